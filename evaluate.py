@@ -21,7 +21,7 @@ import shlex
 import sys
 from pathlib import Path
 
-from topomerge.datasets.core.script import exit_status
+from topomerge.datasets.core.builder import run_script
 
 from topomerge.code_digest import find_other_clone
 from topomerge.config import compose
@@ -30,7 +30,7 @@ from topomerge.evaluation.settings import Evaluation
 from topomerge.evaluation.tasks import MODULES, run_task
 
 
-def say(text: str) -> None:
+def print_progress(text: str) -> None:
     """Report the progress."""
     print(text, file=sys.stderr, flush=True)
 
@@ -41,7 +41,7 @@ def main(words: list[str]) -> int:
         print(__doc__)
         return 0
     if other := find_other_clone(Path(__file__)):
-        say(f"evaluate: {other}")
+        print_progress(f"evaluate: {other}")
     command = shlex.join(
         ["python", "evaluate.py", *words]
     )  # brackets and spaces in quotes, so that a shell takes it as it stands
@@ -51,18 +51,18 @@ def main(words: list[str]) -> int:
         if task == "embedding":
             keys = [word for word in words if not word.startswith("task=")]
             keys = [f"run=[{w[4:]}]" if w.startswith("run=") and not w.startswith("run=[") else w for w in keys]
-            scores = evaluate(compose("evaluate", Evaluation, keys), say, command)
+            scores = evaluate(compose("evaluate", Evaluation, keys), print_progress, command)
             print(f"{scores.summary}\n\nAll tables and figures: {scores.folder}")
         elif task in MODULES:
-            outcome = run_task(task, words, say)
+            outcome = run_task(task, words, print_progress)
             print(f"{outcome.summary}\n\nWritten to {outcome.folder}")
         else:
-            from topomerge.training.judging import judge_task
+            from topomerge.training.tasks import evaluate_task
 
-            judgement = judge_task(task, words, say)
+            judgement = evaluate_task(task, words, print_progress)
             print(f"{judgement.summary}\n\nWritten to {judgement.folder}")
 
-    return exit_status("evaluate", work)
+    return run_script("evaluate", work)
 
 
 if __name__ == "__main__":

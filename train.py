@@ -19,13 +19,13 @@ from omegaconf import DictConfig
 from topomerge.code_digest import find_other_clone
 from topomerge.config import name_by_sweep
 from topomerge.errors import InputError
-from topomerge.training.tasks import register_tasks, settings_from, settings_of, train
+from topomerge.training.tasks import compose_settings, convert_settings, register_tasks, train
 
 register_tasks()
 FLAGS = {f"--{word}": f"{word}=true" for word in ("overfit", "resume", "overwrite")}
 
 
-def say(text: str) -> None:
+def print_progress(text: str) -> None:
     """Report the progress."""
     print(text, file=sys.stderr, flush=True)
 
@@ -34,13 +34,13 @@ def say(text: str) -> None:
 def main(config: DictConfig) -> float:
     """One run; its best score is what a sweep compares."""
     try:
-        settings = settings_from(config)
+        settings = convert_settings(config)
         job = HydraConfig.get()
         if job.mode == RunMode.MULTIRUN:  # each run of a sweep gets a folder of its own
             settings.runs, settings.name = str(job.sweep.dir), str(job.sweep.subdir) or settings.name
             begun = any((settings.folder / name).exists() for name in ("last", "last.new", "best"))
             settings.resume = settings.resume and begun
-        return train(settings, say)[f"val/{settings.watch}"]
+        return train(settings, print_progress)[f"val/{settings.watch}"]
     except InputError as error:
         sys.exit(f"train: {error}")
     except KeyboardInterrupt:
@@ -50,11 +50,11 @@ def main(config: DictConfig) -> float:
 
 if __name__ == "__main__":
     if other := find_other_clone(Path(__file__)):
-        say(f"train: {other}")
+        print_progress(f"train: {other}")
     words = [FLAGS.get(word, word) for word in sys.argv[1:]]
     try:
         if not any(word.startswith("-") or word.startswith("hydra") for word in words):
-            settings_of(words)  # a wrong key is one line, where Hydra says ten
+            compose_settings(words)  # a wrong key is one line, where Hydra says ten
         sys.argv[1:] = name_by_sweep(words)
     except InputError as error:
         sys.exit(f"train: {error}")

@@ -22,12 +22,12 @@ from pathlib import Path
 
 import numpy as np
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.simulation.scanner import scan
-from topomerge.datasets.simulation.walk import part
+from topomerge.datasets.simulation.scanner import scan_building
+from topomerge.datasets.simulation.walk import sample_part
 
 import topomerge as tm
 from benchmarks.speed.bench import DEPTH, WIDTH, storey
-from topomerge.embedding.embedders import embedder
+from topomerge.embedding.learned import build_embedder
 from topomerge.matching.match import match
 from topomerge.types import Array, PointCloud, Sim3, TopometricMap
 
@@ -37,12 +37,12 @@ SEED, SPACING = 41_700, 0.06  # of the training list; m
 TINY = ["data.scans=4", "data.seed=0", "data.folder=", "steps=6", "batch=2", "crop=32", "hold_out=2", "widths=[4,4,4,4,4,4,4,4]"]
 
 
-def peak() -> int:
+def measure_peak() -> int:
     """MB that this process held at most."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
 
 
-def held() -> int:
+def measure_held() -> int:
     """MB that this process holds now."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") // 2**20
 
@@ -53,28 +53,28 @@ def cloud(millions: int = 20) -> None:
     beside = int(np.ceil(np.sqrt(floors)))
     points = np.empty((floors * 2_000_000 + OUTLIERS, 3), np.float32)
     for k in range(floors):
-        points[k * 2_000_000 : (k + 1) * 2_000_000] = storey(2_000_000, k) + moved(k, beside)
+        points[k * 2_000_000 : (k + 1) * 2_000_000] = storey(2_000_000, k) + compute_offset(k, beside)
     low, high = points[:-OUTLIERS].min(axis=0), points[:-OUTLIERS].max(axis=0)
     points[-OUTLIERS:] = np.random.default_rng(0).uniform(low - 10, high + 10, (OUTLIERS, 3))
-    before, began = peak(), time.process_time()
+    before, began = measure_peak(), time.process_time()
     map = tm.extract(points)
     spent = time.process_time() - began
     found = f"{len(points):,} points, {floors * 20} rooms: found {len(map.rooms)}"
-    print(f"{found}; {spent:.1f} s; {before} MB before, {peak()} MB at most", flush=True)
+    print(f"{found}; {spent:.1f} s; {before} MB before, {measure_peak()} MB at most", flush=True)
 
 
-def moved(number: int, beside: int) -> Array:
+def compute_offset(number: int, beside: int) -> Array:
     """(3,) float32 m, where a floor lies among others that lie beside each other without a gap wider than a wall."""
     return np.array([number % beside * (WIDTH + 0.5), number // beside * (DEPTH + 0.5), 0.0], np.float32)
 
 
 def rooms(most: int = 320) -> None:
     """Extract, describe and match (seconds each) maps of 20, 80, 320, ... rooms with a copy of themselves."""
-    describe = embedder("learned")
+    describe = build_embedder("learned")
     floors = 1
     while floors * 20 <= most:
         beside = int(np.ceil(np.sqrt(floors)))
-        points = np.concatenate([storey(POINTS_A_FLOOR, k) + moved(k, beside) for k in range(floors)])
+        points = np.concatenate([storey(POINTS_A_FLOOR, k) + compute_offset(k, beside) for k in range(floors)])
         parts = []
         began = time.process_time()
         map = tm.extract(points)
@@ -85,39 +85,40 @@ def rooms(most: int = 320) -> None:
             step()
             parts.append(time.process_time() - began)
         print(
-            f"{len(map.rooms)} rooms: extract {parts[0]:.1f} s, describe {parts[1]:.2f} s, match {parts[2]:.2f} s; {peak()} MB",
+            f"{len(map.rooms)} rooms: extract {parts[0]:.1f} s, describe {parts[1]:.2f} s, match {parts[2]:.2f} s; "
+            f"{measure_peak()} MB",
             flush=True,
         )
         floors *= 4
 
 
-def partial_clouds(count: int, rooms: int = 4) -> list[PointCloud]:
+def simulate_partial_clouds(count: int, rooms: int = 4) -> list[PointCloud]:
     """Scans of a few rooms each of one office, each in a frame of its own."""
     building = make_building("office", SEED)
     out = []
     for k in range(count):
         rng = np.random.default_rng([SEED, k])
-        some = part(building, rooms, rng)
+        some = sample_part(building, rooms, rng)
         frame = Sim3(float(rng.uniform(-np.pi, np.pi)), tuple(rng.uniform(-9, 9, 3).tolist()))
-        out.append(scan(building, "tls", some, rng, SPACING, frame=frame))
+        out.append(scan_building(building, "tls", some, rng, SPACING, frame=frame))
     return out
 
 
-def maps(count: int = 30) -> None:
+def load_maps(count: int = 30) -> None:
     """Merge so many partial maps of one office at once."""
-    parts = [tm.extract(cloud) for cloud in partial_clouds(count)]
-    print(f"{count} maps extracted, {peak()} MB", flush=True)
+    parts = [tm.extract(cloud) for cloud in simulate_partial_clouds(count)]
+    print(f"{count} maps extracted, {measure_peak()} MB", flush=True)
     began, start = time.process_time(), time.perf_counter()
     result = tm.merge(parts)
     spent = time.process_time() - began
     joined = sum(t is not None for t in result.transforms)
     times = f"{spent:.0f} s of the processor, {time.perf_counter() - start:.0f} s"
-    print(f"{count} maps: {result.status}, {joined} joined; {times}; {peak()} MB")
+    print(f"{count} maps: {result.status}, {joined} joined; {times}; {measure_peak()} MB")
 
 
 def merges(count: int = 300) -> None:
     """Merge the same two maps so often in one process: does memory grow?"""
-    a, b = (tm.extract(cloud) for cloud in partial_clouds(2))
+    a, b = (tm.extract(cloud) for cloud in simulate_partial_clouds(2))
     first, began = None, time.process_time()
     for k in range(count):
         result = tm.merge([a, b])
@@ -125,20 +126,20 @@ def merges(count: int = 300) -> None:
         first = answer if first is None else first
         assert answer == first, (k, answer, first)
         if k + 1 in (1, 10, count // 2, count) or (k + 1) % 100 == 0:
-            print(f"{k + 1} merges: {held()} MB held, {(time.process_time() - began) / (k + 1):.2f} s each", flush=True)
+            print(f"{k + 1} merges: {measure_held()} MB held, {(time.process_time() - began) / (k + 1):.2f} s each", flush=True)
 
 
-def extracted(cloud: PointCloud) -> bytes:
+def extract_signature(cloud: PointCloud) -> bytes:
     """What tells two maps of a cloud apart: their tables, as bytes."""
-    return signature(tm.extract(cloud))
+    return compute_signature(tm.extract(cloud))
 
 
-def signature(map: TopometricMap) -> bytes:
+def compute_signature(map: TopometricMap) -> bytes:
     """The tables of a map, as bytes."""
     return b"".join(np.ascontiguousarray(table).tobytes() for table in (map.rooms, map.edges, map.room, map.navigable_room))
 
 
-def merged(maps: Sequence[TopometricMap]) -> tuple[str, float]:
+def summarise_merge(maps: Sequence[TopometricMap]) -> tuple[str, float]:
     """What a merge says."""
     result = tm.merge(list(maps))
     return result.status, float(result.probability)
@@ -146,11 +147,11 @@ def merged(maps: Sequence[TopometricMap]) -> tuple[str, float]:
 
 def threads(count: int = 4) -> None:
     """Extract and merge in so many threads, and in processes that are spawned and forked: are the results equal?"""
-    clouds = partial_clouds(count)
-    alone = [extracted(cloud) for cloud in clouds]
+    clouds = simulate_partial_clouds(count)
+    alone = [extract_signature(cloud) for cloud in clouds]
     maps = [tm.extract(cloud) for cloud in clouds]
     pairs = [(maps[k], maps[(k + 1) % count]) for k in range(count)]
-    answers = [merged(pair) for pair in pairs]
+    answers = [summarise_merge(pair) for pair in pairs]
     for name, pool in (
         ("threads", ThreadPoolExecutor(count)),
         ("spawned processes", ProcessPoolExecutor(2, get_context("spawn"))),
@@ -158,8 +159,8 @@ def threads(count: int = 4) -> None:
     ):
         try:
             with pool:
-                same = list(pool.map(extracted, clouds)) == alone
-                agree = list(pool.map(merged, pairs)) == answers
+                same = list(pool.map(extract_signature, clouds)) == alone
+                agree = list(pool.map(summarise_merge, pairs)) == answers
         except BrokenProcessPool as error:
             print(f"{name}: {error}", flush=True)
             continue
@@ -206,7 +207,7 @@ def tensor_bytes(path: Path) -> bytes:
     return content[8 + int.from_bytes(content[:8], "little") :]
 
 
-CASES: dict[str, Callable[..., None]] = {c.__name__: c for c in (cloud, rooms, maps, merges, threads, kills)}
+CASES: dict[str, Callable[..., None]] = {c.__name__: c for c in (cloud, rooms, load_maps, merges, threads, kills)}
 
 
 def main(words: Sequence[str] | None = None) -> None:

@@ -6,16 +6,12 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
-from topomerge.models.layers import Standardise, mlp
-from topomerge.models.nodes import NodeEncoder
-from topomerge.models.pointnet import LocalPointNet, PointNet
-from topomerge.models.surroundings import DoorsEncoder, SurroundingsEncoder
-from topomerge.models.voxelcnn import VoxelCNN
-from topomerge.models.yaw import Turned
+from topomerge.models.geometry import DoorsEncoder, LocalPointNet, PointNet, SurroundingsEncoder, VoxelCNN, YawAverage
+from topomerge.models.nodes import NodeEncoder, Standardizer, build_mlp
 from torch import Tensor, nn
 
-from topomerge.embedding.network import GRAPH, TABLE_PARTS, Network, check, needed, pair_tensors, tensors
-from topomerge.embedding.schema import width
+from topomerge.embedding.graph import count_columns
+from topomerge.embedding.network import GRAPH, TABLE_PARTS, Network, check, find_tensor, list_pair_tensors, list_tensors
 from topomerge.embedding.surroundings import CROP_SHAPES, DOOR_PART
 
 QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # cosine and sine of 0 to 3 quarter turns
@@ -27,8 +23,8 @@ class Table(nn.Module):
 
     def __init__(self, columns: int, width: int, dropout: float) -> None:
         super().__init__()
-        self.scale = Standardise(columns)
-        self.each = mlp(columns, 2 * width, width, dropout=dropout)
+        self.scale = Standardizer(columns)
+        self.each = build_mlp(columns, 2 * width, width, dropout=dropout)
 
     def forward(self, values: Tensor) -> Tensor:
         out: Tensor = self.each(self.scale(values))
@@ -44,18 +40,18 @@ class GeometryEncoder(nn.Module):
         self.parts = nn.ModuleDict()
         for part in geometry.parts:
             if part in POINT_ENCODERS:
-                self.parts[part] = Turned(POINT_ENCODERS[part](self.width), geometry.yaws, geometry.canonical)
+                self.parts[part] = YawAverage(POINT_ENCODERS[part](self.width), geometry.yaws, geometry.canonical)
             elif part == DOOR_PART:
                 self.parts[part] = DoorsEncoder(self.width, network.dropout)
             elif part in CROP_SHAPES:
                 self.parts[part] = SurroundingsEncoder(part, self.width, network.dropout)
             else:
-                self.parts[part] = Table(width(TABLE_PARTS[part]), self.width, network.dropout)
+                self.parts[part] = Table(count_columns(TABLE_PARTS[part]), self.width, network.dropout)
         self.join = nn.Sequential(nn.LayerNorm(len(self.parts) * self.width), nn.ReLU(), nn.Dropout(network.dropout))
         self.out = nn.Linear(len(self.parts) * self.width, self.width)
 
     def forward(self, tensors: Mapping[str, Tensor]) -> Tensor:
-        rooms = [module(tensors[needed(part)]) for part, module in self.parts.items()]
+        rooms = [module(tensors[find_tensor(part)]) for part, module in self.parts.items()]
         out: Tensor = self.out(self.join(torch.cat(rooms, dim=1)))
         return out
 
@@ -73,19 +69,19 @@ class Embedder(nn.Module):
         self.network = network
         self.geometry = GeometryEncoder(network)
         self.node = NodeEncoder(network.node, network.geometry.width, network.dropout)
-        self.project = mlp(self.node.out, 2 * network.size, network.size, dropout=network.dropout)
-        self.dustbin = mlp(self.node.out, 32, 1)
+        self.project = build_mlp(self.node.out, 2 * network.size, network.size, dropout=network.dropout)
+        self.dustbin = build_mlp(self.node.out, 32, 1)
         self.log_temperature = nn.Parameter(torch.tensor(-2.3))  # 0.1; similarities are divided by it
 
     @property
     def tensors(self) -> tuple[str, ...]:
         """Names of the tensors that the network reads."""
-        return tensors(self.network)
+        return list_tensors(self.network)
 
     @property
     def pairs(self) -> tuple[str, ...]:
         """Names of the tensors that tell of pairs of doors, if the network reads any."""
-        return pair_tensors(self.network.node)
+        return list_pair_tensors(self.network.node)
 
     @property
     def temperature(self) -> Tensor:
@@ -97,18 +93,18 @@ class Embedder(nn.Module):
         rooms = self.node(self.geometry(tensors), *(tensors[name] for name in GRAPH), *pairs, tensors.get("edge_way"))
         return nn.functional.normalize(self.project(rooms), dim=1), self.dustbin(rooms)[:, 0]
 
-    def turned(self, tensors: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def embed_rotations(self, tensors: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Embeddings (R, D), or, of a network that tells turns apart, (R, 4, D): of the map turned by 0 to 3 quarter turns; and
         the mean of the dustbins (R,)."""
         if self.network.turns == 1:
             return self(tensors)
-        rows, bins = zip(*(self(quarter_turned(tensors, k)) for k in range(self.network.turns)), strict=True)
+        rows, bins = zip(*(self(rotate_quarter_turns(tensors, k)) for k in range(self.network.turns)), strict=True)
         return torch.stack(rows, dim=1), torch.stack(bins).mean(dim=0)
 
     def fit_scales(self, graphs: Iterable[Mapping[str, Any]]) -> None:
         """Take the statistics of all inputs from the graphs of the training set."""
         graphs = list(graphs)
-        tables = [(needed(name), part.scale) for name, part in self.geometry.parts.items() if isinstance(part, Table)]
+        tables = [(find_tensor(name), part.scale) for name, part in self.geometry.parts.items() if isinstance(part, Table)]
         tables += [
             (name, s)
             for name, s in zip(("edge_attr", *self.pairs[1:]), (self.node.edges, self.node.pairs), strict=False)
@@ -118,8 +114,8 @@ class Embedder(nn.Module):
             scale.fit(torch.cat([graph[name] for graph in graphs]))
 
 
-def quarter_turned(tensors: Mapping[str, Tensor], turns: int) -> dict[str, Tensor]:
-    """A map turned by so many quarter turns, counter-clockwise seen from above."""
+def rotate_quarter_turns(tensors: Mapping[str, Tensor], turns: int) -> dict[str, Tensor]:
+    """Return a map turned by so many quarter turns, counter-clockwise seen from above."""
     out = dict(tensors)
     for part in CROP_SHAPES.keys() & out.keys():
         out[part] = out[part].rot90(turns, (out[part].dim() - 3, out[part].dim() - 2))

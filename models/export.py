@@ -15,12 +15,11 @@ from topomerge.models.embedder import Embedder
 from torch import Tensor, nn
 
 import topomerge
+from topomerge.embedding.learned import EMBEDDER_FILE, build_card
 from topomerge.embedding.network import build_embedder_signature
-from topomerge.embedding.weights import EMBEDDER_FILE, build_card
 from topomerge.errors import InputError
-from topomerge.io.atomic import replacing
-from topomerge.networks.network import Run, write_card
-from topomerge.networks.signature import Signature
+from topomerge.io.archive import replace_on_success
+from topomerge.networks.network import Run, Signature, write_card
 from topomerge.types import Array
 
 ONNX_OPSET = 18
@@ -40,7 +39,7 @@ def export_network(module: nn.Module, signature: Signature, sample: Sequence[Ten
     if not all(torch.isfinite(value).all() for value in module.state_dict().values()):
         raise InputError(f"{path}: weights are no finite numbers; training diverged, take another run")
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    with warnings.catch_warnings(), replacing(path) as beside:
+    with warnings.catch_warnings(), replace_on_success(path) as beside:
         warnings.simplefilter("ignore")
         if isinstance(module, Branches):
             model = _joined([_traced(branch, signature, sample, 1) for branch in module.branches], next(iter(signature.inputs)))

@@ -98,7 +98,7 @@ def check(settings: LossSettings) -> None:
         raise InputError(f"loss.temperature must be above 0, not {settings.temperature}")
 
 
-def matching_loss(
+def compute_matching_loss(
     settings: LossSettings,
     embedding: Tensor,
     dustbin: Tensor,
@@ -120,25 +120,25 @@ def matching_loss(
     if processes is not None and settings.kind != "triplet":  # the negatives of triplets are of the same pair
         others = Others(processes.gather_others(embedding), processes.gather_others(truth.building))
     if settings.kind == "infonce":
-        main, counts = info_nce(embedding, temperature, truth, settings.easy, others)
+        main, counts = compute_info_nce(embedding, temperature, truth, settings.easy, others)
     elif settings.kind == "ntxent":
-        main, counts = info_nce(embedding, embedding.new_tensor(settings.temperature), truth, 1.0, others)
+        main, counts = compute_info_nce(embedding, embedding.new_tensor(settings.temperature), truth, 1.0, others)
     else:
-        main, counts = triplet(embedding, truth, settings.margin)
+        main, counts = compute_triplet_loss(embedding, truth, settings.margin)
     # Where another loss than InfoNCE shapes the embedding, only the dustbins and the temperature are fitted to it.
     fixed = embedding if settings.kind == "infonce" else embedding.detach()
     weight = torch.where(truth.clear, 1.0, settings.faint)
-    first = _mean(main, weight * counts, processes)
-    second = _mean(dustbin_loss(fixed, dustbin, temperature, truth), weight, processes)
+    first = _compute_weighted_mean(main, weight * counts, processes)
+    second = _compute_weighted_mean(compute_dustbin_loss(fixed, dustbin, temperature, truth), weight, processes)
     return {"loss": first + settings.dustbin * second, settings.kind: first.detach(), "dustbin": second.detach()}
 
 
-def _mean(values: Tensor, weight: Tensor, processes: Processes | None) -> Tensor:
+def _compute_weighted_mean(values: Tensor, weight: Tensor, processes: Processes | None) -> Tensor:
     total = weight.sum() if processes is None else processes.average(weight.sum())
     return (values * weight).sum() / total.clamp(min=1e-6)
 
 
-def info_nce(
+def compute_info_nce(
     embedding: Tensor, temperature: Tensor, truth: Truth, easy: float = 1.0, others: Others | None = None
 ) -> tuple[Tensor, Tensor]:
     """(N,) -log(sum of exp(s) of partners / sum of exp(s) of partners and negatives), s being the cosine over the temperature;
@@ -158,7 +158,7 @@ def info_nce(
     return torch.where(has, candidates - partners, 0.0), has
 
 
-def triplet(embedding: Tensor, truth: Truth, margin: float) -> tuple[Tensor, Tensor]:
+def compute_triplet_loss(embedding: Tensor, truth: Truth, margin: float) -> tuple[Tensor, Tensor]:
     """(N,) mean over a room's partners of the mean of d(partner) - d(negative) + margin over the negatives of the same pair of
     maps for which it is above 0; and (N,) bool, which rooms have both (Hermans et al. 2017, "batch all").
 
@@ -177,7 +177,7 @@ def triplet(embedding: Tensor, truth: Truth, margin: float) -> tuple[Tensor, Ten
     return total / truth.same.sum(dim=1).clamp(min=1), truth.same.any(dim=1) & negative.any(dim=1)
 
 
-def dustbin_loss(embedding: Tensor, dustbin: Tensor, temperature: Tensor, truth: Truth) -> Tensor:
+def compute_dustbin_loss(embedding: Tensor, dustbin: Tensor, temperature: Tensor, truth: Truth) -> Tensor:
     """(N,) -log(probability of its partners, or of having none where it has none), among the rooms of the other map of the pair
     and the dustbin."""
     logits = embedding @ embedding.T / temperature
@@ -204,4 +204,4 @@ class Objective(nn.Module):
         embedding, dustbin = self.network(tensors)
         with torch.autocast(embedding.device.type, enabled=False):  # a small temperature magnifies what 8 bits leave out
             rows, bins = embedding.float(), dustbin.float()
-            return matching_loss(self.settings, rows, bins, self.network.temperature, truth, self.processes)
+            return compute_matching_loss(self.settings, rows, bins, self.network.temperature, truth, self.processes)

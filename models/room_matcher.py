@@ -11,7 +11,7 @@ import torch
 from topomerge.models.export import Branches
 from torch import Tensor, nn
 
-from topomerge.embedding.turns import FACTS
+from topomerge.embedding.quarter_turns import FACTS
 from topomerge.errors import InputError
 from topomerge.matching.room_matcher import (
     AGREEMENT,
@@ -25,7 +25,7 @@ from topomerge.matching.room_matcher import (
     WAY_FACTS,
     WAY_SOFT,
     RoomsSeen,
-    agreement,
+    compute_agreement,
 )
 from topomerge.types import Array
 
@@ -73,11 +73,11 @@ class MatcherLayer(nn.Module):
         self.drop = nn.Dropout(dropout)
 
     def forward(self, states: Sequence[Tensor], each_way: Sequence[Tensor], votes: Tensor) -> list[Tensor]:
-        states = [self._within(state, way) for state, way in zip(states, each_way, strict=True)]
-        states = self._across(states, votes)
+        states = [self._attend_within(state, way) for state, way in zip(states, each_way, strict=True)]
+        states = self._attend_across(states, votes)
         return [s + self.drop(self.each_out(torch.relu(self.each_in(self.norm_each(s))))) for s in states]
 
-    def _within(self, state: Tensor, way: Tensor) -> Tensor:
+    def _attend_within(self, state: Tensor, way: Tensor) -> Tensor:
         query, key, value = (p.unflatten(1, (ATTENTION_HEADS, -1)) for p in self.within(self.norm_within(state)).chunk(3, dim=1))
         hidden = torch.relu(self.way_in(way))  # (R, R, WAY_HIDDEN)
         weight, bias = self.way_out.weight, self.way_out.bias
@@ -91,7 +91,7 @@ class MatcherLayer(nn.Module):
         out: Tensor = state + self.drop(self.join_within(seen))
         return out
 
-    def _across(self, states: Sequence[Tensor], votes: Tensor) -> list[Tensor]:
+    def _attend_across(self, states: Sequence[Tensor], votes: Tensor) -> list[Tensor]:
         normed = [self.norm_across(state) for state in states]
         query, value = ([of(s).unflatten(1, (ATTENTION_HEADS, -1)) for s in normed] for of in (self.query, self.value))
         score = torch.einsum("ihd,jhd->ijh", *query) / math.sqrt(self.size) + self.votes(votes)
@@ -132,20 +132,20 @@ class RoomMatcher(nn.Module):
                 if set(name.split(".")) & set(MATCHER_PARTS[part]):
                     torch.nn.init.zeros_(weights).requires_grad_(False)
 
-    def fit_facts(self, facts: Array) -> None:
+    def fit_features(self, facts: Array) -> None:
         """Take what is usual from the facts (n, FACTS) of the training set; heights are told by the ways only."""
         usual, spread = facts.mean(axis=0), facts.std(axis=0)
         spread[spread < LEAST_SPREAD] = 1.0
         usual[-1], spread[-1] = 0.0, FAR_HEIGHT
-        self.usual, self.spread = _tensor(usual), _tensor(spread)
+        self.usual, self.spread = _convert_to_tensor(usual), _convert_to_tensor(spread)
 
     def forward(self, a: RoomsSeen, b: RoomsSeen) -> list[Partners]:
-        maps = [Rooms(*(_tensor(part) for part in (m.rows, m.facts, m.places, m.heights))) for m in (a, b)]
+        maps = [Rooms(*(_convert_to_tensor(part) for part in (m.rows, m.facts, m.places, m.heights))) for m in (a, b)]
         likely = self.compute_first_guess(maps)
         states: list[Tensor] = []
         partners: list[Partners] = []
         for k in range(len(self.head)):
-            votes = _tensor(agreement(likely.detach().numpy().astype(float), a, b))
+            votes = _convert_to_tensor(compute_agreement(likely.detach().numpy().astype(float), a, b))
             states, of_stage = self.stage(k, maps, states, votes)
             partners.append(of_stage)
             likely = (0.5 * (of_stage.rows[:, :-1] + of_stage.columns[:, :-1].T)).exp()
@@ -164,9 +164,9 @@ class RoomMatcher(nn.Module):
         else:
             facts = [((m.facts - self.usual) / self.spread).clamp(-UNUSUAL, UNUSUAL) for m in maps]
             after = [self.rows(m.rows) + self.facts(f) for m, f in zip(maps, facts, strict=True)]
-        return after, self._partners(k, after, nn.functional.linear(maps[0].rows, maps[1].rows), votes)
+        return after, self._compute_partners(k, after, nn.functional.linear(maps[0].rows, maps[1].rows), votes)
 
-    def _partners(self, k: int, states: Sequence[Tensor], cosine: Tensor, votes: Tensor) -> Partners:
+    def _compute_partners(self, k: int, states: Sequence[Tensor], cosine: Tensor, votes: Tensor) -> Partners:
         a, b = (nn.functional.normalize(self.head[k](state), dim=1) for state in states)
         logits = LIKENESS_SCALE * (self.sharpness * (a @ b.T) + self.likeness * (cosine - 1)) + self.agree[k](votes)[..., 0]
         alone = [self.alone[k](state) for state in states]
@@ -202,5 +202,5 @@ def ways(places: Tensor, heights: Tensor) -> Tensor:
     return torch.cat([off / (far + WAY_SOFT), *ring, climb], dim=2)
 
 
-def _tensor(array: Array) -> Tensor:
+def _convert_to_tensor(array: Array) -> Tensor:
     return torch.as_tensor(array, dtype=torch.float32)

@@ -20,28 +20,28 @@ from topomerge.models.embedder import Embedder
 from topomerge.models.export import Ordered, read_weights, run_with_torch
 from torch import Tensor
 
-from topomerge.embedding.learned import Learned
-from topomerge.embedding.network import build_embedder_signature
-from topomerge.embedding.weights import (
+from topomerge.embedding.learned import (
     STATE_FILE,
     STATE_SETTINGS,
+    LearnedEmbedder,
     check_settings,
     describe_embedder,
     find_embedder,
     find_state,
     read_embedder_card,
 )
+from topomerge.embedding.network import build_embedder_signature
 from topomerge.errors import InputError
-from topomerge.io.atomic import replacing
+from topomerge.io.archive import replace_on_success
 
 STATE_FORMAT = 2
 LARGEST_FILE = 1 << 28  # bytes
 
 
-def learned(network: Embedder, about: Mapping[str, Any] | None = None) -> Learned:
+def wrap_network(network: Embedder, about: Mapping[str, Any] | None = None) -> LearnedEmbedder:
     """A network that torch runs as a callable map -> (R, D): one that was just trained."""
     run = run_with_torch(Ordered(network), build_embedder_signature(network.network))
-    return Learned(run, network.network, float(network.temperature.detach()), about)
+    return LearnedEmbedder(run, network.network, float(network.temperature.detach()), about)
 
 
 def save_state(network: Embedder, folder: str | Path, about: Mapping[str, Any] | None = None) -> None:
@@ -61,14 +61,14 @@ def save_state(network: Embedder, folder: str | Path, about: Mapping[str, Any] |
     weights = save({name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()})
     known = {"format": STATE_FORMAT, "sha256": hashlib.sha256(weights).hexdigest()}
     settings = {**known, **describe_embedder(network.network, about)}
-    with replacing(folder / STATE_FILE) as beside:
+    with replace_on_success(folder / STATE_FILE) as beside:
         beside.write_bytes(weights)
-    with replacing(folder / STATE_SETTINGS) as beside:
+    with replace_on_success(folder / STATE_SETTINGS) as beside:
         beside.write_text(json.dumps(settings, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def read_embedder(path: str | Path | None = None) -> tuple[Embedder, dict[str, Any]]:
-    """The network, ready to use, and on what it was trained.
+    """Read the network, ready to use, and on what it was trained.
 
     Args:
         path: as of `embedding.weights.find_embedder`, or a folder with the state of a training.

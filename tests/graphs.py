@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from topomerge.embedding.door_layout import door_layout
-from topomerge.embedding.schema import width
+from topomerge.embedding.engineered import compute_door_layout
+from topomerge.embedding.graph import count_columns
 from topomerge.embedding.surroundings import CROP, CROP_SHAPES, SHEET_PLANES
 from topomerge.io import archive
-from topomerge.training.packed import GraphPair
-from topomerge.training.turned_views import with_views
+from topomerge.training.batches import add_views
+from topomerge.training.packed_pairs import GraphPair
 
 LATER = ("engineered", "shapedna", "near_index", "near_attr", *CROP_SHAPES, "edge_way")  # reckoned when a set is read
 VIEWS = (*CROP_SHAPES, "edge_way")
@@ -28,7 +28,7 @@ def graph(rooms: int = 7, seed: int = 0, points: int = 64) -> dict[str, torch.Te
     doors = torch.nonzero((here[:, None] == here[None]) & ~torch.eye(len(here), dtype=torch.bool)).T
     middle, door = 8 * torch.rand((rooms, 3), generator=g), 8 * torch.rand((ends.shape[1], 3), generator=g)
     middle[:, 2] = door[:, 2] = 1.0
-    near = [torch.from_numpy(array) for array in door_layout(index.numpy(), middle.numpy(), door.repeat(2, 1).numpy())]
+    near = [torch.from_numpy(array) for array in compute_door_layout(index.numpy(), middle.numpy(), door.repeat(2, 1).numpy())]
     size = 1 + 3 * torch.rand((rooms, 1, 3), generator=g)
     anchor = 10 + CROP * torch.rand((rooms, 2), generator=g)
     columns = torch.stack(torch.meshgrid(*[torch.arange(CROP + 20.0)] * 2, indexing="ij"), dim=-1)
@@ -40,20 +40,20 @@ def graph(rooms: int = 7, seed: int = 0, points: int = 64) -> dict[str, torch.Te
         "turn": torch.zeros(1, dtype=torch.float64),
     }
     tensors = {
-        "x": 10 * torch.rand((rooms, width("x")), generator=g),
-        "engineered": torch.rand((rooms, width("engineered")), generator=g),
-        "shapedna": torch.rand((rooms, width("shapedna")), generator=g),
+        "x": 10 * torch.rand((rooms, count_columns("x")), generator=g),
+        "engineered": torch.rand((rooms, count_columns("engineered")), generator=g),
+        "shapedna": torch.rand((rooms, count_columns("shapedna")), generator=g),
         "room_points": size * (torch.rand((rooms, points, 3), generator=g) - torch.tensor([0.5, 0.5, 0.0])),
         "edge_index": index,
-        "edge_attr": torch.randn((index.shape[1], width("edge_attr")), generator=g),
+        "edge_attr": torch.randn((index.shape[1], count_columns("edge_attr")), generator=g),
         "door_index": doors,
-        "door_attr": torch.randn((doors.shape[1], width("door_attr")), generator=g),
+        "door_attr": torch.randn((doors.shape[1], count_columns("door_attr")), generator=g),
         "near_index": near[0],
         "near_attr": near[1],
         "pos": middle,
         "edge_pos": door.repeat(2, 1),
     }
-    return with_views({**tensors, **views}, VIEWS)
+    return add_views({**tensors, **views}, VIEWS)
 
 
 def _doors(anchor: torch.Tensor) -> torch.Tensor:
@@ -87,7 +87,7 @@ def shuffled(tensors: dict[str, torch.Tensor], seed: int = 0) -> tuple[dict[str,
         "near_attr": tensors["near_attr"],
     }
     out |= {"door_index": new_edge[tensors["door_index"]], "door_attr": tensors["door_attr"]}
-    return with_views(out, VIEWS), rooms
+    return add_views(out, VIEWS), rooms
 
 
 def pair(seed: int, rooms: int = 7) -> GraphPair:

@@ -25,6 +25,6 @@ def edit(path: Path, old: str, new: str) -> None:
 def edited_kernel(folder: Path, addition: str) -> Path:
     """A copy with an addition to the kernel that makes voxels."""
     package = copied(folder)
-    kernel = package / "kernels" / "voxelise.py"
+    kernel = package / "kernels" / "voxels.py"
     kernel.write_text(f"{kernel.read_text(encoding='utf-8')}\n{addition}\n", encoding="utf-8")
     return package

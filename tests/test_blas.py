@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from topomerge.blas import one_blas_thread
+from topomerge.blas import limit_blas_threads
 
 
 def blas_threads() -> set[int]:
@@ -15,7 +15,7 @@ def blas_threads() -> set[int]:
 
 
 def test_one_thread_inside_and_as_many_as_before_afterwards() -> None:
-    @one_blas_thread
+    @limit_blas_threads
     def work(number: int, *, fails: bool = False) -> tuple[int, set[int]]:
         """What it does."""
         if fails:

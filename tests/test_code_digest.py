@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.package_copy import ROOT, copied, edit, edited_kernel
-from topomerge.code_digest import code_digest, data_digest, data_files, reached
+from topomerge.code_digest import compute_code_digest, compute_data_digest, find_data_files, find_reached_modules
 
 EXTRACT = "topomerge.extraction.extract"
 
@@ -26,25 +26,25 @@ def after(tmp_path: Path) -> Path:
 
 
 def test_the_same_files_in_another_folder_have_the_same_digest(before, after):
-    assert code_digest(EXTRACT, package=before) == code_digest(EXTRACT, package=after)
-    assert data_digest(EXTRACT, package=before) == data_digest(EXTRACT, package=after)
+    assert compute_code_digest(EXTRACT, package=before) == compute_code_digest(EXTRACT, package=after)
+    assert compute_data_digest(EXTRACT, package=before) == compute_data_digest(EXTRACT, package=after)
 
 
 def test_a_kernel_changes_the_digest_of_all_that_reach_it(before, tmp_path):
     after = edited_kernel(tmp_path, "ANOTHER = 1")
     pairs = "topomerge.datasets.pairs.example"
-    assert "topomerge.kernels.voxelise" in reached(EXTRACT, package=before)
-    assert code_digest(EXTRACT, package=before) != code_digest(EXTRACT, package=after)
-    assert code_digest(pairs, package=before) != code_digest(pairs, package=after)
-    assert code_digest("topomerge.errors", package=before) == code_digest("topomerge.errors", package=after)
-    assert data_digest(EXTRACT, package=before) == data_digest(EXTRACT, package=after)
+    assert "topomerge.kernels.voxels" in find_reached_modules(EXTRACT, package=before)
+    assert compute_code_digest(EXTRACT, package=before) != compute_code_digest(EXTRACT, package=after)
+    assert compute_code_digest(pairs, package=before) != compute_code_digest(pairs, package=after)
+    assert compute_code_digest("topomerge.errors", package=before) == compute_code_digest("topomerge.errors", package=after)
+    assert compute_data_digest(EXTRACT, package=before) == compute_data_digest(EXTRACT, package=after)
 
 
 def test_comments_docstrings_and_layout_keep_the_digest(before, after):
-    kernel = after / "kernels" / "voxelise.py"
+    kernel = after / "kernels" / "voxels.py"
     edit(kernel, '"""', '"""Other words. ')
     edit(kernel, "from __future__ import annotations", "# why\n\n\n\nfrom __future__ import annotations  # so")
-    assert code_digest(EXTRACT, package=before) == code_digest(EXTRACT, package=after)
+    assert compute_code_digest(EXTRACT, package=before) == compute_code_digest(EXTRACT, package=after)
 
 
 @pytest.mark.parametrize(
@@ -68,15 +68,17 @@ def test_comments_docstrings_and_layout_keep_the_digest(before, after):
 def test_packaged_data_changes_the_digest_of_its_readers(before, after, module, name):
     with (after / name).open("ab") as file:
         file.write(b" ")
-    assert code_digest(module, package=before) != code_digest(module, package=after)
-    assert data_digest(module, package=before) != data_digest(module, package=after)
-    assert code_digest("topomerge.kernels.voxelise", package=before) == code_digest("topomerge.kernels.voxelise", package=after)
+    assert compute_code_digest(module, package=before) != compute_code_digest(module, package=after)
+    assert compute_data_digest(module, package=before) != compute_data_digest(module, package=after)
+    assert compute_code_digest("topomerge.kernels.voxels", package=before) == compute_code_digest(
+        "topomerge.kernels.voxels", package=after
+    )
 
 
 @pytest.mark.longer
 def test_every_packaged_weight_and_table_is_seen(before):
     modules = [p for folder in ("topomerge", "datasets", "models") for p in (before.parent / folder).rglob("*.py")]
-    seen = {file for path in modules for file in data_files(path, before)}
+    seen = {file for path in modules for file in find_data_files(path, before)}
     packaged = {p for s in ("json", "npz", "onnx", "safetensors", "txt") for p in before.parent.rglob(f"*.{s}")}
     assert packaged and packaged <= seen, sorted(packaged - seen)
 
@@ -110,20 +112,26 @@ def small_package(folder: Path, **files: str) -> Path:
 )
 def test_what_is_followed(tmp_path, text, names):
     package = small_package(tmp_path, start=text, home="thing = 1", io__a="", io__b="from topomerge.home import thing")
-    assert set(reached("topomerge.start", package=package)) == {"topomerge.start", *(f"topomerge.{n}" for n in names)}
+    assert set(find_reached_modules("topomerge.start", package=package)) == {
+        "topomerge.start",
+        *(f"topomerge.{n}" for n in names),
+    }
 
 
 def test_circles_end(tmp_path):
     package = small_package(tmp_path, a="import topomerge.b", b="import topomerge.a")
-    assert len(reached("topomerge.a", package=package)) == 2
+    assert len(find_reached_modules("topomerge.a", package=package)) == 2
 
 
 def test_a_module_that_does_not_exist(before):
     with pytest.raises(ModuleNotFoundError, match=r"topomerge\.nothing"):
-        code_digest("topomerge.nothing", package=before)
+        compute_code_digest("topomerge.nothing", package=before)
 
 
 def test_nothing_is_imported():
-    code = "import sys; from topomerge.code_digest import code_digest as d; d('topomerge.fusion.pipeline'); print(*sys.modules)"
+    code = (
+        "import sys; from topomerge.code_digest import compute_code_digest as d; d('topomerge.fusion.pipeline'); "
+        "print(*sys.modules)"
+    )
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout.split()
     assert not {"numpy", "numba", "torch", "topomerge.fusion.pipeline"} & set(loaded)

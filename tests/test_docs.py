@@ -65,9 +65,9 @@ def run_commands(example: Example, where: str) -> None:
         done = subprocess.run(
             command, shell=True, env={**os.environ, "PATH": path}, capture_output=True, text=True, timeout=600, check=False
         )
-        wanted = example.status if number == len(typed) else 0
+        requested = example.status if number == len(typed) else 0
         said = f"{done.stdout[-2000:]}{done.stderr[-2000:]}"
-        assert done.returncode == wanted, f"{where}: `{command}` gives {done.returncode}\n{said}"
+        assert done.returncode == requested, f"{where}: `{command}` gives {done.returncode}\n{said}"
 
 
 def run_page(page: Path, folder: Path) -> None:
@@ -195,9 +195,9 @@ def test_yaml_of_extend_is_taken(tmp_path: Path) -> None:
     text = (ROOT / "docs" / "extend.md").read_text()
     added = re.findall(r"\*\*One YAML\*\*, `configs/(\w+)/(\w+)\.yaml`.*?```yaml\n(.*?)```", text, re.DOTALL)
     assert len(added) == text.count("```yaml") > 0
-    from topomerge.training.tasks import settings_of
+    from topomerge.training.tasks import compose_settings
 
-    settings_of([])  # schemas
+    compose_settings([])  # schemas
     shutil.copytree(ROOT / "configs", tmp_path / "configs")
     for group, name, block in added:
         (tmp_path / "configs" / group / f"{name}.yaml").write_text(block)

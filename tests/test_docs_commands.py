@@ -52,7 +52,7 @@ def take(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         Exception: it does not take them.
     """
     if words[0] == "train.py":
-        importlib.import_module("topomerge.training.tasks").settings_of(
+        importlib.import_module("topomerge.training.tasks").compose_settings(
             [w for w in words[1:] if w != "-m"]
         )  # of a sweep, its start
         return

@@ -7,14 +7,14 @@ import os
 import pytest
 
 from topomerge.errors import InputError
-from topomerge.io.atomic import replacing
+from topomerge.io.archive import replace_on_success
 
 
 def test_whole_or_absent(tmp_path):
     target = tmp_path / "a.tmap"
 
     def killed() -> None:
-        with replacing(target) as beside:
+        with replace_on_success(target) as beside:
             beside.write_text("half")
             assert list(tmp_path.glob("*.tmap")) == []  # what a kill would leave is not taken for a map
             raise RuntimeError
@@ -22,7 +22,7 @@ def test_whole_or_absent(tmp_path):
     with pytest.raises(RuntimeError):
         killed()
     assert list(tmp_path.iterdir()) == []
-    with replacing(target) as beside:
+    with replace_on_success(target) as beside:
         beside.write_text("whole")
     assert [p.name for p in tmp_path.iterdir()] == ["a.tmap"] and target.read_text() == "whole"
 
@@ -31,7 +31,7 @@ def test_a_link_is_followed(tmp_path):
     (tmp_path / "real").mkdir()
     (tmp_path / "real" / "a.txt").write_text("old")
     (tmp_path / "link").symlink_to(tmp_path / "real" / "a.txt")
-    with replacing(tmp_path / "link") as beside:
+    with replace_on_success(tmp_path / "link") as beside:
         beside.write_text("new")
     assert (tmp_path / "link").is_symlink() and (tmp_path / "real" / "a.txt").read_text() == "new"
 
@@ -39,7 +39,7 @@ def test_a_link_is_followed(tmp_path):
 def test_what_is_no_file_is_left_alone(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", tmp_path, os.devnull):
-        with pytest.raises(InputError, match="no file that could be replaced"), replacing(path):
+        with pytest.raises(InputError, match="no file that could be replaced"), replace_on_success(path):
             pass
-    with pytest.raises(InputError, match="folder that exists"), replacing(tmp_path / "no" / "a"):
+    with pytest.raises(InputError, match="folder that exists"), replace_on_success(tmp_path / "no" / "a"):
         pass

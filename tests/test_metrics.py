@@ -11,16 +11,16 @@ from hypothesis.extra.numpy import arrays
 from tests.grids import COMPILED
 from topomerge.metrics import (
     assign,
-    consistency,
-    contingency,
+    compute_consistency,
+    compute_overlaps,
+    count_contingency,
+    is_on_storey,
+    is_pose_right,
+    is_storeys_right,
     match_places,
-    on_storey,
-    overlaps,
-    pose_right,
     score_doors,
     score_edges,
     score_rooms,
-    storeys_right,
 )
 
 LABELS = arrays(np.int32, 40, elements=st.integers(-1, 4))
@@ -86,8 +86,8 @@ def test_rooms_that_do_not_count() -> None:
 
 def test_contingency_and_overlaps_by_hand() -> None:
     true, found = np.array([0, 0, 1, -1, 1]), np.array([0, 1, 1, 1, -1])
-    assert contingency(true, found, 2, 2).tolist() == [[1, 1], [0, 1]]
-    iou, _ = overlaps(true, found, 2, 2)
+    assert count_contingency(true, found, 2, 2).tolist() == [[1, 1], [0, 1]]
+    iou, _ = compute_overlaps(true, found, 2, 2)
     assert iou == pytest.approx(np.array([[1 / 2, 1 / 4], [0, 1 / 4]]))
     assert assign(iou).tolist() == [0, 1]
 
@@ -95,7 +95,7 @@ def test_contingency_and_overlaps_by_hand() -> None:
 def test_matthews_correlation_is_that_of_the_masks() -> None:
     rng = np.random.default_rng(0)
     true, found = rng.integers(-1, 3, 200), rng.integers(-1, 4, 200)
-    _, mcc = overlaps(true, found, 3, 4)
+    _, mcc = compute_overlaps(true, found, 3, 4)
     for i in range(3):
         for j in range(4):
             assert mcc[i, j] == pytest.approx(np.corrcoef(true == i, found == j)[0, 1])
@@ -108,23 +108,23 @@ def test_names_of_rooms_and_order_of_places_do_not_matter(true, found, a, b, ord
     renamed = [np.append(p, -1)[x][list(order)] for p, x in ((a, true), (b, found))]
     after = score_rooms(*renamed, 5, np.ones(5, bool))
     assert after.iou == pytest.approx(before.iou)
-    assert consistency(*renamed) == pytest.approx(consistency(true, found), nan_ok=True)
+    assert compute_consistency(*renamed) == pytest.approx(compute_consistency(true, found), nan_ok=True)
 
 
 @COMPILED
 @given(LABELS, LABELS)
 def test_consistency_is_symmetric(a, b) -> None:
-    assert consistency(a, b) == pytest.approx(consistency(b, a), nan_ok=True)
-    assert (a < 0).all() or consistency(a, a) == 1
+    assert compute_consistency(a, b) == pytest.approx(compute_consistency(b, a), nan_ok=True)
+    assert (a < 0).all() or compute_consistency(a, a) == 1
 
 
 def test_consistency_by_hand() -> None:
     a, b = places((0, 0, 30), (1, 1, 18), (1, 2, 12))
-    assert consistency(a, b) == pytest.approx((1 + 18 / 30) / 3)
-    assert consistency(a, b, every=False) == pytest.approx((1 + 18 / 30) / 2)
-    assert consistency(a, b, least=15) == pytest.approx((1 + 18 / 30) / 2)
-    assert consistency(a, np.full(60, -1)) == 0
-    assert np.isnan(consistency(np.full(3, -1), np.full(3, -1)))
+    assert compute_consistency(a, b) == pytest.approx((1 + 18 / 30) / 3)
+    assert compute_consistency(a, b, every=False) == pytest.approx((1 + 18 / 30) / 2)
+    assert compute_consistency(a, b, least=15) == pytest.approx((1 + 18 / 30) / 2)
+    assert compute_consistency(a, np.full(60, -1)) == 0
+    assert np.isnan(compute_consistency(np.full(3, -1), np.full(3, -1)))
 
 
 def test_doors() -> None:
@@ -155,9 +155,9 @@ def test_edges() -> None:
 
 
 def test_storeys() -> None:
-    assert storeys_right(np.array([0.0, 3.0]), np.array([3.4, -0.2]))
-    assert not storeys_right(np.array([0.0, 3.0]), np.array([0.0, 3.6]))
-    assert not storeys_right(np.array([0.0]), np.array([0.0, 3.0]))
+    assert is_storeys_right(np.array([0.0, 3.0]), np.array([3.4, -0.2]))
+    assert not is_storeys_right(np.array([0.0, 3.0]), np.array([0.0, 3.6]))
+    assert not is_storeys_right(np.array([0.0]), np.array([0.0, 3.0]))
 
 
 @pytest.mark.parametrize(
@@ -174,9 +174,9 @@ def test_storeys() -> None:
     ],
 )
 def test_a_pose_is_right_in_space_or_on_its_storey(error, flat, good) -> None:
-    assert pose_right(error, flat, (0.5, 5.0)) == good
+    assert is_pose_right(error, flat, (0.5, 5.0)) == good
 
 
 def test_storeys_are_nearer_to_their_own_floor() -> None:
     for height in (2.8, 3.2, 4.0):
-        assert on_storey(0.0) and on_storey(0.1 * height) and not on_storey(height) and not on_storey(-0.9 * height)
+        assert is_on_storey(0.0) and is_on_storey(0.1 * height) and not is_on_storey(height) and not is_on_storey(-0.9 * height)

@@ -30,10 +30,10 @@ def test_probabilities(torch):
 def test_a_perceptron_is_rectified_between_its_layers_only(torch):
     layers = [(normal(4, 6), normal(6)), (normal(6, 6), normal(6)), (normal(6, 2), normal(2))]
     x = normal(9, 4)
-    wanted = torch.from_numpy(x)
+    requested = torch.from_numpy(x)
     for k, (weight, bias) in enumerate(layers):
-        wanted = torch.nn.functional.linear(
-            wanted.relu() if k else wanted, torch.from_numpy(weight.T.copy()), torch.from_numpy(bias)
+        requested = torch.nn.functional.linear(
+            requested.relu() if k else requested, torch.from_numpy(weight.T.copy()), torch.from_numpy(bias)
         )
-    out = numpy_nn.perceptron(x, layers)
-    assert np.allclose(out, wanted) and (out < 0).any()
+    out = numpy_nn.apply_mlp(x, layers)
+    assert np.allclose(out, requested) and (out < 0).any()

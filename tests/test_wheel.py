@@ -62,8 +62,8 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_wheel_holds_every_file(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         inside = set(archive.namelist())
-    wanted = {name if name.startswith("topomerge/") else f"topomerge/{name}" for name in tracked() if (ROOT / name).exists()}
-    assert wanted <= inside, f"not in the wheel: {sorted(wanted - inside)}"
+    requested = {name if name.startswith("topomerge/") else f"topomerge/{name}" for name in tracked() if (ROOT / name).exists()}
+    assert requested <= inside, f"not in the wheel: {sorted(requested - inside)}"
     others = {name for name in inside if not name.startswith("topomerge/") and ".dist-info/" not in name}
     assert not others, f"installed beside topomerge: {sorted(others)}"
     assert "topomerge/py.typed" in inside

@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from topomerge.extraction.voxels import voxelise as voxelise
     from topomerge.fusion.atlas.find import find as find
     from topomerge.fusion.atlas.result import AtlasResult as AtlasResult
-    from topomerge.fusion.atlas.solve import atlas as atlas
+    from topomerge.fusion.atlas.solve import build_atlas as build_atlas
     from topomerge.fusion.pipeline import merge as merge
     from topomerge.fusion.result import MergeResult as MergeResult
     from topomerge.io.exports import save_export as save_export
-    from topomerge.io.listing import map_to_json as map_to_json
+    from topomerge.io.listing import convert_map_to_json as convert_map_to_json
     from topomerge.io.listing import save_json as save_json
     from topomerge.io.maps import load_map as load_map
     from topomerge.io.maps import save_map as save_map
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from topomerge.types import Sim3 as Sim3
     from topomerge.types import TopometricMap as TopometricMap
     from topomerge.types import VoxelGrid as VoxelGrid
-    from topomerge.viz.atlas_report import atlas_html as atlas_html
-    from topomerge.viz.figures import plan_figure as plan_figure
+    from topomerge.viz.atlas_report import render_atlas_html as render_atlas_html
+    from topomerge.viz.figures import plot_plan as plot_plan
     from topomerge.viz.figures import save_figure as save_figure
     from topomerge.viz.merge_report import save_merge as save_merge
     from topomerge.viz.report import save_report as save_report
@@ -55,14 +55,14 @@ _HOMES = {
     "Sim3": "topomerge.types",
     "TopometricMap": "topomerge.types",
     "VoxelGrid": "topomerge.types",
-    "atlas": "topomerge.fusion.atlas.solve",
-    "atlas_html": "topomerge.viz.atlas_report",
+    "build_atlas": "topomerge.fusion.atlas.solve",
+    "render_atlas_html": "topomerge.viz.atlas_report",
     "extract": "topomerge.extraction.extract",
     "load_embedder": "topomerge.embedding.learned",
     "load_map": "topomerge.io.maps",
-    "map_to_json": "topomerge.io.listing",
+    "convert_map_to_json": "topomerge.io.listing",
     "merge": "topomerge.fusion.pipeline",
-    "plan_figure": "topomerge.viz.figures",
+    "plot_plan": "topomerge.viz.figures",
     "read_chunks": "topomerge.io.points",
     "read_points": "topomerge.io.points",
     "save_export": "topomerge.io.exports",
@@ -75,11 +75,20 @@ _HOMES = {
     "voxelise": "topomerge.extraction.voxels",
 }
 
+# Deprecated names of 0.1: they give what they gave.
+_RENAMED = {
+    "atlas": "build_atlas",
+    "atlas_html": "render_atlas_html",
+    "map_to_json": "convert_map_to_json",
+    "plan_figure": "plot_plan",
+}
+
 __all__ = ["__version__", *_HOMES]
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name from its home (PEP 562)."""
+    name = _RENAMED.get(name, name)
     if name not in _HOMES:
         raise AttributeError(f"module 'topomerge' has no attribute {name!r}")
     value = getattr(import_module(_HOMES[name]), name)

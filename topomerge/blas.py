@@ -12,8 +12,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:
-    """The function, in which NumPy's and SciPy's linear algebra takes one thread; afterwards as many as before.
+def limit_blas_threads(function: Callable[P, R]) -> Callable[P, R]:
+    """Return the function, in which NumPy's and SciPy's linear algebra takes one thread; afterwards as many as before.
 
     Matrices here are small. More threads of BLAS wait for each other, and by waiting busily they take the processor from the
     compiled loops, which use all cores; and sums come out the same on machines with any number of cores. Called from another

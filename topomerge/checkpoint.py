@@ -19,7 +19,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from topomerge.embedding.weights import STATE_FILE as EMBEDDER_STATE
+from topomerge.embedding.learned import STATE_FILE as EMBEDDER_STATE
 from topomerge.errors import InputError
 
 STATE_FORMAT = 3
@@ -42,8 +42,8 @@ def save_state(
         shutil.rmtree(stale, ignore_errors=True)
     new.mkdir(parents=True)
     write(new)
-    (new / OPTIMIZER_FILE).write_bytes(save(_flat(optimizer)))
-    digests = {path.name: _digest(path) for path in sorted(new.iterdir())}
+    (new / OPTIMIZER_FILE).write_bytes(save(_flatten_state(optimizer)))
+    digests = {path.name: _compute_digest(path) for path in sorted(new.iterdir())}
     state = {"format": STATE_FORMAT, "class": STATE_CLASS, "sha256": digests, "progress": dict(progress)}
     (new / STATE_FILE).write_text(json.dumps(state, indent=1) + "\n", encoding="utf-8")
     if folder.exists():
@@ -98,7 +98,7 @@ def load_state(
             f"{folder / STATE_FILE}: has format {state.get('format')!r}, this program reads {STATE_FORMAT}; start again"
         )
     for name in {*state["sha256"], weights, OPTIMIZER_FILE}:
-        if not (folder / name).exists() or _digest(folder / name) != state["sha256"].get(name):
+        if not (folder / name).exists() or _compute_digest(folder / name) != state["sha256"].get(name):
             raise InputError(f"{folder / name}: missing, cut off, or not of this state; start again without resume")
     try:
         network.load_state_dict(load((folder / weights).read_bytes()))
@@ -110,11 +110,11 @@ def load_state(
     return progress
 
 
-def _digest(path: Path) -> str:
+def _compute_digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _flat(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+def _flatten_state(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
     state = optimizer.state_dict()["state"]
     return {f"{k}.{name}": value.detach().cpu().contiguous() for k, of in state.items() for name, value in of.items()}
 

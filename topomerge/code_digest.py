@@ -3,9 +3,11 @@
     key = code_digest("topomerge.extraction.extract")     # of everything that `extract` may run
     key = data_digest("topomerge.extraction.extract")     # of its packaged weights and tables only
 
-A cache whose files are cheap to make again puts `code_digest` of the module that makes them into their names: no edit, neither of
+A cache whose files are cheap to make again puts `compute_code_digest` of the module that makes them into their names: no edit,
+neither of
 a kernel three imports away nor of `calibration.json`, can leave an old file in use. A cache whose files take hours puts a version
-number of its steps there instead, which whoever changes their results raises, and `data_digest`: packaged weights change without
+number of its steps there instead, which whoever changes their results raises, and `compute_data_digest`: packaged weights change
+without
 anyone reading code. Name the modules that *make* the files, not those that only score or print them.
 
 The walk reads syntax trees and imports nothing, so that it needs no torch and costs a second or two, once a process. It follows
@@ -40,8 +42,8 @@ NETWORKS, NETWORK, CARD = "networks", ".onnx", ".card.json"  # folder of the net
 
 
 @cache
-def code_digest(*modules: str, package: Path = HERE) -> str:
-    """Hash of modules, of all that they import within the house, and of the data files that these read.
+def compute_code_digest(*modules: str, package: Path = HERE) -> str:
+    """Compute the hash of modules, of all that they import within the house, and of the data files that these read.
 
     Args:
         modules: full names, such as ``"topomerge.extraction.extract"``; their order counts for nothing.
@@ -50,39 +52,40 @@ def code_digest(*modules: str, package: Path = HERE) -> str:
     Raises:
         ModuleNotFoundError: no such module.
     """
-    files = reached(*modules, package=package)
-    lines = [f"{name} {_source(path).hash}" for name, path in files.items()]
-    return _hash("\n".join([*lines, *_data_lines(files, package)]))
+    files = find_reached_modules(*modules, package=package)
+    lines = [f"{name} {_read_source(path).hash}" for name, path in files.items()]
+    return _compute_hash("\n".join([*lines, *_list_data_lines(files, package)]))
 
 
 @cache
-def data_digest(*modules: str, package: Path = HERE) -> str:
-    """As `code_digest`, of the data files alone: weights and tables that were trained or measured."""
-    return _hash("\n".join(_data_lines(reached(*modules, package=package), package)))
+def compute_data_digest(*modules: str, package: Path = HERE) -> str:
+    """Compute the digest of the data files alone (see `compute_code_digest`): weights and tables that were trained or
+    measured."""
+    return _compute_hash("\n".join(_list_data_lines(find_reached_modules(*modules, package=package), package)))
 
 
 @cache
-def reached(*modules: str, package: Path = HERE) -> dict[str, Path]:
+def find_reached_modules(*modules: str, package: Path = HERE) -> dict[str, Path]:
     """Name -> file of modules and of all that they import within the house, sorted by name."""
     files: dict[str, Path] = {}
     waiting = list(modules)
     for module in modules:
-        if _file_of(module, package) is None:
+        if _find_module_file(module, package) is None:
             raise ModuleNotFoundError(f"{module}: no such module below {package}", name=module)
     while waiting:
         module = waiting.pop()
-        path = _file_of(module, package)
+        path = _find_module_file(module, package)
         if path is None or module in files or module == TOP:
             continue
         files[module] = path
         waiting.append(module.rpartition(".")[0])
-        waiting += _imports(path, package)
+        waiting += _iter_imports(path, package)
     return dict(sorted(files.items()))
 
 
-def data_files(path: Path, package: Path = HERE) -> list[Path]:
+def find_data_files(path: Path, package: Path = HERE) -> list[Path]:
     """Data files that a module names, beside it, in a folder beside it, or among the networks; sorted."""
-    texts = _source(path).texts
+    texts = _read_source(path).texts
     files = []
     for entry in path.parent.iterdir():
         if entry.is_dir():
@@ -97,23 +100,23 @@ def data_files(path: Path, package: Path = HERE) -> list[Path]:
     return sorted({*files})
 
 
-def _data_lines(files: dict[str, Path], package: Path) -> list[str]:
+def _list_data_lines(files: dict[str, Path], package: Path) -> list[str]:
     """A line for each data file: its place and its hash."""
     lines = set()
     for name, path in files.items():
         above = name if path.name == "__init__.py" else name.rpartition(".")[0]
-        for file in data_files(path, package):
+        for file in find_data_files(path, package):
             inside = file.is_relative_to(path.parent)
             place = f"{above}/{file.relative_to(path.parent).as_posix()}" if inside else f"{TOP}.{NETWORKS}/{file.name}"
             lines.add(f"{place} {hashlib.sha256(file.read_bytes()).hexdigest()}")
     return sorted(lines)
 
 
-def _hash(text: str) -> str:
+def _compute_hash(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:LENGTH]
 
 
-def _file_of(module: str, package: Path) -> Path | None:
+def _find_module_file(module: str, package: Path) -> Path | None:
     """File of a module of the house; None of anything else, such as a function's name behind its module's."""
     top, *parts = module.split(".")
     if top != TOP:
@@ -138,20 +141,20 @@ class _Source:
 
 
 @cache
-def _source(path: Path) -> _Source:
-    return _source_of(path.read_text(encoding="utf-8"))
+def _read_source(path: Path) -> _Source:
+    return _parse_source(path.read_text(encoding="utf-8"))
 
 
 @cache
-def _source_of(text: str) -> _Source:
+def _parse_source(text: str) -> _Source:
     """Of a file's text: the same file of another copy of the package is not read a second time."""
-    reading = _Reading()
+    reading = _SourceReader()
     reading.read(ast.parse(text))
     words = hashlib.sha256("\n".join(reading.words).encode())
     return _Source(words.hexdigest(), frozenset(reading.names), frozenset(reading.texts))
 
 
-class _Reading:
+class _SourceReader:
     """One pass over a syntax tree, which is all that the walk costs."""
 
     def __init__(self) -> None:
@@ -167,7 +170,7 @@ class _Reading:
         """
         counts = counts and not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test))
         if counts:
-            self.names.update(_named(node))
+            self.names.update(_iter_imported_names(node))
         self.words.append(node.__class__.__name__)
         for field in node._fields:
             value = getattr(node, field, None)
@@ -184,7 +187,7 @@ class _Reading:
         self.words.append("end")
 
 
-def _named(node: ast.AST) -> Iterator[str]:
+def _iter_imported_names(node: ast.AST) -> Iterator[str]:
     """What a node of a syntax tree imports, or takes from the library's face."""
     if isinstance(node, ast.Import):
         yield from (alias.name for alias in node.names)
@@ -201,15 +204,15 @@ def _named(node: ast.AST) -> Iterator[str]:
             yield str(name.values[0].value).rpartition(".")[0] + ".*"
 
 
-def _imports(path: Path, package: Path) -> Iterator[str]:
+def _iter_imports(path: Path, package: Path) -> Iterator[str]:
     """Names in the house that a file imports; those behind a module's name may be functions or classes of it."""
-    homes = _homes(package)
-    for name in _source(path).names:
+    homes = _read_homes(package)
+    for name in _read_source(path).names:
         name = homes.get(name, name)
         if name.split(".")[0] != TOP:
             continue
         folder, _, last = name.rpartition(".")
-        init = _file_of(folder, package) if last == "*" else None
+        init = _find_module_file(folder, package) if last == "*" else None
         if init is None:
             yield name
         else:
@@ -217,7 +220,7 @@ def _imports(path: Path, package: Path) -> Iterator[str]:
 
 
 @cache
-def _homes(package: Path) -> dict[str, str]:
+def _read_homes(package: Path) -> dict[str, str]:
     """``topomerge.extract`` -> the module that it comes from: `_HOMES` of the face."""
     for node in ast.parse((package / "__init__.py").read_text(encoding="utf-8")).body:
         if isinstance(node, ast.Assign) and [ast.unparse(t) for t in node.targets] == ["_HOMES"]:

@@ -13,7 +13,7 @@ Schema = TypeVar("Schema")
 
 
 def compose(name: str, schema: type[Schema], words: Sequence[str] = ()) -> Schema:
-    """The settings of `configs/<name>.yaml`, overridden by words like ``data=train_small jobs=2 data.pairs=10``.
+    """Return the settings of `configs/<name>.yaml`, overridden by words like ``data=train_small jobs=2 data.pairs=10``.
 
     Every key must be a field of the dataclass `schema` and every value of its type; a field with a default may be absent.
 
@@ -32,8 +32,8 @@ def compose(name: str, schema: type[Schema], words: Sequence[str] = ()) -> Schem
         with initialize_config_module("topomerge.configs", version_base="1.3"):
             given = hydra_compose(name, overrides=list(words))
     except (HydraException, OmegaConfBaseException) as error:
-        raise InputError(_one_line(error)) from error
-    return typed(given, schema)
+        raise InputError(_shorten_error(error)) from error
+    return convert_to_dataclass(given, schema)
 
 
 def register(name: str, schema: type[Any], group: str | None = None) -> None:
@@ -64,8 +64,8 @@ def _open_tables(node: Any) -> None:
                 _open_tables(value)
 
 
-def typed(given: Any, schema: type[Schema]) -> Schema:
-    """What Hydra composed, as a dataclass.
+def convert_to_dataclass(given: Any, schema: type[Schema]) -> Schema:
+    """Convert what Hydra composed to a dataclass.
 
     Raises:
         InputError: one line with the key's name.
@@ -78,11 +78,11 @@ def typed(given: Any, schema: type[Schema]) -> Schema:
         merged: Any = OmegaConf.merge(OmegaConf.structured(schema), plain)
         settings: Schema = OmegaConf.to_object(merged)  # type: ignore[assignment]
     except OmegaConfBaseException as error:
-        raise InputError(_one_line(error)) from error
+        raise InputError(_shorten_error(error)) from error
     return settings
 
 
-def _one_line(error: Exception) -> str:
+def _shorten_error(error: Exception) -> str:
     """What Hydra and OmegaConf say in many lines; the innermost reason is the one that names the key's fault."""
     texts = [str(error)]
     if error.__cause__ is not None and str(error.__cause__) not in texts[0]:
@@ -101,7 +101,7 @@ def name_by_sweep(words: Sequence[str]) -> list[str]:
     try:
         overrides = OverridesParser.create().parse_overrides([word for word in words if not word.startswith("-")])
     except HydraException as error:
-        raise InputError(_one_line(error)) from error
+        raise InputError(_shorten_error(error)) from error
     fixed = [one.key_or_group for one in overrides if not one.is_sweep_override() and not one.key_or_group.startswith("hydra")]
     return [*words, f"hydra.job.config.override_dirname.exclude_keys=[{','.join(fixed)}]"]
 

@@ -16,7 +16,7 @@ MEMORY_WORDS = (
 
 
 def is_memory_short(error: BaseException | None) -> bool:
-    """Does an error, or one that it comes from, say that there is not enough memory?"""
+    """Return whether an error, or one that it comes from, says that there is not enough memory."""
     seen: set[int] = set()
     while error is not None and id(error) not in seen:
         seen.add(id(error))
@@ -29,6 +29,6 @@ def is_memory_short(error: BaseException | None) -> bool:
     return False
 
 
-def printable(text: str) -> str:
-    """A text that may come from a stranger's file, without what would steer a terminal."""
+def make_printable(text: str) -> str:
+    """Make a text from a stranger's file safe for a terminal, without what would steer it."""
     return "".join(c if c.isprintable() or c == "\n" else "\N{REPLACEMENT CHARACTER}" for c in text)

@@ -46,17 +46,17 @@ class Scores:
     right: int
 
     @staticmethod
-    def of(right: int, true: int, extracted: int) -> Scores:
-        """From the numbers of right, true and found ones."""
-        return Scores(_ratio(right, extracted), _ratio(right, true), true, extracted, right)
+    def from_counts(right: int, true: int, extracted: int) -> Scores:
+        """Compute scores from the numbers of right, true and found ones."""
+        return Scores(_compute_ratio(right, extracted), _compute_ratio(right, true), true, extracted, right)
 
 
-def _ratio(part: float, whole: float) -> float:
+def _compute_ratio(part: float, whole: float) -> float:
     return part / whole if whole else float("nan")
 
 
-def contingency(true: Array, extracted: Array, trues: int, extracted_rooms: int) -> Array:
-    """(trues, extracted_rooms) int64: places that have true room i and found room j.
+def count_contingency(true: Array, extracted: Array, trues: int, extracted_rooms: int) -> Array:
+    """Count (trues, extracted_rooms) int64: places that have true room i and found room j.
 
     Args:
         true, extracted: (n,) labels of the same places, -1 none.
@@ -66,12 +66,12 @@ def contingency(true: Array, extracted: Array, trues: int, extracted_rooms: int)
     return np.bincount(pair, minlength=trues * extracted_rooms).reshape(trues, extracted_rooms)
 
 
-def overlaps(true: Array, extracted: Array, trues: int, extracted_rooms: int) -> tuple[Array, Array]:
+def compute_overlaps(true: Array, extracted: Array, trues: int, extracted_rooms: int) -> tuple[Array, Array]:
     """IoU and Matthews correlation (trues, extracted_rooms) of the mask of each true room against the mask of each found one.
 
     The correlation is over all places given, 0 where one of the masks is empty or full.
     """
-    both = contingency(true, extracted, trues, extracted_rooms).astype(float)
+    both = count_contingency(true, extracted, trues, extracted_rooms).astype(float)
     of_true = np.bincount(true[true >= 0], minlength=trues).astype(float)[:, None]
     of_extracted = np.bincount(extracted[extracted >= 0], minlength=extracted_rooms).astype(float)[None]
     total = float(len(true))
@@ -93,7 +93,7 @@ def assign(iou: Array) -> Array:
 
 
 def score_rooms(true: Array, extracted: Array, trues: int, counted: Array, expected: Array | None = None) -> RoomScores:
-    """Rooms found against true ones.
+    """Score the rooms found against true ones.
 
     Mean IoU: of the one-to-one assignment, over all expected true rooms; one that got no room counts 0. Precision and recall:
     found rooms that count and expected true rooms that are assigned to each other with an IoU of at least 0.5. MCC: Matthews
@@ -107,7 +107,7 @@ def score_rooms(true: Array, extracted: Array, trues: int, counted: Array, expec
         expected: (trues,) bool, true rooms that should have been found; None: all.
     """
     expected = np.ones(trues, bool) if expected is None else expected
-    iou, mcc = overlaps(true, extracted, trues, len(counted))
+    iou, mcc = compute_overlaps(true, extracted, trues, len(counted))
     iou[~expected] = 0
     assigned = assign(iou)
     rows, taken = np.arange(trues), np.maximum(assigned, 0)
@@ -120,10 +120,10 @@ def score_rooms(true: Array, extracted: Array, trues: int, counted: Array, expec
     claims = len(right | set(np.flatnonzero(counted).tolist()))
     count = int(expected.sum())
     return RoomScores(
-        iou=_ratio(float(each.sum()), count),
-        precision=_ratio(int(good.sum()), claims),
-        recall=_ratio(int(good.sum()), count),
-        mcc=_ratio(float(each_mcc[expected].sum()), count),
+        iou=_compute_ratio(float(each.sum()), count),
+        precision=_compute_ratio(int(good.sum()), claims),
+        recall=_compute_ratio(int(good.sum()), count),
+        mcc=_compute_ratio(float(each_mcc[expected].sum()), count),
         each=each,
         each_mcc=each_mcc,
         assigned=assigned,
@@ -146,7 +146,7 @@ def match_places(true: Array, extracted: Array, plan: float = PLAN, height: floa
 
 
 def score_doors(true: Array, extracted: Array, counted: Array, others: Array | None = None) -> Scores:
-    """Doors found against true ones, one to one, by where they are (`match_places`).
+    """Score the doors found against true ones, one to one, by where they are (`match_places`).
 
     Args:
         true: (n, 3) centres of the doors that should be found, m.
@@ -158,7 +158,7 @@ def score_doors(true: Array, extracted: Array, counted: Array, others: Array | N
     left = np.setdiff1d(np.flatnonzero(counted), pairs[:, 1])
     if others is not None and len(left):
         left = np.delete(left, match_places(others, extracted[left])[:, 1])
-    return Scores.of(len(pairs), len(true), len(pairs) + len(left))
+    return Scores.from_counts(len(pairs), len(true), len(pairs) + len(left))
 
 
 def score_edges(true: Iterable[Iterable[int]], extracted: Array, assigned: Array, counted: Array) -> Scores:
@@ -170,7 +170,7 @@ def score_edges(true: Iterable[Iterable[int]], extracted: Array, assigned: Array
         assigned: (T,) the found room of each true one, -1 none.
         counted: (F,) bool, found rooms that are wrong if they are no true room; pairs with another one are left out.
     """
-    wanted = {frozenset(map(int, pair)) for pair in true}
+    requested = {frozenset(map(int, pair)) for pair in true}
     of = np.full(len(counted), -1)
     of[assigned[assigned >= 0]] = np.flatnonzero(assigned >= 0)
     got, false = set(), set()
@@ -180,16 +180,16 @@ def score_edges(true: Iterable[Iterable[int]], extracted: Array, assigned: Array
             got.add(pair)
         elif counted[a] and counted[b]:
             false.add(frozenset((a, b)))
-    return Scores.of(len(wanted & got), len(wanted), len(got) + len(false))
+    return Scores.from_counts(len(requested & got), len(requested), len(got) + len(false))
 
 
-def storeys_right(true: Array, extracted: Array, within: float = LEVEL) -> bool:
-    """Are there as many storeys as there should be, each floor within `within` metres?"""
+def is_storeys_right(true: Array, extracted: Array, within: float = LEVEL) -> bool:
+    """Return whether there are as many storeys as there should be, each floor within `within` metres."""
     return len(true) == len(extracted) and bool((np.abs(np.sort(true) - np.sort(extracted)) <= within).all())
 
 
-def consistency(a: Array, b: Array, least: int = 0, every: bool = True) -> float:
-    """How alike two maps cut one place into rooms: 1 where they agree; the same either way round.
+def compute_consistency(a: Array, b: Array, least: int = 0, every: bool = True) -> float:
+    """Compute how alike two maps cut one place into rooms: 1 where they agree; symmetric.
 
     The sum of the IoU of the rooms assigned to each other one to one, divided by the number of rooms of the map that has more, so
     that a room that is split in one of them costs; or, without `every`, of the map that has fewer: the mean of those assigned.
@@ -200,7 +200,7 @@ def consistency(a: Array, b: Array, least: int = 0, every: bool = True) -> float
         least: rooms with fewer places than this in their own map are not asked for.
     """
     counts = [np.bincount(x[x >= 0], minlength=1) for x in (a, b)]
-    iou, _ = overlaps(a, b, len(counts[0]), len(counts[1]))
+    iou, _ = compute_overlaps(a, b, len(counts[0]), len(counts[1]))
     sizes = [c >= max(least, 1) for c in counts]
     iou = iou[sizes[0]][:, sizes[1]]
     if not iou.size:
@@ -209,8 +209,8 @@ def consistency(a: Array, b: Array, least: int = 0, every: bool = True) -> float
     return float(iou[i, j].sum() / (max(iou.shape) if every else min(iou.shape)))
 
 
-def on_storey(vertical: float) -> bool:
-    """Does a pose that is so many metres too high or too low lay a slice or a drawing on its own storey?
+def is_on_storey(vertical: float) -> bool:
+    """Return whether a pose with this vertical error, m, puts a slice or a drawing on its own storey.
 
     They tell no height, so that registration takes it from the floors: a slice is laid 0.3 m above one, a drawing on one. On the
     right floor that is within half a metre; another floor is a storey's height off.
@@ -218,14 +218,14 @@ def on_storey(vertical: float) -> bool:
     return abs(vertical) < OFF_STOREY
 
 
-def pose_right(error: Sequence[float], flat: bool, limits: tuple[float, float]) -> bool:
-    """Is a pose right?
+def is_pose_right(error: Sequence[float], flat: bool, limits: tuple[float, float]) -> bool:
+    """Return whether a pose is right.
 
     Args:
         error: horizontal and vertical, m, and of the yaw, degrees.
         flat: one of the maps is a slice or a drawing, which has no height of its own: the distance is the horizontal one, and
-            the pose must be `on_storey`.
+            the pose must be `is_on_storey`.
         limits: m, degrees.
     """
     far = error[0] if flat else float(np.hypot(error[0], error[1]))
-    return far < limits[0] and error[2] < limits[1] and (not flat or on_storey(error[1]))
+    return far < limits[0] and error[2] < limits[1] and (not flat or is_on_storey(error[1]))

@@ -10,17 +10,17 @@ from topomerge.types import Array
 
 
 def sigmoid(x: Array) -> Array:
-    """Logits as probabilities."""
+    """Return logits as probabilities."""
     return np.asarray(1 / (1 + np.exp(-x)))
 
 
 def softmax(logits: Array) -> Array:
-    """Logits as probabilities that sum to 1 along the last axis."""
+    """Return logits as probabilities that sum to 1 along the last axis."""
     weight = np.exp(logits - logits.max(axis=-1, keepdims=True))
     return np.asarray(weight / weight.sum(axis=-1, keepdims=True))
 
 
-def perceptron(x: Array, layers: Sequence[tuple[Array, Array]]) -> Array:
+def apply_mlp(x: Array, layers: Sequence[tuple[Array, Array]]) -> Array:
     """(n, in) -> (n, out): linear layers (weight (in, out), bias (out,)), rectified between each other."""
     for k, (weight, bias) in enumerate(layers):
         x = (np.maximum(x, 0) if k else x) @ weight + bias

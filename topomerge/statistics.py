@@ -20,7 +20,7 @@ NEAR_ZERO = 0.1  # probabilities below it are the mass near zero, which makes an
 CHANCE_ROUNDS = 500
 
 
-def exact_interval(hits: int, n: int) -> tuple[float, float]:
+def compute_exact_interval(hits: int, n: int) -> tuple[float, float]:
     """Ends of the 95 % interval of a share of which `hits` of `n` were seen (Clopper & Pearson, Biometrika 1934); 0 and 1 where
     n is 0.
 
@@ -45,14 +45,14 @@ def estimate_mean(values: Array) -> tuple[float, float, float]:
     return mean, mean - half, mean + half
 
 
-def bootstrap(values: Array, groups: Array, rounds: int = 2000, seed: int = 0) -> tuple[float, float, float]:
-    """Mean of values and the ends of its 95 % confidence interval, drawing whole groups (buildings) with replacement.
+def bootstrap_mean(values: Array, groups: Array, rounds: int = 2000, seed: int = 0) -> tuple[float, float, float]:
+    """Return mean of values and the ends of its 95 % confidence interval, drawing whole groups (buildings) with replacement.
 
     Args:
         values: (n,), nan where a value does not exist: left out.
         groups: (n,) what each value belongs to.
     """
-    total, count = _sums(values, groups)
+    total, count = _sum_groups(values, groups)
     if not len(total):
         return float("nan"), float("nan"), float("nan")
     drawn = np.random.default_rng(seed).integers(len(total), size=(rounds, len(total)))
@@ -61,21 +61,23 @@ def bootstrap(values: Array, groups: Array, rounds: int = 2000, seed: int = 0) -
     return float(total.sum() / count.sum()), low, high
 
 
-def interval_text(values: Array, groups: Array, digits: int = 2, unit: float = 1.0) -> str:
+def format_interval(values: Array, groups: Array, digits: int = 2, unit: float = 1.0) -> str:
     """A mean with its interval by `bootstrap`, `0.62 [0.50, 0.71]`; of fewer than eight groups with the range of the groups'
     means instead, `0.71, 0.62–0.91 (4 buildings)`; a dash where there is no value. A share that is 0 or 1 throughout has the
-    `exact_interval` over groups: drawing equal values again says nothing.
+    `compute_exact_interval` over groups: drawing equal values again says nothing.
 
     Args:
         values, groups: as of `bootstrap`.
         digits: behind the point.
         unit: what values are multiplied by: 100 for per cent.
     """
-    total, count = _sums(values, groups)
+    total, count = _sum_groups(values, groups)
     if not len(total):
         return "–"
     share = float(total.sum() / count.sum())
-    ends = exact_interval(int(share) * len(total), len(total)) if share in (0.0, 1.0) else bootstrap(values, groups)[1:]
+    ends = (
+        compute_exact_interval(int(share) * len(total), len(total)) if share in (0.0, 1.0) else bootstrap_mean(values, groups)[1:]
+    )
     mean, low, high = (f"{unit * v:.{digits}f}" for v in (share, *ends))
     if len(total) >= FEWEST_GROUPS:
         return f"{mean} [{low}, {high}]"
@@ -85,7 +87,7 @@ def interval_text(values: Array, groups: Array, digits: int = 2, unit: float = 1
     return f"{mean}, {means.min():.{digits}f}–{means.max():.{digits}f} ({len(total)} buildings)"
 
 
-def _sums(values: Array, groups: Array) -> tuple[Array, Array]:
+def _sum_groups(values: Array, groups: Array) -> tuple[Array, Array]:
     """Sum and number of the finite values of each group that has any."""
     values, groups = np.asarray(values, float), np.asarray(groups)
     finite = np.isfinite(values)
@@ -114,8 +116,8 @@ class Calibration:
     above: Calibration | None = None
 
 
-def calibration(probability: Sequence[float] | Array, right: Sequence[bool] | Array, bins: int = 10) -> Calibration:
-    """Probabilities against what came true, in bins of equal mass, with and without the mass near zero.
+def measure_calibration(probability: Sequence[float] | Array, right: Sequence[bool] | Array, bins: int = 10) -> Calibration:
+    """Measure probabilities against what came true, in bins of equal mass, with and without the mass near zero.
 
     Equal probabilities are in one bin, so that bins differ in size where many are equal; empty ones are left out.
 
@@ -125,11 +127,11 @@ def calibration(probability: Sequence[float] | Array, right: Sequence[bool] | Ar
     """
     p, y = np.asarray(probability, float), np.asarray(right, float)
     high = p >= NEAR_ZERO
-    above = Calibration(*_reliability(p[high], y[high], bins)) if high.any() else None
-    return Calibration(*_reliability(p, y, bins), above)
+    above = Calibration(*_compute_reliability(p[high], y[high], bins)) if high.any() else None
+    return Calibration(*_compute_reliability(p, y, bins), above)
 
 
-def _reliability(p: Array, y: Array, bins: int) -> tuple[float, float, Array, Array, Array]:
+def _compute_reliability(p: Array, y: Array, bins: int) -> tuple[float, float, Array, Array, Array]:
     """The error, and what it is by chance; number, mean, and share that is right of each bin."""
     if not len(p):
         return float("nan"), float("nan"), np.zeros(0, int), np.zeros(0), np.zeros(0)
@@ -143,8 +145,10 @@ def _reliability(p: Array, y: Array, bins: int) -> tuple[float, float, Array, Ar
     return float(np.abs((share - mean) * count).sum() / len(p)), float(by_chance), count, mean, share
 
 
-def precision_recall(score: Sequence[float] | Array, right: Sequence[bool] | Array, possible: int) -> tuple[Array, Array, Array]:
-    """What a verdict by a threshold gives, for every threshold: (thresholds, precision, recall), each (k,), the strictest first.
+def compute_precision_recall(
+    score: Sequence[float] | Array, right: Sequence[bool] | Array, possible: int
+) -> tuple[Array, Array, Array]:
+    """Compute (thresholds, precision, recall), each (k,), of a verdict for every threshold, the strictest first.
 
     Args:
         score: (n,) of each answer; believed are those that reach the threshold.

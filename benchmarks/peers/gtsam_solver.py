@@ -23,7 +23,7 @@ from topomerge.registration.bend import alignment as alignments
 from topomerge.registration.bend.alignment import Alignment
 from topomerge.registration.bend.bend import WINDOWS, settle_all
 from topomerge.registration.bend.graph import OUTLIER, Joints, Measurements, settle
-from topomerge.registration.bend.pieces import sensor_drift
+from topomerge.registration.bend.pieces import get_sensor_drift
 from topomerge.registration.prepared import prepare
 from topomerge.types import Array, Sim3, VoxelGrid
 
@@ -69,7 +69,7 @@ def _line(start: tuple[float, float], end: tuple[float, float]) -> Array:
     return np.linspace(start, end, count)
 
 
-def waved(points: Array) -> Array:
+def wave_points(points: Array) -> Array:
     """The points moved by waves that are long and low: drift without a jump."""
     out = points.copy()
     for k, turn in enumerate((1.0, 0.6)):
@@ -78,23 +78,23 @@ def waved(points: Array) -> Array:
     return out
 
 
-def cells_of(points: Array) -> VoxelGrid:
+def build_cells(points: Array) -> VoxelGrid:
     """Occupied cells of points."""
     low = points.min(axis=0) - EDGE
     return VoxelGrid.from_cells(np.unique(np.floor((points - low) / EDGE).astype(np.int32), axis=0), low, EDGE)
 
 
-def problem(rooms: int) -> Problem:
+def build_problem(rooms: int) -> Problem:
     """What is solved when a storey of so many rooms and a bent copy of it are brought together."""
     points = np.concatenate(storey(rooms))
-    maps = [prepare(g) for g in (cells_of(points), cells_of(POSE.inverse().apply(waved(points))))]
+    maps = [prepare(g) for g in (build_cells(points), build_cells(POSE.inverse().apply(wave_points(points))))]
     problems: list[Problem] = []
 
     def noted(anchors: Array, joints: Joints, measured: Measurements, prior: Array) -> Any:
         problems.append((anchors, joints, measured, prior))
         return settle(anchors, joints, measured, prior)
 
-    usual, original = sensor_drift("depth"), alignments.settle
+    usual, original = get_sensor_drift("depth"), alignments.settle
     alignments.settle = noted  # type: ignore[attr-defined]
     try:
         settle_all(Alignment(maps, (Sim3(), POSE), [(0, 1)], False), [usual, usual])
@@ -106,18 +106,18 @@ def problem(rooms: int) -> Problem:
     return anchors, joints, single, prior
 
 
-def about(place: Array) -> Array:
+def compute_effect(place: Array) -> Array:
     """(3, 3) what a small motion of the plane is at a place: shift there and turn."""
     return np.array([[1.0, 0.0, -place[1]], [0.0, 1.0, place[0]], [0.0, 0.0, 1.0]])
 
 
-def gtsam_moves(gtsam: Any, given: Problem) -> Array:
+def solve_with_gtsam(gtsam: Any, given: Problem) -> Array:
     """(n, 3) shift and turn of each piece at its anchor."""
     anchors, joints, measured, prior = given
     graph, start, sure = gtsam.NonlinearFactorGraph(), gtsam.Values(), []
 
     def add(factor: Callable[[Any], Any], place: Array, information: Array, certain: bool) -> None:
-        there = about(place)
+        there = compute_effect(place)
         if certain:
             sure.append(graph.size())
         graph.add(factor(gtsam.noiseModel.Gaussian.Information(there.T @ information @ there)))
@@ -131,7 +131,7 @@ def gtsam_moves(gtsam: Any, given: Problem) -> Array:
         add(between, anchors[[i, j]].mean(axis=0), np.diag(1 / sigma**2), True)
     for k, piece in enumerate(measured.piece.tolist()):
         place, move, other = measured.places[k], measured.moves[k], int(measured.others[k, 0])
-        motion = gtsam.Pose2.Expmap(np.linalg.solve(about(place), move))
+        motion = gtsam.Pose2.Expmap(np.linalg.solve(compute_effect(place), move))
         link = lambda noise, o=other, p=piece, m=motion: gtsam.BetweenFactorPose2(o, p, m, noise)  # noqa: E731
         add(link, place, measured.information[k] + 1e-6 * np.eye(3), False)
     params = gtsam.GncGaussNewtonParams(gtsam.GaussNewtonParams())
@@ -144,7 +144,7 @@ def gtsam_moves(gtsam: Any, given: Problem) -> Array:
     return np.array([[*(p.transformFrom(a) - a), p.theta()] for p, a in zip(poses, anchors, strict=True)])
 
 
-def timed(solve: Callable[[], Array]) -> tuple[Array, float]:
+def time_bending(solve: Callable[[], Array]) -> tuple[Array, float]:
     """What it gives, and the median of its seconds."""
     seconds = []
     for _ in range(RUNS):
@@ -162,9 +162,9 @@ def main(*rooms: str) -> None:
         raise InputError("this comparison needs GTSAM: pip install gtsam") from error
     print("rooms | pieces | measurements | apart: median, most mm | GTSAM's time over ours")
     for number in map(int, rooms or ROOMS):
-        given = problem(number)
-        ours, seconds = timed(lambda given=given: settle(*given).moves)  # type: ignore[misc]
-        theirs, others = timed(lambda given=given: gtsam_moves(gtsam, given))  # type: ignore[misc]
+        given = build_problem(number)
+        ours, seconds = time_bending(lambda given=given: settle(*given).moves)  # type: ignore[misc]
+        theirs, others = time_bending(lambda given=given: solve_with_gtsam(gtsam, given))  # type: ignore[misc]
         apart = 1000 * np.linalg.norm(ours[:, :2] - theirs[:, :2], axis=1)
         sizes = f"{number} | {len(ours)} | {len(given[2].piece)}"
         print(f"{sizes} | {np.median(apart):.1f}, {apart.max():.1f} | {others / seconds:.1f}", flush=True)

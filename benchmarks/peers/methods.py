@@ -55,7 +55,7 @@ class PeerAnswer:
     refinement_seconds: float
 
 
-def kiss(b: Array, a: Array, voxel: float) -> Iterator[tuple[str, PeerAnswer]]:
+def run_kiss(b: Array, a: Array, voxel: float) -> Iterator[tuple[str, PeerAnswer]]:
     """KISS-Matcher with rotations in space and, as ``…q``, with Quatro's yaw; clouds (n, 3) m."""
     import kiss_matcher
 
@@ -74,17 +74,17 @@ def kiss(b: Array, a: Array, voxel: float) -> Iterator[tuple[str, PeerAnswer]]:
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = np.array(solution.rotation), np.array(solution.translation).ravel()
         inliers = float(matcher.get_num_final_inliers()) if solution.valid else 0.0
-        yield variant, refine.answer(pose, {"inliers": inliers}, seconds)
+        yield variant, refine.refine_answer(pose, {"inliers": inliers}, seconds)
 
 
-def open3d(b: Array, a: Array) -> Iterator[tuple[str, PeerAnswer]]:
+def run_open3d(b: Array, a: Array) -> Iterator[tuple[str, PeerAnswer]]:
     """RANSAC and FGR with one set of features, whose time counts for both; clouds (n, 3) m."""
     import open3d as o3d
 
     o3d.utility.random.seed(0)
     reg = o3d.pipelines.registration
     begun = time.process_time()
-    (thin_b, features_b), (thin_a, features_a) = (_features(c) for c in (b, a))
+    (thin_b, features_b), (thin_a, features_a) = (_compute_features(c) for c in (b, a))
     described = time.process_time() - begun
     refine = Refinement(b, a)
     for name in ("fpfh", "fgr"):
@@ -103,7 +103,7 @@ def open3d(b: Array, a: Array) -> Iterator[tuple[str, PeerAnswer]]:
         judged = reg.evaluate_registration(thin_b, thin_a, EVALUATED_WITHIN["fitness"], solution.transformation)
         seconds = described + time.process_time() - begun
         scores = {"fitness": judged.fitness, "residual": judged.inlier_rmse}
-        yield name, refine.answer(np.array(solution.transformation), scores, seconds)
+        yield name, refine.refine_answer(np.array(solution.transformation), scores, seconds)
 
 
 class Refinement:
@@ -113,11 +113,11 @@ class Refinement:
         import open3d as o3d
 
         begun = time.process_time()
-        self.b, self.a = (_cloud(c).voxel_down_sample(edge) for c, edge in ((b, REFINED_FROM), (a, REFINED_TO)))
+        self.b, self.a = (_build_cloud(c).voxel_down_sample(edge) for c, edge in ((b, REFINED_FROM), (a, REFINED_TO)))
         self.a.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=3 * REFINED_TO, max_nn=30))
         self.prepared = time.process_time() - begun
 
-    def answer(self, pose: Array, scores: dict[str, float], seconds: float) -> PeerAnswer:
+    def refine_answer(self, pose: Array, scores: dict[str, float], seconds: float) -> PeerAnswer:
         """The answer of a solver with its refined pose and the scores of that."""
         import open3d as o3d
 
@@ -130,17 +130,17 @@ class Refinement:
         return PeerAnswer(pose, refined, scores, seconds, self.prepared + time.process_time() - begun)
 
 
-def _cloud(points: Array) -> Any:
+def _build_cloud(points: Array) -> Any:
     import open3d as o3d
 
     return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.ascontiguousarray(points, float)))
 
 
-def _features(points: Array) -> tuple[Any, Any]:
+def _compute_features(points: Array) -> tuple[Any, Any]:
     """A cloud at Open3D's voxel and its FPFH features."""
     import open3d as o3d
 
-    cloud = _cloud(points).voxel_down_sample(OPEN3D_VOXEL)
+    cloud = _build_cloud(points).voxel_down_sample(OPEN3D_VOXEL)
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=2 * OPEN3D_VOXEL, max_nn=30))
     search = o3d.geometry.KDTreeSearchParamHybrid(radius=5 * OPEN3D_VOXEL, max_nn=100)
     return cloud, o3d.pipelines.registration.compute_fpfh_feature(cloud, search)

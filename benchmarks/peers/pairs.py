@@ -13,15 +13,14 @@ from typing import Any
 
 import numpy as np
 from topomerge.datasets.pairs.evaluation_pair import load_set
-from topomerge.datasets.pairs.example import _first_pair
-from topomerge.datasets.pairs.grid_pairs import GridItem, GridPair, grid_items, load_grids
-from topomerge.datasets.pairs.items import plans_of
-from topomerge.datasets.pairs.recipe import Library
+from topomerge.datasets.pairs.example import _make_first_pair
+from topomerge.datasets.pairs.grid_pairs import GridItem, GridPair, draw_grid_items, load_grids
+from topomerge.datasets.pairs.items import Library, select_plans
 
 from topomerge.errors import InputError
-from topomerge.evaluation.grid_pairs import iterate_real_pairs, make_pair_files, read_recipe
 from topomerge.evaluation.merge_report import modality
-from topomerge.extraction.cleaning import cell_middles
+from topomerge.evaluation.tasks import iterate_real_pairs, make_pair_files, read_recipe
+from topomerge.extraction.cleaning import compute_cell_means
 from topomerge.types import Array, VoxelGrid
 
 HELDOUT = Path("cache/evaluation/heldout.jsonl")
@@ -46,21 +45,21 @@ class PeerPair:
     a: Array
 
 
-def pair_files(split: str) -> list[Path]:
+def list_pair_files(split: str) -> list[Path]:
     """Files of a split, made where they are missing."""
     return make_pair_files(split, "cache", 1, print)
 
 
-def bin_of(value: float, bins: Mapping[str, tuple[float, float]] = AREA_BINS) -> str:
+def find_bin(value: float, bins: Mapping[str, tuple[float, float]] = AREA_BINS) -> str:
     """The bin of a value; of the area that both maps saw if nothing else is said."""
     return next(name for name, (low, high) in bins.items() if low <= value < high)
 
 
-def cell_of(about: Mapping[str, Any]) -> tuple[str, str]:
+def find_cell(about: Mapping[str, Any]) -> tuple[str, str]:
     """Class of sensors, and the area in common or, of pairs that must not merge, their kind."""
     alike = about["kind"] == "overlap"
     shared = "nothing in common" if alike and about["common"] < 1 else ""
-    return modality(about), shared or (bin_of(about["common"]) if alike else about["kind"])
+    return modality(about), shared or (find_bin(about["common"]) if alike else about["kind"])
 
 
 def described(pair: GridPair) -> dict[str, Any]:
@@ -69,7 +68,7 @@ def described(pair: GridPair) -> dict[str, Any]:
     return {name: pair.about[name] for name in names if name in pair.about}
 
 
-def in_turn(groups: Mapping[tuple[str, str], Sequence[Path]], many: Callable[[tuple[str, str]], int]) -> Iterator[Path]:
+def iter_in_turn(groups: Mapping[tuple[str, str], Sequence[Path]], many: Callable[[tuple[str, str]], int]) -> Iterator[Path]:
     """`many` of each group in each turn, until all have had theirs."""
     turns = max((-(-len(paths) // many(key)) for key, paths in groups.items()), default=0)
     for k in range(turns):
@@ -77,18 +76,18 @@ def in_turn(groups: Mapping[tuple[str, str], Sequence[Path]], many: Callable[[tu
             yield from paths[k * many(key) : (k + 1) * many(key)]
 
 
-def cells(paths: Sequence[Path]) -> dict[tuple[str, str], list[Path]]:
-    """Files by `cell_of`; drawings of unknown scale are left out, as the peers have no scale to find."""
+def group_by_cell(paths: Sequence[Path]) -> dict[tuple[str, str], list[Path]]:
+    """Files by `find_cell`; drawings of unknown scale are left out, as the peers have no scale to find."""
     groups: dict[tuple[str, str], list[Path]] = {}
     for path in paths:
         with np.load(path) as arrays:
             about = json.loads(arrays["about"].tobytes())
         if not about.get("scaled"):
-            groups.setdefault(cell_of(about), []).append(path)
+            groups.setdefault(find_cell(about), []).append(path)
     return groups
 
 
-def cached_order(what: str) -> list[Path]:
+def list_cached_order(what: str) -> list[Path]:
     """Files of ``train``, ``test``, ``raw`` or ``thinned`` in their order; of a manifest of such pairs, cells in turn.
 
     Ordinary scans that share most are four in each turn; in the test set thirty of them come first.
@@ -96,39 +95,39 @@ def cached_order(what: str) -> list[Path]:
     if what.endswith(".jsonl"):
         lines = Path(what).read_text(encoding="utf-8").splitlines()
         scaled_too = [Path(what).parent / "grids" / json.loads(line)["file"] for line in lines]
-        return list(in_turn(cells(scaled_too), lambda key: 1))
+        return list(iter_in_turn(group_by_cell(scaled_too), lambda key: 1))
     most = (ORDINARY, MOST_AREA)
     often = lambda key: COMMON_TURN if key == most else 1  # noqa: E731
     if what in ("raw", "thinned"):
-        groups = {k: v for k, v in cells(pair_files("test")).items() if k[0] == ORDINARY and k[1] in AREA_BINS}
-        return list(in_turn(groups, often))[:RAW_PAIRS]
-    groups = cells([*pair_files(what), *_drawings(what)])
+        groups = {k: v for k, v in group_by_cell(list_pair_files("test")).items() if k[0] == ORDINARY and k[1] in AREA_BINS}
+        return list(iter_in_turn(groups, often))[:RAW_PAIRS]
+    groups = group_by_cell([*list_pair_files(what), *_list_drawings(what)])
     first = groups.get(most, [])[: FIRST_PAIRS if what == "test" else 0]
     groups[most] = groups.get(most, [])[len(first) :]
-    return [*first, *in_turn(groups, often)]
+    return [*first, *iter_in_turn(groups, often)]
 
 
-def _drawings(split: str) -> list[Path]:
+def _list_drawings(split: str) -> list[Path]:
     """Floor plans of a split; none where they are not made yet, as they come last."""
     try:
-        return pair_files(f"{split}_drawings")
+        return list_pair_files(f"{split}_drawings")
     except InputError as missing:
         print(missing, flush=True)
         return []
 
 
-def peer_pairs(what: str, done: set[str]) -> Iterator[PeerPair]:
-    """The pairs that are not done: of `cached_order`, or ``real``, or ``heldout`` (maps that `evaluate.py` kept).
+def iter_peer_pairs(what: str, done: set[str]) -> Iterator[PeerPair]:
+    """The pairs that are not done: of `list_cached_order`, or ``real``, or ``heldout`` (maps that `evaluate.py` kept).
 
     Raises:
         InputError: the cached pairs of ``raw`` were made by another version.
     """
     if what in ("real", "heldout"):
-        every = iterate_real_pairs() if what == "real" else heldout_pairs()
-        yield from (thinned(pair) for pair in every if pair.name not in done)
+        every = iterate_real_pairs() if what == "real" else iter_heldout_pairs()
+        yield from (thin_pair(pair) for pair in every if pair.name not in done)
         return
-    left = [path for path in cached_order(what) if path.stem not in done]
-    items = raw_items({path.stem for path in left}) if what == "raw" else {}
+    left = [path for path in list_cached_order(what) if path.stem not in done]
+    items = load_raw_items({path.stem for path in left}) if what == "raw" else {}
     if older := [path for path in left if what == "raw" and path.stem not in items]:
         made = "python evaluate.py task=merges data=test"
         raise InputError(
@@ -136,28 +135,28 @@ def peer_pairs(what: str, done: set[str]) -> Iterator[PeerPair]:
         )
     for path in left:
         pair = load_grids(path)
-        yield raw(pair, *items[path.stem]) if what == "raw" else thinned(pair)
+        yield simulate_raw_pair(pair, *items[path.stem]) if what == "raw" else thin_pair(pair)
 
 
-def thinned(pair: GridPair) -> PeerPair:
+def thin_pair(pair: GridPair) -> PeerPair:
     """The means of the points of 0.1 m cells; b at the scale of a."""
     size = pair.truth.scale if pair.truth is not None else 1.0
-    return PeerPair(pair, cell_middles(pair.b).astype(float) * size, cell_middles(pair.a).astype(float))
+    return PeerPair(pair, compute_cell_means(pair.b).astype(float) * size, compute_cell_means(pair.a).astype(float))
 
 
-def raw_items(names: set[str]) -> dict[str, tuple[GridItem, Library]]:
+def load_raw_items(names: set[str]) -> dict[str, tuple[GridItem, Library]]:
     """The items of test pairs, which they can be simulated from again."""
-    items, plans = grid_items(read_recipe("test").data)
+    items, plans = draw_grid_items(read_recipe("test").data)
     return {item.name: (item, plans) for item in items if item.name in names}
 
 
-def raw(pair: GridPair, item: GridItem, plans: Library) -> PeerPair:
+def simulate_raw_pair(pair: GridPair, item: GridItem, plans: Library) -> PeerPair:
     """All simulated points of a cached pair; its cells are what they were.
 
     Raises:
         ValueError: the generator gives another pair by now.
     """
-    simulated = _first_pair(item.item, list(plans_of(item.item, plans)))
+    simulated = _make_first_pair(item.item, list(select_plans(item.item, plans)))
     pose, truth = simulated.truth, pair.truth
     if pose is None or truth is None or np.abs(pose.matrix - truth.matrix).max() > 1e-6:
         raise ValueError(f"{pair.name}: the generator gives another pair by now")
@@ -165,12 +164,12 @@ def raw(pair: GridPair, item: GridItem, plans: Library) -> PeerPair:
     return PeerPair(pair, b, a)
 
 
-def heldout_pairs() -> Iterator[GridPair]:
+def iter_heldout_pairs() -> Iterator[GridPair]:
     """Held-out pairs of extracted maps that show something in common, as cells."""
     for evaluation_pair in load_set(HELDOUT):
         if evaluation_pair.transform is None or evaluation_pair.about["common"] < 1 or evaluation_pair.about["scale_free"]:
             continue
-        maps = evaluation_pair.maps()
+        maps = evaluation_pair.load_maps()
         a, b = (m.grid for m in maps)
         about = {key: evaluation_pair.about[key] for key in ("sensors", "source")}
         about |= {"building": str(evaluation_pair.about["building"]), "kind": "overlap", "evaluation_pair": evaluation_pair}
@@ -178,7 +177,7 @@ def heldout_pairs() -> Iterator[GridPair]:
         yield GridPair(evaluation_pair.name, a, b, free, evaluation_pair.transform, common, about)
 
 
-def scaled(pair: GridPair) -> GridPair:
+def scale_pair(pair: GridPair) -> GridPair:
     """The pair with b brought to the scale of a, to judge poses of methods that were given it."""
     size = pair.truth.scale if pair.truth is not None else 1.0
     if pair.truth is None or size == 1.0:

@@ -19,19 +19,19 @@ from topomerge.datasets.simulation.floor_truth import (
     LEAST_SEEN_AREA,
     NOT_JUDGED,
     TRUTH_CELL,
-    Truth,
-    Verdict,
-    column_words,
-    judge,
+    FloorScores,
+    FloorTruth,
+    evaluate_map,
+    predict_storey_columns,
 )
 
 from benchmarks.peers.segmentations import METHODS
 from topomerge.evaluation.cases import select_cases
-from topomerge.evaluation.markdown import compute_mean, write_mean, write_table
+from topomerge.evaluation.documents import compute_mean, write_mean, write_table
 from topomerge.evaluation.rooms import measure_case
 from topomerge.evaluation.scans import Case, Scan, load_scan
 from topomerge.evaluation.tasks import find_optional_data
-from topomerge.metrics import contingency
+from topomerge.metrics import count_contingency
 from topomerge.types import Array
 
 PEER_COLUMNS = {
@@ -62,14 +62,14 @@ class FloorGrid:
     origin: Array
     floor: float
 
-    def centres(self, cells: Array) -> Array:
+    def compute_centres(self, cells: Array) -> Array:
         """(n, 3) m, of the marked cells."""
         rows, columns = np.nonzero(cells)
         x, y = self.origin[0] + (columns + 0.5) * CELL, self.origin[1] + (rows + 0.5) * CELL
         return np.column_stack([x, y, np.full(len(x), self.floor)])
 
 
-def floor_grids(scan: Scan) -> list[FloorGrid | None]:
+def build_floor_grids(scan: Scan) -> list[FloorGrid | None]:
     """The grid of each true storey, by its true floor and ceiling; None where the scan has nothing of it.
 
     A cell is occupied where points lie in the band, else free where others do: floor, ceiling, lamps or a lintel.
@@ -77,7 +77,7 @@ def floor_grids(scan: Scan) -> list[FloorGrid | None]:
     truth = scan.truth
     assert truth is not None
     points = scan.cloud.points.astype(np.float64) + scan.cloud.shift
-    height = truth.place(points)[:, 2]
+    height = truth.transform_to_building(points)[:, 2]
     scale = float(truth.matrix[2, 2])
     out: list[FloorGrid | None] = []
     for floor, room_height in zip(truth.floors.tolist(), truth.height.tolist(), strict=True):
@@ -94,20 +94,20 @@ def floor_grids(scan: Scan) -> list[FloorGrid | None]:
         occupied, seen = np.zeros(shape, bool), np.zeros(shape, bool)
         occupied[rows[within], columns[within]] = True
         seen[rows, columns] = True
-        occupied, seen = _without_pieces(_closed(occupied), OBSTACLE_SPECK), _closed(seen)
+        occupied, seen = _remove_pieces(_close_gaps(occupied), OBSTACLE_SPECK), _close_gaps(seen)
         own_floor = (floor - float(truth.matrix[2, 3])) / scale  # in the scan's frame
-        out.append(FloorGrid(_without_pieces(seen & ~occupied, FREE_ISLAND), seen, origin, own_floor))
+        out.append(FloorGrid(_remove_pieces(seen & ~occupied, FREE_ISLAND), seen, origin, own_floor))
     return out
 
 
-def _closed(mask: Array) -> Array:
+def _close_gaps(mask: Array) -> Array:
     """The mask with gaps closed."""
     reach = round(CLOSED_GAPS / CELL / 2)
     size = 2 * reach + 1
     return mask | ndimage.binary_closing(np.pad(mask, size), np.ones((size, size)))[size:-size, size:-size]
 
 
-def _without_pieces(mask: Array, least: float) -> Array:
+def _remove_pieces(mask: Array, least: float) -> Array:
     """Without connected pieces of less than an area (m2)."""
     pieces, _ = ndimage.label(mask, np.ones((3, 3)))
     large = np.bincount(pieces.ravel()) * CELL**2 >= least
@@ -115,10 +115,10 @@ def _without_pieces(mask: Array, least: float) -> Array:
     return large[pieces]
 
 
-def segmented(scan: Scan, method: str, grids: list[FloorGrid | None]) -> tuple[Array, int]:
+def segment_scan(scan: Scan, method: str, grids: list[FloorGrid | None]) -> tuple[Array, int]:
     """The room of each column of the truth's raster by a classic method, -1 none, and how many rooms there are.
 
-    Words are spread as those of our maps are (`floor_truth.said`): furniture has the room that is the nearest.
+    Words are spread as those of our maps are (`floor_truth.predict_columns`): furniture has the room that is the nearest.
     """
     truth = scan.truth
     assert truth is not None
@@ -131,23 +131,23 @@ def segmented(scan: Scan, method: str, grids: list[FloorGrid | None]) -> tuple[A
             continue
         nearest = ndimage.distance_transform_edt(labels < 0, return_distances=False, return_indices=True)
         filled = np.where(grid.seen, labels[tuple(nearest)], -1)
-        stood, over = (_raster(truth, grid, cells) for cells in (labels, filled))
-        words = column_words(truth, k, stood, over)
+        stood, over = (_rasterise_labels(truth, grid, cells) for cells in (labels, filled))
+        words = predict_storey_columns(truth, k, stood, over)
         out[k] = np.where(words >= 0, words + total, -1)
         total += int(labels.max()) + 1
     return out, total
 
 
-def _raster(truth: Truth, grid: FloorGrid, labels: Array) -> Array:
+def _rasterise_labels(truth: FloorTruth, grid: FloorGrid, labels: Array) -> Array:
     """(rows, columns) int32 labels of cells on the raster of the truth, -1 none."""
     cells = labels >= 0
-    ij, inside = truth.columns(truth.place(grid.centres(cells)))
+    ij, inside = truth.compute_columns(truth.transform_to_building(grid.compute_centres(cells)))
     out = np.full(truth.raster.shape[1:], -1, np.int32)
     out[ij[inside, 0], ij[inside, 1]] = labels[cells][inside]
     return out
 
 
-def judged(truth: Truth, columns: Array, count: int) -> Verdict:
+def score_map(truth: FloorTruth, columns: Array, count: int) -> FloorScores:
     """The scores of rooms alone. Rooms that lie mostly in true ones that were not visited are not held against the method."""
     foreign = (truth.raster >= 0) & ~np.append(truth.visited, False)[truth.raster] & (columns >= 0)
     every = (truth.raster != NOT_JUDGED) & (columns >= 0)
@@ -156,17 +156,17 @@ def judged(truth: Truth, columns: Array, count: int) -> Verdict:
     rooms = np.zeros(count, [("glimpsed", bool), ("outside", float)])
     rooms["glimpsed"] = glimpsed
     storeys = np.zeros(0, [("floor", "<f8")])
-    return judge(SimpleNamespace(rooms=rooms, edges=edges, storeys=storeys), truth, columns)
+    return evaluate_map(SimpleNamespace(rooms=rooms, edges=edges, storeys=storeys), truth, columns)
 
 
-def survey_scores(truth: Truth, columns: Array) -> tuple[float, float]:
+def compute_survey_scores(truth: FloorTruth, columns: Array) -> tuple[float, float]:
     """Precision and recall as the survey has them, by area: the mean over the rooms of a map of the largest share of one that
     lies in one true room, and the mean over the true rooms of the largest share of one that lies in one room of the map. Cutting
     a room costs recall alone, and uniting two costs precision alone. Only what is of visited rooms counts.
     """
     visited = (truth.raster >= 0) & np.append(truth.visited, False)[truth.raster]
     count = int(columns.max()) + 1
-    both = contingency(truth.raster[visited], columns[visited], len(truth.visited), count)
+    both = count_contingency(truth.raster[visited], columns[visited], len(truth.visited), count)
     area = np.bincount(truth.raster[visited], minlength=len(truth.visited))
     expected, of_map = area * TRUTH_CELL**2 >= LEAST_SEEN_AREA, both.sum(axis=0)
     if not count or not expected.any():
@@ -183,11 +183,11 @@ def measure_method(case: Case, method: str, scans: Path) -> dict[str, Any]:
     scan = load_scan(case, scans, find_optional_data())
     assert scan.truth is not None
     began = process_time()
-    columns, count = segmented(scan, method, floor_grids(scan))
+    columns, count = segment_scan(scan, method, build_floor_grids(scan))
     row: dict[str, Any] = {"set": case.set, "place": case.place, "method": method, "seconds": process_time() - began}
-    rooms = judged(scan.truth, columns, count).rooms
+    rooms = score_map(scan.truth, columns, count).rooms
     row |= {"iou": rooms.iou, "mcc": rooms.mcc, "precision": rooms.precision, "recall": rooms.recall}
-    row["survey_precision"], row["survey_recall"] = survey_scores(scan.truth, columns)
+    row["survey_precision"], row["survey_recall"] = compute_survey_scores(scan.truth, columns)
     return row
 
 

@@ -38,55 +38,55 @@ from topomerge.datasets.pairs.grid_pairs import GridPair
 
 from benchmarks.peers import methods
 from benchmarks.peers.methods import CALL_SECONDS, GuardedWork
-from benchmarks.peers.pairs import PEER_SPLITS, PeerPair, described, peer_pairs, scaled
+from benchmarks.peers.pairs import PEER_SPLITS, PeerPair, described, iter_peer_pairs, scale_pair
 from topomerge.errors import InputError
-from topomerge.evaluation.grid_pairs import SCALELESS, find_places, upright
-from topomerge.extraction.cleaning import cell_middles
-from topomerge.training.belief_hypotheses import error
+from topomerge.evaluation.tasks import SCALELESS, convert_to_upright, find_places
+from topomerge.extraction.cleaning import compute_cell_means
+from topomerge.training.belief_hypotheses import compute_pose_error
 from topomerge.types import Array, PointCloud, VoxelGrid
 
 CACHE = Path("cache/merge")
 WHOLE = 6  # every sixth pair of the test set goes the whole way to a joined map
 OPEN3D_SHARE = 3  # RANSAC and FGR, which take most of the time, get every third pair
 PEER_CALLS: tuple[PeerCall, ...] = (  # each in a process of its own
-    (GuardedWork(partial(methods.kiss, voxel=0.2)), ("kiss02", "kiss02q")),
-    (GuardedWork(partial(methods.kiss, voxel=0.3)), ("kiss03", "kiss03q")),
-    (GuardedWork(methods.open3d), ("fpfh", "fgr")),
+    (GuardedWork(partial(methods.run_kiss, voxel=0.2)), ("kiss02", "kiss02q")),
+    (GuardedWork(partial(methods.run_kiss, voxel=0.3)), ("kiss03", "kiss03q")),
+    (GuardedWork(methods.run_open3d), ("fpfh", "fgr")),
 )
 PACKAGES = {"kiss_matcher": "kiss-matcher==1.0.2", "open3d": "open3d-cpu==0.19.*"}  # modules of the peers
 PeerCall = tuple[GuardedWork, tuple[str, ...]]
 Outcome = dict[str, Any]  # status (empty: answered), err, err_icp, scores, seconds, refinement_seconds
 
 
-def target_of(what: str) -> Path:
+def get_target(what: str) -> Path:
     """Where the lines of a set of pairs are."""
     return CACHE / f"peers_{Path(what).stem if what.endswith('.jsonl') else what}.jsonl"
 
 
-def rows_of(what: str) -> list[dict[str, Any]]:
+def read_result_rows(what: str) -> list[dict[str, Any]]:
     """Lines of a set of pairs; none where nothing was measured."""
-    path = target_of(what)
+    path = get_target(what)
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def ours(given: PeerPair) -> Outcome:
+def run_ours(given: PeerPair) -> Outcome:
     """From points to the pose: cells, plans, search, verdict."""
     from topomerge.extraction.voxels import voxelise
     from topomerge.registration.pipeline import register
 
     pair, free = given.pair, given.pair.about.get("source") in SCALELESS
     begun = time.process_time()
-    clouds = (given.a, cell_middles(pair.b) if free else given.b)
+    clouds = (given.a, compute_cell_means(pair.b) if free else given.b)
     a, b = (voxelise(PointCloud(points), pair.a.edge) for points in clouds)
     registration = register(a, b, free=pair.free, scale="free" if free else "fixed")
     seconds = time.process_time() - begun
     pose = registration.transform
-    err = None if pose is None else error(pose, pair)
+    err = None if pose is None else compute_pose_error(pose, pair)
     scores = {"probability": 0.0 if pose is None else registration.probability}
     return {"status": "", "err": err, "scores": scores, "believed": registration.accepted, "seconds": seconds}
 
 
-def whole(pair: GridPair) -> dict[str, float]:
+def time_whole_way(pair: GridPair) -> dict[str, float]:
     """Seconds from two clouds to the joined map and its rooms: extraction of both, and `merge` (joined even where refused)."""
     from topomerge.extraction.extract import extract
     from topomerge.fusion.pipeline import merge
@@ -100,10 +100,10 @@ def whole(pair: GridPair) -> dict[str, float]:
 
 def cloud(grid: VoxelGrid, free: VoxelGrid | None = None) -> PointCloud:
     """A grid's points as a cloud."""
-    return PointCloud(cell_middles(grid).astype(np.float32), free=free)
+    return PointCloud(compute_cell_means(grid).astype(np.float32), free=free)
 
 
-def learned(pair: GridPair) -> Outcome:
+def run_learned(pair: GridPair) -> Outcome:
     """`merge` of the extracted maps: rooms matched by the embedder that ships propose poses, too."""
     from topomerge.fusion.pipeline import merge
 
@@ -113,14 +113,14 @@ def learned(pair: GridPair) -> Outcome:
     seconds = time.process_time() - begun
     pose = result.registration.transform if result.registration else None
     scores = {"probability": result.registration.probability if result.registration else 0.0}
-    err = None if pose is None else error(pose, pair)
+    err = None if pose is None else compute_pose_error(pose, pair)
     return {"status": "", "err": err, "scores": scores, "believed": result.merged, "seconds": seconds}
 
 
 def peers(given: PeerPair, calls: Sequence[PeerCall] = PEER_CALLS) -> tuple[dict[str, Outcome], float]:
     """The outcomes of peers, and the seconds of processor that their processes took."""
     outcomes: dict[str, Outcome] = {}
-    used, judged = 0.0, scaled(given.pair)
+    used, judged = 0.0, scale_pair(given.pair)
     for call, names in calls:
         answers, why, seconds = call(given.b, given.a)
         used += seconds
@@ -129,16 +129,16 @@ def peers(given: PeerPair, calls: Sequence[PeerCall] = PEER_CALLS) -> tuple[dict
                 outcomes[name] = {"status": why, "err": None, "err_icp": None, "scores": {}, "seconds": CALL_SECONDS}
                 continue
             answer = answers[name]
-            errors = {"err": _error(answer.pose, judged), "err_icp": _error(answer.refined, judged)}
+            errors = {"err": _measure_error(answer.pose, judged), "err_icp": _measure_error(answer.refined, judged)}
             times = {"seconds": answer.seconds, "refinement_seconds": answer.refinement_seconds}
             outcomes[name] = {"status": "", **errors, "scores": answer.scores, **times}
     return outcomes, used
 
 
-def _error(matrix: Array, pair: GridPair) -> list[float] | None:
+def _measure_error(matrix: Array, pair: GridPair) -> list[float] | None:
     """Of the pose made upright; None where it turns the map over, or no pose is right."""
-    pose = upright(matrix, pair)
-    return None if pose is None else error(pose, pair)
+    pose = convert_to_upright(matrix, pair)
+    return None if pose is None else compute_pose_error(pose, pair)
 
 
 def measured(given: PeerPair, what: str, number: int) -> tuple[dict[str, Any], float]:
@@ -148,20 +148,20 @@ def measured(given: PeerPair, what: str, number: int) -> tuple[dict[str, Any], f
         number: of the pair in its set: some methods get every so many pairs only.
     """
     pair = given.pair
-    outcomes = {"ours": ours(given)}
+    outcomes = {"ours": run_ours(given)}
     if "evaluation_pair" in pair.about:
-        outcomes["learned"] = learned(pair)
+        outcomes["learned"] = run_learned(pair)
     answers, used = peers(given, PEER_CALLS if number % OPEN3D_SHARE == 0 else PEER_CALLS[:-1])
     about = {**described(pair), **(find_places(pair, PEER_SPLITS[what]) if what in PEER_SPLITS else {})}
     line = {"name": pair.name, "common": pair.common, **about, "points": [len(given.a), len(given.b)]}
     return {
         **line,
         "methods": {**outcomes, **answers},
-        "whole": whole(pair) if what == "test" and number % WHOLE == 0 else None,
+        "whole": time_whole_way(pair) if what == "test" and number % WHOLE == 0 else None,
     }, used
 
 
-def done_of(target: Path) -> set[str]:
+def read_done(target: Path) -> set[str]:
     """Names of the pairs that a file has lines of."""
     return {json.loads(line)["name"] for line in target.read_text().splitlines()} if target.exists() else set()
 
@@ -177,7 +177,7 @@ def check_peers() -> None:
         raise InputError(f"{', '.join(missing)}: not installed, so nothing can be compared; pip install {' '.join(missing)}")
 
 
-def _one_core() -> None:
+def _pin_to_one_core() -> None:
     os.sched_setaffinity(0, {sorted(os.sched_getaffinity(0))[-1]})  # KISS-Matcher takes all cores otherwise
     os.environ["OMP_NUM_THREADS"] = "1"  # in the processes of the peers: two threads on one core wait for each other
 
@@ -189,13 +189,13 @@ def run(seconds: float, what: str = "test") -> None:
         InputError: a peer is not installed.
     """
     check_peers()
-    _one_core()
-    target = target_of(what)
+    _pin_to_one_core()
+    target = get_target(what)
     target.parent.mkdir(parents=True, exist_ok=True)
-    done, of_peers = done_of(target), 0.0
-    for k, given in enumerate(peer_pairs(what, done), len(done)):
+    done, of_peers = read_done(target), 0.0
+    for k, given in enumerate(iter_peer_pairs(what, done), len(done)):
         if k == len(done):
-            ours(given)  # compiled code is loaded at the first call
+            run_ours(given)  # compiled code is loaded at the first call
         row, used = measured(given, what, k)
         of_peers += used
         with target.open("a") as out:
@@ -207,29 +207,29 @@ def run(seconds: float, what: str = "test") -> None:
             return
 
 
-def whole_ways(pairs: str = "9") -> None:
+def time_whole_ways(pairs: str = "9") -> None:
     """Of the first test pairs, which share most: seconds from two clouds to the joined map, over those that KISS-Matcher (0.2 m)
     takes to the refined pose. The first pair is run twice, as compiled code is loaded."""
     check_peers()
-    _one_core()
+    _pin_to_one_core()
     ratios: list[float] = []
-    for given in islice(peer_pairs("test", set()), int(pairs)):
+    for given in islice(iter_peer_pairs("test", set()), int(pairs)):
         if not ratios:
-            whole(given.pair)
-        seconds = whole(given.pair)
+            time_whole_way(given.pair)
+        seconds = time_whole_way(given.pair)
         answer = peers(given, PEER_CALLS[:1])[0][PEER_CALLS[0][1][0]]
         ratios.append((seconds["extract"] + seconds["merge"]) / (answer["seconds"] + answer.get("refinement_seconds", 0.0)))
         print(given.pair.name, {k: round(v, 1) for k, v in seconds.items()}, f"{ratios[-1]:.2f}", flush=True)
     print(f"{len(ratios)} pairs: median {np.median(ratios):.2f}, {min(ratios):.2f} to {max(ratios):.2f}")
 
 
-def whole_ways_of_files(*folders: str) -> None:
+def time_whole_ways_of_files(*folders: str) -> None:
     """Seconds of `topomerge merge` from two files to the report, start of Python included, over those that KISS-Matcher (0.2 m)
     takes from points in memory to the refined pose. The first pair is merged twice, as compiled code is kept."""
     from topomerge.io.points import read_points
 
     check_peers()
-    _one_core()
+    _pin_to_one_core()
     ratios: list[float] = []
     for folder in folders:
         command = [sys.executable, "-m", "topomerge", "merge", f"{folder}/a.ply", f"{folder}/b.ply", "--force", "--quiet"]
@@ -253,13 +253,13 @@ def whole_ways_of_files(*folders: str) -> None:
     print(f"{len(ratios)} pairs: median {np.median(ratios):.2f}, {min(ratios):.2f} to {max(ratios):.2f}")
 
 
-def again(what: str = "test") -> None:
+def measure_ours_anew(what: str = "test") -> None:
     """Ours alone, measured anew on the pairs that a file has lines of; what the peers answered stays."""
-    target = target_of(what)
+    target = get_target(what)
     lines = {row["name"]: row for row in map(json.loads, target.read_text().splitlines())}
-    for given in peer_pairs(what, set()):
+    for given in iter_peer_pairs(what, set()):
         if given.pair.name in lines:
-            lines[given.pair.name]["methods"]["ours"] = ours(given)
+            lines[given.pair.name]["methods"]["ours"] = run_ours(given)
     fresh = target.with_name(f"{target.name}.{os.getpid()}")
     fresh.write_text("".join(json.dumps(row) + "\n" for row in lines.values()))
     fresh.replace(target)
@@ -267,10 +267,10 @@ def again(what: str = "test") -> None:
 
 if __name__ == "__main__":
     if sys.argv[1] == "again":
-        again(*sys.argv[2:])
+        measure_ours_anew(*sys.argv[2:])
     elif sys.argv[1] == "whole":
-        whole_ways(*sys.argv[2:])
+        time_whole_ways(*sys.argv[2:])
     elif sys.argv[1] == "files":
-        whole_ways_of_files(*sys.argv[2:])
+        time_whole_ways_of_files(*sys.argv[2:])
     else:
         run(float(sys.argv[1]), *sys.argv[2:])

@@ -29,7 +29,7 @@ APART = 0.5  # of its clearance that critical points are apart at least
 TEETH = 3.0  # cells between the two walls of a point of the graph: below are the teeth of slanted walls
 
 
-def distance_transform(free: Array, cell: float) -> Array:
+def segment_by_distance(free: Array, cell: float) -> Array:
     """Seeds are what is further from everything occupied than a threshold: the one that gives most seeds of a room's size.
 
     Args:
@@ -42,13 +42,13 @@ def distance_transform(free: Array, cell: float) -> Array:
     clearance = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1]
     best, most = np.zeros(free.shape, np.int32), 0
     for threshold in range(1, int(clearance.max()) + 1):
-        seeds, count = _pieces(clearance > threshold, cell, DISTANCE_AREAS, SQUARE)
+        seeds, count = _label_pieces(clearance > threshold, cell, DISTANCE_AREAS, SQUARE)
         if count > most:
             best, most = seeds, count
-    return flood(best, free)
+    return flood_seeds(best, free)
 
 
-def morphological(free: Array, cell: float) -> Array:
+def segment_by_erosion(free: Array, cell: float) -> Array:
     """Free space is eroded cell by cell; a piece that has come apart from others and has a room's size is a seed and taken out,
     and so is one that would vanish in the next step.
 
@@ -81,10 +81,10 @@ def morphological(free: Array, cell: float) -> Array:
         left = real & ~(apart & (area <= high))
         pieces, count = np.where(left, np.cumsum(left), 0)[smaller], int(left.sum())
         apart = np.concatenate([[False], apart[left]])
-    return flood(seeds, free)
+    return flood_seeds(seeds, free)
 
 
-def voronoi(free: Array, cell: float) -> Array:
+def segment_by_voronoi(free: Array, cell: float) -> Array:
     """Critical lines of the Voronoi graph cut free space; pieces that no door parts are joined again.
 
     Args:
@@ -95,21 +95,21 @@ def voronoi(free: Array, cell: float) -> Array:
         (h, w) int32 room of each cell, -1 none.
     """
     cut = free.copy()
-    for rows, columns in critical_lines(free, cell):
+    for rows, columns in find_critical_lines(free, cell):
         cut[rows, columns] = False
-    pieces, count = _pieces(cut, cell, VORONOI_AREAS, None)
-    labels = flood(pieces, free)
-    return joined(labels, count, cell) if count else labels
+    pieces, count = _label_pieces(cut, cell, VORONOI_AREAS, None)
+    labels = flood_seeds(pieces, free)
+    return join_pieces(labels, count, cell) if count else labels
 
 
 METHODS: dict[str, Callable[[Array, float], Array]] = {
-    "voronoi": voronoi,
-    "distance": distance_transform,
-    "morphological": morphological,
+    "voronoi": segment_by_voronoi,
+    "distance": segment_by_distance,
+    "morphological": segment_by_erosion,
 }
 
 
-def _pieces(mask: Array, cell: float, areas: tuple[float, float], structure: Array | None) -> tuple[Array, int]:
+def _label_pieces(mask: Array, cell: float, areas: tuple[float, float], structure: Array | None) -> tuple[Array, int]:
     """(h, w) int32 connected pieces of a size between two areas (m2), numbered from 1, and how many there are."""
     pieces, count = ndimage.label(mask, structure)
     area = np.bincount(pieces.ravel(), minlength=count + 1) * cell**2
@@ -119,7 +119,7 @@ def _pieces(mask: Array, cell: float, areas: tuple[float, float], structure: Arr
     return number[pieces], int(fits.sum())
 
 
-def flood(seeds: Array, free: Array) -> Array:
+def flood_seeds(seeds: Array, free: Array) -> Array:
     """(h, w) int32 free cells by the seed (from 1) whose wave front reaches them first, from 0; -1: none does."""
     labels = np.pad(np.where(free, seeds, 0).astype(np.int32), 1)
     open_cells = np.pad(free, 1).ravel() & (labels.ravel() == 0)
@@ -137,7 +137,7 @@ def flood(seeds: Array, free: Array) -> Array:
     return labels[1:-1, 1:-1] - 1
 
 
-def contacts(labels: Array, count: int) -> Array:
+def count_contacts(labels: Array, count: int) -> Array:
     """(count + 1, count + 1) sides that cells of two pieces share; the last is what is not free."""
     padded = np.pad(np.where(labels < 0, count, labels), 1, constant_values=count)
     out = np.zeros((count + 1, count + 1), np.int64)
@@ -147,9 +147,9 @@ def contacts(labels: Array, count: int) -> Array:
     return out + out.T
 
 
-def joined(labels: Array, count: int, cell: float) -> Array:
+def join_pieces(labels: Array, count: int, cell: float) -> Array:
     """Pieces between critical lines joined by the survey's four rules, one after the other, the smallest piece first."""
-    touch = contacts(labels, count).astype(float)
+    touch = count_contacts(labels, count).astype(float)
     area = np.bincount(labels[labels >= 0], minlength=count) * cell**2
     name = np.arange(count)
     for rule in (_dead_end, _small, _passage, _wide):
@@ -173,7 +173,7 @@ def _join(touch: Array, area: Array, name: Array, i: int, j: int) -> None:
     name[name == i] = j
 
 
-def _shares(touch: Array, i: int) -> tuple[Array, float, Array]:
+def _measure_shares(touch: Array, i: int) -> tuple[Array, float, Array]:
     """Shares of a piece's outline by neighbour, of walls, and its neighbours, the longest border first."""
     outline = max(float(touch[i].sum()), 1.0)
     shares = touch[i, :-1] / outline
@@ -182,35 +182,35 @@ def _shares(touch: Array, i: int) -> tuple[Array, float, Array]:
 
 
 def _dead_end(touch: Array, area: Array, i: int) -> list[int]:
-    _, wall, near = _shares(touch, i)
+    _, wall, near = _measure_shares(touch, i)
     return near.tolist() if len(near) == 1 and area[i] < DEAD_END_AREA and wall <= DEAD_END_WALL else []
 
 
 def _small(touch: Array, area: Array, i: int) -> list[int]:
-    shares, _, near = _shares(touch, i)
+    shares, _, near = _measure_shares(touch, i)
     return near[:1].tolist() if len(near) and area[i] < SMALL_AREA and shares[near[0]] > SMALL_BORDER else []
 
 
 def _passage(touch: Array, area: Array, i: int) -> list[int]:
-    shares, wall, near = _shares(touch, i)
+    shares, wall, near = _measure_shares(touch, i)
     if not len(near) or len(near) > 2 or wall <= PASSAGE_WALL or shares[near[0]] <= PASSAGE_BORDER:
         return []
-    others, other_wall, beyond = _shares(touch, int(near[0]))
+    others, other_wall, beyond = _measure_shares(touch, int(near[0]))
     ends = other_wall + float(others[beyond[:2]].sum())
     return near[:1].tolist() if len(beyond) <= 2 or ends >= PASSAGE_ENDS else []
 
 
 def _wide(touch: Array, area: Array, i: int) -> list[int]:
-    shares, wall, near = _shares(touch, i)
+    shares, wall, near = _measure_shares(touch, i)
     out = []
     for j in near.tolist():
         end = shares[j] > END_BORDER and abs(wall - (1 - 2 * shares[j])) < END_SLACK
-        if (shares[j] > WIDE_BORDER or end) and _shares(touch, j)[0][i] > WIDE_OTHER:
+        if (shares[j] > WIDE_BORDER or end) and _measure_shares(touch, j)[0][i] > WIDE_OTHER:
             out.append(j)
     return out
 
 
-def graph(free: Array) -> tuple[Array, Array, Array]:
+def build_graph(free: Array) -> tuple[Array, Array, Array]:
     """The Voronoi graph of the occupied cells beside free ones, without its dead ends.
 
     Args:
@@ -234,11 +234,11 @@ def graph(free: Array) -> tuple[Array, Array, Array]:
     ends, walls = ends[good], walls[good]
     wide = np.linalg.norm(walls[:, 0] - walls[:, 1], axis=1) > TEETH
     ends, walls = ends[wide], walls[wide]
-    stay = _without_dead_ends(ends, len(cells.vertices))
+    stay = _prune_dead_ends(ends, len(cells.vertices))
     return cells.vertices, ends[stay], walls[stay]
 
 
-def _without_dead_ends(ends: Array, count: int) -> Array:
+def _prune_dead_ends(ends: Array, count: int) -> Array:
     """(e,) bool edges that remain when every dead end is taken back to the first crossing."""
     stay = np.ones(len(ends), bool)
     crossing = np.bincount(ends.ravel(), minlength=count) >= 3
@@ -251,19 +251,19 @@ def _without_dead_ends(ends: Array, count: int) -> Array:
         stay &= ~dead
 
 
-def critical_lines(free: Array, cell: float) -> list[tuple[Array, Array]]:
+def find_critical_lines(free: Array, cell: float) -> list[tuple[Array, Array]]:
     """Rows and columns of the cells of each critical line: from a narrowest point of the graph to its two nearest walls.
 
     Args:
         free: (h, w) bool.
         cell: m, edge of a cell.
     """
-    points, ends, walls = graph(free)
+    points, ends, walls = build_graph(free)
     if not len(ends):
         return []
     middle = points[ends].mean(axis=1)
     clearance = np.linalg.norm(middle - walls[:, 0], axis=1) * cell
-    narrow = _narrowest(points * cell, ends, clearance)
+    narrow = _find_narrowest(points * cell, ends, clearance)
     one, two = walls[:, 0] - middle, walls[:, 1] - middle
     cosine = (one * two).sum(axis=1) / np.maximum(np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1), 1e-9)
     lines: list[tuple[Array, Array]] = []
@@ -277,7 +277,7 @@ def critical_lines(free: Array, cell: float) -> list[tuple[Array, Array]]:
     return lines
 
 
-def _narrowest(points: Array, ends: Array, clearance: Array) -> Array:
+def _find_narrowest(points: Array, ends: Array, clearance: Array) -> Array:
     """Edges that no other edge of the graph within their neighbourhood undercuts; every one of a stretch of even width."""
     length = np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1)
     count, edges = len(points), np.arange(len(ends))

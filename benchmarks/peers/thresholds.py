@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.peers.run import rows_of
+from benchmarks.peers.run import read_result_rows
 from topomerge.errors import InputError
-from topomerge.evaluation.false_merges import Row, broken, good, tellable
-from topomerge.statistics import precision_recall
+from topomerge.evaluation.false_merges import Row, is_broken, is_good, is_tellable
+from topomerge.statistics import compute_precision_recall
 from topomerge.types import Array
 
 THRESHOLDS_FILE = Path(__file__).with_name("thresholds.json")
@@ -53,30 +53,30 @@ class PeerVerdict:
     recall: float
     right: int
 
-    def score_of(self, outcome: Row) -> float:
+    def get_score(self, outcome: Row) -> float:
         """The score of an answer; minus infinity where there is none, or its residual is too large."""
         scores = outcome["scores"]
         limit, residual = self.residual_at_most, SCORES[self.score]
         large = limit is not None and residual is not None and scores.get(residual, np.inf) > limit
         return -np.inf if large else scores.get(self.score, -np.inf)
 
-    def believes(self, outcome: Row) -> bool:
+    def is_accepted(self, outcome: Row) -> bool:
         """Is an answer believed?"""
-        return self.at_least is not None and self.score_of(outcome) >= self.at_least
+        return self.at_least is not None and self.get_score(outcome) >= self.at_least
 
 
-def refined(row: Row, variant: str) -> Row:
+def apply_refinement(row: Row, variant: str) -> Row:
     """A pair's row with the outcome of a peer's variant: ``err`` is of the refined pose, ``err_solved`` of the solver's."""
     outcome = row["methods"][variant]
     return {**row, **outcome, "err": outcome.get("err_icp"), "err_solved": outcome["err"]}
 
 
-def possible(row: Row) -> bool:
+def is_possible(row: Row) -> bool:
     """Is there a right pose?"""
     return row["kind"] == "overlap" and row["common"] >= 1
 
 
-def least_score(score: Array, right: Array, of: int) -> tuple[float | None, float, float]:
+def find_least_score(score: Array, right: Array, of: int) -> tuple[float | None, float, float]:
     """The threshold of highest recall at `LEAST_PRECISION`, halfway to the best score below it (None: there is none), its
     precision and its recall.
 
@@ -86,7 +86,7 @@ def least_score(score: Array, right: Array, of: int) -> tuple[float | None, floa
         of: number of pairs that have a right answer.
     """
     scored = np.isfinite(score)
-    thresholds, precision, recall = precision_recall(score[scored], right[scored], max(of, 1))
+    thresholds, precision, recall = compute_precision_recall(score[scored], right[scored], max(of, 1))
     fine = np.flatnonzero((precision >= LEAST_PRECISION) & (recall > 0))
     if not len(fine):
         return None, 0.0, 0.0
@@ -95,11 +95,11 @@ def least_score(score: Array, right: Array, of: int) -> tuple[float | None, floa
     return float(thresholds[best] + below) / 2, float(precision[best]), float(recall[best])
 
 
-def tried(rows: Sequence[Row], variant: str) -> Iterable[PeerVerdict]:
+def iter_verdicts(rows: Sequence[Row], variant: str) -> Iterable[PeerVerdict]:
     """A variant's verdicts by every score and limit of the residual."""
-    mine = [refined(r, variant) for r in rows if variant in r["methods"]]
-    right = np.array([good(r) for r in mine])
-    of = sum(map(possible, mine))
+    mine = [apply_refinement(r, variant) for r in rows if variant in r["methods"]]
+    right = np.array([is_good(r) for r in mine])
+    of = sum(map(is_possible, mine))
     for score, residual in SCORES.items():
         if not any(score in r["scores"] for r in mine):
             continue
@@ -109,15 +109,15 @@ def tried(rows: Sequence[Row], variant: str) -> Iterable[PeerVerdict]:
             limits += np.quantile(seen, np.linspace(1.0, 0.2, RESIDUAL_LIMITS)).tolist()
         for limit in limits:
             blank = PeerVerdict(variant, score, None, limit, 0.0, 0.0, int(right.sum()))
-            at_least, precision, recall = least_score(np.array([blank.score_of(r) for r in mine]), right, of)
+            at_least, precision, recall = find_least_score(np.array([blank.get_score(r) for r in mine]), right, of)
             yield PeerVerdict(variant, score, at_least, limit, precision, recall, int(right.sum()))
 
 
 def choose(rows: Sequence[Row]) -> dict[str, PeerVerdict]:
     """Each peer's verdict of highest recall, of equal ones that with more right answers, then the first that was tried."""
-    rows = [r for r in rows if tellable(r) and not broken(r)]
+    rows = [r for r in rows if is_tellable(r) and not is_broken(r)]
     return {
-        peer: max((v for name in variants for v in tried(rows, name)), key=lambda v: (v.recall, v.right))
+        peer: max((v for name in variants for v in iter_verdicts(rows, name)), key=lambda v: (v.recall, v.right))
         for peer, variants in VARIANTS.items()
     }
 
@@ -133,23 +133,25 @@ def load_verdicts(path: Path = THRESHOLDS_FILE) -> dict[str, PeerVerdict]:
     return {peer: PeerVerdict(**values) for peer, values in json.loads(path.read_text(encoding="utf-8"))["verdicts"].items()}
 
 
-def written(rows: Sequence[Row], verdicts: dict[str, PeerVerdict]) -> dict[str, Any]:
+def serialise_verdicts(rows: Sequence[Row], verdicts: dict[str, PeerVerdict]) -> dict[str, Any]:
     """What is committed: verdicts, where they are from, and what each variant had right."""
-    fair = [r for r in rows if tellable(r) and not broken(r)]
-    variants = {v: sum(good(refined(r, v)) for r in fair if v in r["methods"]) for names in VARIANTS.values() for v in names}
+    fair = [r for r in rows if is_tellable(r) and not is_broken(r)]
+    variants = {
+        v: sum(is_good(apply_refinement(r, v)) for r in fair if v in r["methods"]) for names in VARIANTS.values() for v in names
+    }
     return {
         "command": THRESHOLDS_COMMAND,
         "rule": f"highest recall at a precision of {LEAST_PRECISION} or more, over variants, scores and limits of the residual",
-        "pairs": len(fair), "with a right pose": sum(map(possible, fair)), "right of each variant": variants,
+        "pairs": len(fair), "with a right pose": sum(map(is_possible, fair)), "right of each variant": variants,
         "verdicts": {peer: asdict(v) for peer, v in verdicts.items()}, "names": [r["name"] for r in fair],
     }  # fmt: skip
 
 
 def main() -> None:
     """Choose and write."""
-    rows = rows_of("train")
+    rows = read_result_rows("train")
     verdicts = choose(rows)
-    text = json.dumps(written(rows, verdicts), indent=1) + "\n"
+    text = json.dumps(serialise_verdicts(rows, verdicts), indent=1) + "\n"
     THRESHOLDS_FILE.write_text(text, encoding="utf-8")
     print(text[: text.index('"names"')])
 

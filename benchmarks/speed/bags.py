@@ -20,7 +20,7 @@ from time import perf_counter
 
 import numpy as np
 
-from benchmarks.speed.bench import line
+from benchmarks.speed.bench import print_line
 from tests.io.bags import Entry, Messages, walk_messages, write_bag
 from tests.io.walks import PERIOD, START, Walk
 
@@ -29,12 +29,12 @@ AGAIN, NOISE = 10, 0.01  # each point so often, with other noise (m): 36,000 a s
 POINT_BYTES = 16
 
 
-def office_walk(spacing: float) -> Walk:
+def simulate_office_walk(spacing: float) -> Walk:
     """A lap through an office as a LiDAR sees it."""
     from topomerge.datasets.buildings.procedural import make_building
-    from topomerge.datasets.simulation.scanner import scan
+    from topomerge.datasets.simulation.scanner import scan_building
 
-    cloud = scan(make_building("office", SEED), "lidar", seed=1, spacing=spacing)
+    cloud = scan_building(make_building("office", SEED), "lidar", seed=1, spacing=spacing)
     assert cloud.poses is not None and cloud.pose_of is not None
     scans, order = [], np.argsort(cloud.pose_of, kind="stable")
     for rows in np.split(order, np.cumsum(np.bincount(cloud.pose_of, minlength=len(cloud.poses)))[:-1]):
@@ -44,7 +44,7 @@ def office_walk(spacing: float) -> Walk:
     return Walk([scans[k] for k in seen], cloud.poses[seen], START + PERIOD * np.arange(len(seen)))
 
 
-def laps(walk: Walk, gigabytes: float, m: Messages) -> Iterable[Entry]:
+def iter_laps(walk: Walk, gigabytes: float, m: Messages) -> Iterable[Entry]:
     """The messages of as many laps as give the bag its size."""
     rng, size, lap = np.random.default_rng(0), 0, 0
     while size < gigabytes * 1e9:
@@ -81,7 +81,7 @@ def measure(path: str, alone: bool) -> dict[str, float]:
     return {"seconds": perf_counter() - began, "peak": sum(usage), "rooms": rooms}
 
 
-def in_a_process(path: Path, alone: bool) -> dict[str, float]:
+def measure_in_process(path: Path, alone: bool) -> dict[str, float]:
     """`measure` in a process of its own."""
     command = [sys.executable, "-m", "benchmarks.speed.bags", "--measure", str(path), "alone" if alone else "extract"]
     said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
@@ -91,14 +91,14 @@ def in_a_process(path: Path, alone: bool) -> dict[str, float]:
 
 def main(gigabytes: Iterable[float] = (1.0,), spacing: float = SPACING) -> None:
     """Print the lines."""
-    walk = office_walk(spacing)
+    walk = simulate_office_walk(spacing)
     for size in gigabytes:
         with tempfile.TemporaryDirectory(prefix="topomerge-") as folder:
-            path = write_bag(Path(folder), "mcap", partial(laps, walk, size))
+            path = write_bag(Path(folder), "mcap", partial(iter_laps, walk, size))
             megabytes = path.stat().st_size / 1e6
-            in_a_process(path, alone=True)  # into the disk's cache, as far as it fits
-            ours, alone = in_a_process(path, alone=False), in_a_process(path, alone=True)
-            line(f"bag_{size:g}_GB", ours["seconds"], alone["seconds"])
+            measure_in_process(path, alone=True)  # into the disk's cache, as far as it fits
+            ours, alone = measure_in_process(path, alone=False), measure_in_process(path, alone=True)
+            print_line(f"bag_{size:g}_GB", ours["seconds"], alone["seconds"])
             rate = f"{megabytes / ours['seconds']:.0f} MB/s, {ours['rooms']:.0f} rooms, at most {ours['peak']:.0f} MiB"
             bare = f"{megabytes / alone['seconds']:.0f} MB/s, {alone['peak']:.0f} MiB"
             print(f"# {megabytes:.0f} MB: {rate}; the library alone {bare}", flush=True)

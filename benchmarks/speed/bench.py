@@ -15,7 +15,7 @@ CORRIDOR = 2.4  # m
 DOOR_WIDTH = 1.0  # m
 
 
-def best(fn: Callable[[], Any], repeat: int = 5) -> float:
+def time_best(fn: Callable[[], Any], repeat: int = 5) -> float:
     """Shortest of `repeat` runs, s: the least disturbed one. Call `fn` once before, if it compiles."""
     seconds = []
     for _ in range(repeat):
@@ -26,7 +26,7 @@ def best(fn: Callable[[], Any], repeat: int = 5) -> float:
     return min(seconds)
 
 
-def line(name: str, ours: float, peer: float) -> str:
+def print_line(name: str, ours: float, peer: float) -> str:
     """Print and return `name ours peer ratio`: s with 4 significant digits, ratio = peer / ours (above 1: ours is faster)."""
     if not name or any(c.isspace() for c in name):
         raise ValueError(f"a name of a benchmark must be one word, not {name!r}")
@@ -35,7 +35,7 @@ def line(name: str, ours: float, peer: float) -> str:
     return text
 
 
-def _walls() -> list[tuple[tuple[float, float], tuple[float, float]]]:
+def _build_walls() -> list[tuple[tuple[float, float], tuple[float, float]]]:
     low, high = DEPTH / 2 - CORRIDOR / 2, DEPTH / 2 + CORRIDOR / 2
     corners = [(0.0, 0.0), (WIDTH, 0.0), (WIDTH, DEPTH), (0.0, DEPTH)]
     walls = list(zip(corners, corners[1:] + corners[:1], strict=True))
@@ -54,7 +54,7 @@ def _walls() -> list[tuple[tuple[float, float], tuple[float, float]]]:
 def storey(points: int = 6_000_000, seed: int = 0, noise: float = 0.01) -> np.ndarray:
     """(points, 3) float32 on the surfaces of 20 rooms on a corridor, 1,500 m2, evenly by area, with noise (m)."""
     rng = np.random.default_rng(seed)
-    walls = [(np.array(a), np.array(b)) for a, b in _walls()]
+    walls = [(np.array(a), np.array(b)) for a, b in _build_walls()]
     area = np.array([WIDTH * DEPTH] * 2 + [2 * STOREY_HEIGHT * float(np.linalg.norm(b - a)) for a, b in walls])
     which = rng.choice(len(area), points, p=area / area.sum())
     u, v = rng.random(points), rng.random(points)

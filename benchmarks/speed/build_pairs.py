@@ -19,10 +19,9 @@ from statistics import median
 from time import perf_counter, process_time
 
 from topomerge.datasets.pairs.example import make_file
-from topomerge.datasets.pairs.items import Item, draw_items
-from topomerge.datasets.pairs.recipe import Recipe
+from topomerge.datasets.pairs.items import Item, Recipe, draw_items
 
-from benchmarks.speed.bench import line
+from benchmarks.speed.bench import print_line
 
 TARGET, LIMIT = 6.0, 1.5  # s a pair; GB a worker
 SINGLE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -36,7 +35,7 @@ RECIPE = Recipe(
 )
 
 
-def one(item: Item) -> tuple[float, float]:
+def build_one(item: Item) -> tuple[float, float]:
     """Seconds of a pair, and those that the processor worked."""
     with tempfile.TemporaryDirectory() as folder:
         began, worked = perf_counter(), process_time()
@@ -52,14 +51,14 @@ def warm_up(folder: str, number: int) -> int:
     return os.getpid()
 
 
-def work(item: Item, folder: str) -> tuple[str, float, float]:
+def build_in_worker(item: Item, folder: str) -> tuple[str, float, float]:
     """Make a pair in a worker: why not, seconds, and seconds that the processor worked."""
     began, worked = perf_counter(), process_time()
     row = make_file(item, [], folder)
     return row.reason, perf_counter() - began, process_time() - worked
 
 
-def all_of(items: list[Item], jobs: int) -> float:
+def time_all(items: list[Item], jobs: int) -> float:
     """Seconds that warm workers take for all items, the longest first, as `build` does."""
     from joblib.externals.loky import get_reusable_executor
 
@@ -69,7 +68,7 @@ def all_of(items: list[Item], jobs: int) -> float:
         while len(warm) < jobs:
             warm |= set(pool.map(warm_up, [folder] * jobs, range(jobs), chunksize=1))
         began = perf_counter()
-        rows = list(pool.map(work, items, [folder] * len(items), chunksize=1))
+        rows = list(pool.map(build_in_worker, items, [folder] * len(items), chunksize=1))
         seconds = perf_counter() - began
     if any(reason for reason, _, _ in rows):
         raise RuntimeError([reason for reason, _, _ in rows if reason])
@@ -83,16 +82,16 @@ def main(pairs: int = 24, rooms: int = 15) -> None:
     from joblib.externals.loky import get_reusable_executor
 
     items = draw_items(replace(RECIPE, pairs=pairs, rooms=[rooms, rooms]), {})
-    one(items[0])  # compiles
-    seconds, worked = zip(*(one(item) for item in items[:8]), strict=True)
-    line("pair", median(seconds), TARGET)
-    line("pair_cpu", median(worked), TARGET)
+    build_one(items[0])  # compiles
+    seconds, worked = zip(*(build_one(item) for item in items[:8]), strict=True)
+    print_line("pair", median(seconds), TARGET)
+    print_line("pair_cpu", median(worked), TARGET)
     print(f"# pairs of {rooms} rooms took {min(seconds):.1f} to {max(seconds):.1f} s")
     items.sort(key=lambda item: -item.rooms)
-    alone = all_of(items, 1)
-    line("two_workers", all_of(items, 2), alone)
+    alone = time_all(items, 1)
+    print_line("two_workers", time_all(items, 2), alone)
     get_reusable_executor().shutdown(wait=True)
-    line("memory", resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20, LIMIT)
+    print_line("memory", resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20, LIMIT)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.speed.bench import STOREY_HEIGHT, WIDTH, line, storey
+from benchmarks.speed.bench import STOREY_HEIGHT, WIDTH, print_line, storey
 from topomerge.evaluation.documents import build_stamp
 from topomerge.evaluation.headline import FIGURES, write_headline
 
@@ -46,17 +46,17 @@ def measure(floors: int, preset: str, points: int, place: str) -> dict[str, Any]
     }
 
 
-def in_a_process(floors: int, preset: str = "default", points: int = 6_000_000, place: str = "beside") -> dict[str, Any]:
+def measure_in_process(floors: int, preset: str = "default", points: int = 6_000_000, place: str = "beside") -> dict[str, Any]:
     command = [sys.executable, "-m", "benchmarks.speed.extract_floor", "--measure", str(floors), preset, str(points), place]
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()[-1])
 
 
 def main(most: int = 16, points: int = 6_000_000) -> None:
     """Print the lines; `most` floors at the most. With 1 the figure of the README is written."""
-    in_a_process(1, points=100_000)
-    one = min((in_a_process(1, points=points) for _ in range(3)), key=lambda m: m["seconds"])
-    thesis = in_a_process(1, "thesis", points)
-    line("extract_floor", one["seconds"], thesis["seconds"])
+    measure_in_process(1, points=100_000)
+    one = min((measure_in_process(1, points=points) for _ in range(3)), key=lambda m: m["seconds"])
+    thesis = measure_in_process(1, "thesis", points)
+    print_line("extract_floor", one["seconds"], thesis["seconds"])
     if most == 1 and points == 6_000_000:
         stamp = build_stamp("python -m benchmarks.speed.extract_floor 1", ("topomerge.extraction.extract",))
         ratio = f"{float(thesis['seconds']) / float(one['seconds']):.1f}"
@@ -64,12 +64,12 @@ def main(most: int = 16, points: int = 6_000_000) -> None:
     for step, seconds in one["steps"].items():
         print(f"#   {step}: {seconds:.2f} s")
     print(f"# {one['cells']} cells, {one['rooms']} rooms, peak {one['peak_mb']:.0f} MB; thesis: {thesis['rooms']} rooms")
-    small = min((in_a_process(1, points=points // 3) for _ in range(3)), key=lambda m: m["seconds"])
+    small = min((measure_in_process(1, points=points // 3) for _ in range(3)), key=lambda m: m["seconds"])
     for place in ("beside", "above"):
         floors = 2
         while floors <= most:
-            floor_run = in_a_process(floors, points=points // 3, place=place)
-            line(f"{place}_{floors}", floor_run["seconds"], floors * small["seconds"])
+            floor_run = measure_in_process(floors, points=points // 3, place=place)
+            print_line(f"{place}_{floors}", floor_run["seconds"], floors * small["seconds"])
             size = f"{floor_run['cells']} cells, {floor_run['rooms']} rooms, {floor_run['storeys']} storeys"
             print(f"# {size}, peak {floor_run['peak_mb']:.0f} MB")
             floors *= 2

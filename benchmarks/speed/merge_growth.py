@@ -23,7 +23,7 @@ ROW = 20  # rooms along one side of a corridor
 TURNED_POSE = Sim3(0.7, (12.3, -4.1, 0.2))
 
 
-def floor_plan(rooms: int, seed: int = 0) -> tuple[Array, Array]:
+def draw_floor_plan(rooms: int, seed: int = 0) -> tuple[Array, Array]:
     """(H, W) bool: walls, and where doors are cut into them."""
     rng = np.random.default_rng(seed)
     corridors = max(round(rooms / (2 * ROW)), 1)
@@ -45,7 +45,7 @@ def floor_plan(rooms: int, seed: int = 0) -> tuple[Array, Array]:
     return wall, door
 
 
-def as_cells(wall: Array, door: Array) -> Array:
+def build_cells(wall: Array, door: Array) -> Array:
     """(n, 3) cells of floor, ceiling and walls with open doors under lintels."""
     x, y = np.indices(wall.shape).reshape(2, -1)
     level = [np.column_stack([x, y, np.full(x.size, z)]) for z in (0, CEILING_CELLS)]
@@ -56,10 +56,10 @@ def as_cells(wall: Array, door: Array) -> Array:
     return np.concatenate([*level, walls, lintels]).astype(np.int64)
 
 
-def two_maps(rooms: int) -> tuple[VoxelGrid, VoxelGrid, Array]:
+def build_two_maps(rooms: int) -> tuple[VoxelGrid, VoxelGrid, Array]:
     """Three quarters of a floor each, of which the second one is turned; and its points (n, 3), m."""
-    wall, door = floor_plan(rooms)
-    cells = as_cells(wall, door)
+    wall, door = draw_floor_plan(rooms)
+    cells = build_cells(wall, door)
     quarter = wall.shape[0] // 4
     a = VoxelGrid.from_cells(cells[cells[:, 0] < 3 * quarter], np.zeros(3), CELL_EDGE)
     points = TURNED_POSE.apply((cells[cells[:, 0] > quarter] + 0.5) * CELL_EDGE)
@@ -72,7 +72,7 @@ def measure(rooms: int) -> None:
     """One size."""
     import resource
 
-    a, b, points = two_maps(rooms)
+    a, b, points = build_two_maps(rooms)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     began = time.process_time()
     registration = register(a, b)

@@ -1,21 +1,20 @@
 """Networks by ONNX Runtime against torch, eager: the weights that ship, one thread each.
 
-Run from the root: ``python -m benchmarks.speed.networks``. Lines: `name ours peer ratio`, see `bench.line`; loading is not timed.
+Run from the root: ``python -m benchmarks.speed.networks``. Lines: `name ours peer ratio`, see `bench.print_line`; loading is not
+timed.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from topomerge.models.convolutional import PlaceLogOdds, PlaceNetwork, PlanProbabilities, PlanUNet, WallNetwork, WallProbabilities
 from topomerge.models.export import read_weights, run_with_torch
-from topomerge.models.place_network import PlaceLogOdds, PlaceNetwork
-from topomerge.models.plan_unet import PlanProbabilities, PlanUNet
-from topomerge.models.wall_network import WallNetwork, WallProbabilities
 
-from benchmarks.speed.bench import best, line
+from benchmarks.speed.bench import print_line, time_best
 from topomerge.extraction.elevations.elevation import WALL_NETWORK_FILE, WALL_SIGNATURE
 from topomerge.extraction.plans.plan_network import PLAN_NETWORK_FILE, PLAN_SIGNATURE
 from topomerge.networks.network import load_shipped_network
-from topomerge.registration.evidence.network import PLACE_NETWORK_FILE, PLACE_SIGNATURE
+from topomerge.registration.evidence.places import PLACE_NETWORK_FILE, PLACE_SIGNATURE
 
 AGREE = 1e-5
 MODULES = {
@@ -48,7 +47,7 @@ def main(sides: tuple[int, ...] = (256, 512, 1024), strip: int = 800, squares: i
         feeds = {argument: np.random.default_rng(0).random(shape, np.float32)}
         if np.abs(network(**feeds)[0] - peer(**feeds)[0]).max() > AGREE:
             raise SystemExit("the two differ")
-        line(name, best(lambda: network(**feeds)), best(lambda: peer(**feeds)))  # noqa: B023
+        print_line(name, time_best(lambda: network(**feeds)), time_best(lambda: peer(**feeds)))  # noqa: B023
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ Every method answers the same question, all cells within r of 5000 occupied cell
 compared before anything is timed, and no index is built in the time. All run on all cores. The KD-tree's answers are Python
 lists, it has no other; `bricks` is the library's own cell lookup under every cell of a sphere, `hash` the same with a plain
 hash table. Run from the root: ``python -m benchmarks.speed.octree_queries [queries]``. Lines: `name ours peer ratio`, see
-`bench.line`.
+`bench.print_line`.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ import numpy as np
 from numba import njit, prange
 from scipy.spatial import cKDTree
 
-from benchmarks.speed.bench import best, line
-from topomerge.extraction.convolution import sphere
+from benchmarks.speed.bench import print_line, time_best
+from topomerge.extraction.convolution import build_sphere
 from topomerge.extraction.views.visibility import SparseVoxelOctree
-from topomerge.kernels.lookup import row
+from topomerge.kernels.voxels import find_row
 from topomerge.types import VoxelGrid
 
 CELL_EDGE = 0.1  # m
@@ -29,7 +29,7 @@ RADIUS_SLACK = 1e-6 * CELL_EDGE  # m: cells exactly at r count, as they do for t
 CSR = tuple[np.ndarray, np.ndarray]
 
 
-def floor_grid() -> VoxelGrid:
+def build_floor_grid() -> VoxelGrid:
     """A storey of 40 x 40 m: floor, ceiling at 2.8 m, walls around rooms of 5 x 4 m with doors, and furniture."""
     volume = np.zeros((400, 400, 30), bool)
     volume[:, :, [0, 28]] = True
@@ -48,11 +48,13 @@ def floor_grid() -> VoxelGrid:
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
-def _by_bricks(table, bricks, cells, offsets, indptr, rows, fill):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _query_by_bricks(table, bricks, cells, offsets, indptr, rows, fill):  # type: ignore[no-untyped-def]  # pragma: no cover
     for i in prange(len(cells)):
         count = 0
         for j in range(len(offsets)):
-            cell_row = row(table, bricks, cells[i, 0] + offsets[j, 0], cells[i, 1] + offsets[j, 1], cells[i, 2] + offsets[j, 2])
+            cell_row = find_row(
+                table, bricks, cells[i, 0] + offsets[j, 0], cells[i, 1] + offsets[j, 1], cells[i, 2] + offsets[j, 2]
+            )
             if cell_row >= 0:
                 if fill:
                     rows[indptr[i] + count] = cell_row
@@ -62,29 +64,29 @@ def _by_bricks(table, bricks, cells, offsets, indptr, rows, fill):  # type: igno
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _key(x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _encode_key(x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover
     return np.int64((x << 42) | (y << 21) | z)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _slot(key, mask):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _find_slot(key, mask):  # type: ignore[no-untyped-def]  # pragma: no cover
     mixed = key * np.int64(0x1E3779B97F4A7C15)  # Fibonacci hashing: the high bits depend on every bit of the key
     return ((mixed >> 36) ^ (mixed >> 20)) & mask
 
 
 @njit(cache=True, error_model="numpy")
-def _hash(cells, keys, values):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _hash_key(cells, keys, values):  # type: ignore[no-untyped-def]  # pragma: no cover
     mask = len(keys) - 1
     for i in range(len(cells)):
-        key = _key(np.int64(cells[i, 0]), np.int64(cells[i, 1]), np.int64(cells[i, 2]))
-        slot = _slot(key, mask)
+        key = _encode_key(np.int64(cells[i, 0]), np.int64(cells[i, 1]), np.int64(cells[i, 2]))
+        slot = _find_slot(key, mask)
         while keys[slot] >= 0:
             slot = (slot + 1) & mask
         keys[slot], values[slot] = key, i
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
-def _by_hash(keys, values, cells, offsets, indptr, rows, fill):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _query_by_hash(keys, values, cells, offsets, indptr, rows, fill):  # type: ignore[no-untyped-def]  # pragma: no cover
     mask = len(keys) - 1
     for i in prange(len(cells)):
         count = 0
@@ -92,8 +94,8 @@ def _by_hash(keys, values, cells, offsets, indptr, rows, fill):  # type: ignore[
             x, y, z = cells[i, 0] + offsets[j, 0], cells[i, 1] + offsets[j, 1], cells[i, 2] + offsets[j, 2]
             if x < 0 or y < 0 or z < 0:
                 continue
-            key = _key(x, y, z)
-            slot = _slot(key, mask)
+            key = _encode_key(x, y, z)
+            slot = _find_slot(key, mask)
             while keys[slot] >= 0 and keys[slot] != key:
                 slot = (slot + 1) & mask
             if keys[slot] == key:
@@ -104,9 +106,9 @@ def _by_hash(keys, values, cells, offsets, indptr, rows, fill):  # type: ignore[
             indptr[i + 1] = count
 
 
-def _two_passes(kernel: Callable[..., None], tables: CSR, cells: np.ndarray, radius: float) -> CSR:
+def _run_two_passes(kernel: Callable[..., None], tables: CSR, cells: np.ndarray, radius: float) -> CSR:
     """Count, then fill: as the octree does. Rows stay in the order of the stencil."""
-    offsets = sphere(radius, CELL_EDGE).offsets
+    offsets = build_sphere(radius, CELL_EDGE).offsets
     indptr, rows = np.zeros(len(cells) + 1, np.int64), np.empty(0, np.int64)
     kernel(*tables, cells, offsets, indptr, rows, False)
     np.cumsum(indptr, out=indptr)
@@ -115,19 +117,19 @@ def _two_passes(kernel: Callable[..., None], tables: CSR, cells: np.ndarray, rad
     return indptr, rows
 
 
-def methods(grid: VoxelGrid, queries: np.ndarray) -> dict[str, Callable[[float], Any]]:
+def build_methods(grid: VoxelGrid, queries: np.ndarray) -> dict[str, Callable[[float], Any]]:
     """Name -> function of a radius; each has its index built already."""
     octree = SparseVoxelOctree(grid)
-    centroids, centres, cells = grid.centroids(), grid.centroids(queries), queries.astype(np.int64)
+    centroids, centres, cells = grid.compute_centroids(), grid.compute_centroids(queries), queries.astype(np.int64)
     tree = cKDTree(centroids)
     keys = np.full(1 << int(len(grid) * 2 - 1).bit_length(), -1, np.int64)  # at most half full
     values = np.empty_like(keys)
-    _hash(grid.cells, keys, values)
+    _hash_key(grid.cells, keys, values)
     by_name: dict[str, Callable[[float], Any]] = {
-        "octree": lambda r: octree.radius_many(queries, r),
+        "octree": lambda r: octree.find_in_radius_many(queries, r),
         "kdtree": lambda r: tree.query_ball_point(centres, r + RADIUS_SLACK, workers=2),
-        "bricks": lambda r: _two_passes(_by_bricks, grid._bricks, cells, r),
-        "hash": lambda r: _two_passes(_by_hash, (keys, values), cells, r),
+        "bricks": lambda r: _run_two_passes(_query_by_bricks, grid._bricks, cells, r),
+        "hash": lambda r: _run_two_passes(_query_by_hash, (keys, values), cells, r),
     }
     try:
         import open3d as o3d
@@ -145,7 +147,7 @@ def methods(grid: VoxelGrid, queries: np.ndarray) -> dict[str, Callable[[float],
     return {**by_name, "open3d": by_open3d}
 
 
-def counts(result: Any) -> np.ndarray:
+def count_found(result: Any) -> np.ndarray:
     """Cells found for each query, whatever the method returns."""
     if isinstance(result, np.ndarray):
         return np.array([len(r) for r in result])
@@ -154,17 +156,17 @@ def counts(result: Any) -> np.ndarray:
 
 def main(queries: int = 5000, radii: tuple[float, ...] = RADII) -> None:
     """Verify, then time."""
-    grid = floor_grid()
+    grid = build_floor_grid()
     chosen = np.random.default_rng(1).choice(len(grid), queries, replace=False)
-    by_name = methods(grid, grid.cells[np.sort(chosen)])
+    by_name = build_methods(grid, grid.cells[np.sort(chosen)])
     for radius in radii:
-        expected = counts(by_name["octree"](radius))
+        expected = count_found(by_name["octree"](radius))
         for name, method in by_name.items():
-            if not np.array_equal(counts(method(radius)), expected):
+            if not np.array_equal(count_found(method(radius)), expected):
                 raise AssertionError(f"{name} and the octree differ at {radius} m")
-        seconds = {name: best(lambda m=method, r=radius: m(r), 5) for name, method in by_name.items()}  # type: ignore[misc]
+        seconds = {name: time_best(lambda m=method, r=radius: m(r), 5) for name, method in by_name.items()}  # type: ignore[misc]
         for name in list(by_name)[1:]:
-            line(f"radius_{radius:g}m_octree_vs_{name}", seconds["octree"], seconds[name])
+            print_line(f"radius_{radius:g}m_octree_vs_{name}", seconds["octree"], seconds[name])
 
 
 if __name__ == "__main__":

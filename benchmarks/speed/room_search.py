@@ -1,9 +1,9 @@
-"""Nearest rooms among many: exact search beside the index of a large atlas (`fusion.atlas.neighbours`, `rooms_index`).
+"""Nearest rooms among many: exact search beside the index of a large atlas (`fusion.atlas.neighbours`, `prepare_rooms_index`).
 
 ``python -m benchmarks.speed.room_search [ROOMS ...] [--write FILE]``: vectors of length 1 as of the embedder that ships (256
 numbers), noisy copies of a twentieth as many looks; what is looked for are noisy copies of some of them, as many as a map of 30
 rooms has at four turns. Seconds are of the processor: run it on one core. It prints a table, and a line a
-size as `bench.line` does.
+size as `bench.print_line` does.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from time import process_time
 
 import numpy as np
 
-from benchmarks.speed.bench import line
+from benchmarks.speed.bench import print_line
 from topomerge.evaluation.tables import write_section
-from topomerge.fusion.atlas.partners import nearest
+from topomerge.fusion.atlas.partners import find_nearest
 from topomerge.fusion.atlas.rooms_index import RoomsIndex
 from topomerge.types import Array
 
@@ -34,24 +34,24 @@ SEARCH_COLUMNS = (
 )
 
 
-def noisy(rng: np.random.Generator, vectors: Array, noise: float) -> Array:
+def add_noise(rng: np.random.Generator, vectors: Array, noise: float) -> Array:
     """Vectors with noise of such a length added, of length 1, in single precision."""
     other = vectors + np.float32(noise / np.sqrt(VECTOR)) * rng.standard_normal(vectors.shape, dtype=np.float32)
     out: Array = other / np.linalg.norm(other, axis=1, keepdims=True)
     return out
 
 
-def table_of(rng: np.random.Generator, rooms: int) -> Array:
+def draw_table(rng: np.random.Generator, rooms: int) -> Array:
     """(rooms, VECTOR) vectors."""
-    looks = noisy(rng, np.zeros((max(rooms // ALIKE, 1), VECTOR), np.float32), 1.0)
+    looks = add_noise(rng, np.zeros((max(rooms // ALIKE, 1), VECTOR), np.float32), 1.0)
     table = np.empty((rooms, VECTOR), np.float32)
     for k in range(0, rooms, MADE_AT_ONCE):
         part = table[k : k + MADE_AT_ONCE]
-        part[:] = noisy(rng, looks[rng.integers(0, len(looks), len(part))], LOOK_NOISE)
+        part[:] = add_noise(rng, looks[rng.integers(0, len(looks), len(part))], LOOK_NOISE)
     return table
 
 
-def seconds(search: Callable[..., object], *inputs: Array) -> float:
+def time_query(search: Callable[..., object], *inputs: Array) -> float:
     """Of the processor, a query; the best of three runs."""
     spent = []
     for _ in range(3):
@@ -64,16 +64,16 @@ def seconds(search: Callable[..., object], *inputs: Array) -> float:
 def measure(rooms: int) -> str:
     """One size: a row of the table."""
     rng = np.random.default_rng(rooms)
-    table = table_of(rng, rooms)
+    table = draw_table(rng, rooms)
     itself = rng.integers(0, rooms, ASKED)
-    asked = noisy(rng, table[itself], SEEN_NOISE)
+    asked = add_noise(rng, table[itself], SEEN_NOISE)
     index = RoomsIndex(VECTOR)
     began = process_time()
     index.add(["all"], [rooms], table)
     made = process_time() - began
-    exact, by_index = nearest(table, asked)[0], index.nearest(asked)[0]
-    slow, fast = seconds(nearest, table, asked), seconds(index.nearest, asked)
-    line(f"room_search_{rooms}", fast, slow)
+    exact, by_index = find_nearest(table, asked)[0], index.find_nearest(asked)[0]
+    slow, fast = time_query(find_nearest, table, asked), time_query(index.find_nearest, asked)
+    print_line(f"room_search_{rooms}", fast, slow)
     recall = np.mean([len(set(a[:10]) & set(b[:10])) / 10 for a, b in zip(exact.tolist(), by_index.tolist(), strict=True)])
     first = [float((hits[:, 0] == itself).mean()) for hits in (exact, by_index)]
     memory = [size / 1e6 for size in (table.nbytes, index.memory)]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from benchmarks.speed.bench import best
+from benchmarks.speed.bench import time_best
 from topomerge.cli.main import COMMANDS
 
 
@@ -16,7 +16,7 @@ def main(repeat: int = 5, commands: int | None = None) -> None:
     """Print a table of the least disturbed of `repeat` runs; of the first `commands` commands, or of all."""
 
     def run(*words: str) -> float:
-        return best(lambda: subprocess.run([sys.executable, *words], stdout=subprocess.DEVNULL, check=True), repeat)
+        return time_best(lambda: subprocess.run([sys.executable, *words], stdout=subprocess.DEVNULL, check=True), repeat)
 
     print("| command | s |\n|---|---|")
     print(f"| `python -c pass` | {run('-c', 'pass'):.3f} |")

@@ -25,7 +25,7 @@ from topomerge.config import compose
 from topomerge.embedding.network import Geometry, Network, Node
 from topomerge.training.embedding import EmbeddingJob, start_fabric
 from topomerge.training.loop import State
-from topomerge.training.packed import GraphPair, load_pairs
+from topomerge.training.packed_pairs import GraphPair, load_pairs
 from topomerge.training.settings import Training
 
 SURROUNDINGS = Network(
@@ -66,7 +66,7 @@ def measure_training(pairs: Sequence[GraphPair], settings: Training, steps: int)
     fused = fabric.device.type == "cuda"
     optimizer = torch.optim.AdamW(network.parameters(), settings.rate, weight_decay=settings.decay, fused=fused)
     job = EmbeddingJob(settings, fabric, network, optimizer, (pairs, []))
-    batches, state, rooms, waited, began = job.batches(State()), State(), 0, 0.0, 0.0
+    batches, state, rooms, waited, began = job.iter_batches(State()), State(), 0, 0.0, 0.0
     with CardMonitor() as card:
         for k in range(WARM_UP + steps):
             if k == WARM_UP:
@@ -75,8 +75,8 @@ def measure_training(pairs: Sequence[GraphPair], settings: Training, steps: int)
             before = time.perf_counter()
             batch = next(batches)
             waited += time.perf_counter() - before
-            rooms += job.size(batch)
-            job.step(batch, state)
+            rooms += job.count_items(batch)
+            job.train_step(batch, state)
             state.step += 1
         synchronize(fabric.device)
         seconds = time.perf_counter() - began

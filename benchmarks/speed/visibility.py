@@ -2,7 +2,7 @@
 
 Both decide the same rays. Open3D is told where each ray should end and says what it hits first; building its scene is not timed,
 and neither is compiling. Run from the root: ``python -m benchmarks.speed.visibility``. Lines: `name ours peer ratio`, see
-`bench.line`; the rates follow as a comment.
+`bench.print_line`; the rates follow as a comment.
 """
 
 from __future__ import annotations
@@ -10,15 +10,15 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from benchmarks.speed.bench import DEPTH, WIDTH, best, line, storey
-from topomerge.extraction.views.visibility import visible_cells
+from benchmarks.speed.bench import DEPTH, WIDTH, print_line, storey, time_best
+from topomerge.extraction.views.visibility import find_visible_cells
 from topomerge.extraction.voxels import voxelise
 from topomerge.types import VoxelGrid
 
 VIEW_RANGE = 5.0  # m
 
 
-def cubes(grid: VoxelGrid):
+def build_cubes(grid: VoxelGrid):
     """Open3D scene of one cube a cell (12 triangles), in units of cells."""
     import open3d as o3d
 
@@ -39,26 +39,26 @@ def main(points: int = 2_000_000, views: int = 200) -> None:
     grid = voxelise(storey(points))
     rng = np.random.default_rng(1)
     places = rng.uniform((0.5, 0.5, 1.4), (WIDTH - 0.5, DEPTH - 0.5, 2.0), (views, 3))
-    targets = cKDTree(grid.centroids()).query_ball_point(places, VIEW_RANGE, return_sorted=True)
+    targets = cKDTree(grid.compute_centroids()).query_ball_point(places, VIEW_RANGE, return_sorted=True)
     view_of = np.repeat(np.arange(views), [len(t) for t in targets])
     target = np.concatenate(targets)
     origin = ((places - grid.origin) / grid.edge)[view_of]
     toward = grid.cells[target] + 0.5 - origin
     length = np.linalg.norm(toward, axis=1)
     rays = o3d.core.Tensor(np.hstack([origin, toward / length[:, None]]).astype(np.float32))
-    scene = cubes(grid)
+    scene = build_cubes(grid)
 
-    visibility = visible_cells(grid, places, VIEW_RANGE)
+    visibility = find_visible_cells(grid, places, VIEW_RANGE)
     answer = scene.cast_rays(rays)
     hit = answer["primitive_ids"].numpy() // 12
-    ours = np.concatenate([np.isin(t, visibility.rows(v)) for v, t in enumerate(targets)])
+    ours = np.concatenate([np.isin(t, visibility.get_rows(v)) for v, t in enumerate(targets)])
     agree = float((ours == (hit == target)).mean())
     if agree < 0.995:  # float32 rays that graze an edge may differ
         raise SystemExit(f"the two don't decide alike: {agree:.4f}")
 
-    seconds = best(lambda: visible_cells(grid, places, VIEW_RANGE), 3)
-    peer = best(lambda: scene.cast_rays(rays), 3)
-    line("visibility_rays", seconds, peer)
+    seconds = time_best(lambda: find_visible_cells(grid, places, VIEW_RANGE), 3)
+    peer = time_best(lambda: scene.cast_rays(rays), 3)
+    print_line("visibility_rays", seconds, peer)
     rate = len(target) / 1e6
     print(f"# {len(target)} rays, {len(grid)} cells; {agree:.4%} decided alike")
     print(f"# {rate / seconds:.1f} against {rate / peer:.1f} million rays a second")

@@ -7,7 +7,7 @@ points and sorts the cells in Morton order, Open3D's averages positions. Run fro
 
 from __future__ import annotations
 
-from benchmarks.speed.bench import best, line, storey
+from benchmarks.speed.bench import print_line, storey, time_best
 from topomerge.extraction.voxels import voxelise
 
 
@@ -22,9 +22,11 @@ def main(points: int = 10_000_000) -> None:
     if abs(cells / len(ours) - 1) > 0.02:
         raise SystemExit(f"not the same cells: {len(ours)} and {cells}")
     name = f"voxelise_{points // 1_000_000}M"
-    line(name, best(lambda: voxelise(cloud_points), 3), best(lambda: cloud.voxel_down_sample(0.1), 3))
+    print_line(name, time_best(lambda: voxelise(cloud_points), 3), time_best(lambda: cloud.voxel_down_sample(0.1), 3))
     classic = cloud.to_legacy()
-    line(f"{name}_legacy", best(lambda: voxelise(cloud_points), 3), best(lambda: classic.voxel_down_sample(0.1), 1))
+    print_line(
+        f"{name}_legacy", time_best(lambda: voxelise(cloud_points), 3), time_best(lambda: classic.voxel_down_sample(0.1), 1)
+    )
 
 
 if __name__ == "__main__":

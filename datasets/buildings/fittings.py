@@ -6,14 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 import shapely
-from topomerge.datasets.buildings.furnish import Floor, furnish
-from topomerge.datasets.buildings.furniture import Item, footprints
-from topomerge.datasets.buildings.openings import Hole
-from topomerge.datasets.buildings.spaces import Space
-from topomerge.datasets.core.building import SURFACES, THING_DTYPE
-from topomerge.datasets.core.difficulty import Difficulty
-from topomerge.datasets.core.plan import Plan
-from topomerge.datasets.core.solids import Soup, boxes, column, flat, rotation
+from topomerge.datasets.buildings.furniture import FurnishedFloor, Item, compute_footprints, furnish
+from topomerge.datasets.buildings.openings import RoomCells, WallOpening
+from topomerge.datasets.core.building import SURFACES, THING_DTYPE, Difficulty, Plan
+from topomerge.datasets.core.solids import (
+    TriangleSoup,
+    build_rotation,
+    triangulate_boxes,
+    triangulate_column,
+    triangulate_polygons,
+)
 
 from topomerge.types import Array
 
@@ -25,11 +27,11 @@ CASED = 0.8  # share of the faces of doors with a frame that have a casing
 TWO_LEAVES = 1.25  # m; wider doors have two leaves
 
 
-def fit(
-    soup: Soup,
+def add_fittings(
+    soup: TriangleSoup,
     plans: Sequence[Plan],
-    spaces: list[Space],
-    holes: list[Hole],
+    spaces: list[RoomCells],
+    holes: list[WallOpening],
     doors: Array,
     stairs: Array,
     difficulty: Difficulty,
@@ -37,22 +39,22 @@ def fit(
 ) -> Array:
     """Add all fittings and furniture; returns (M,) THING_DTYPE."""
     things: list[tuple] = []
-    _leaves(soup, things, spaces, doors, difficulty.frames, rng)
+    _add_leaves(soup, things, spaces, doors, difficulty.frames, rng)
     for hole in holes:
-        _pane(soup, hole)
+        _add_pane(soup, hole)
     for space in spaces:
         if space.room < 0:
             continue
-        _slope(soup, space)
+        _add_sloped_ceiling(soup, space)
         taken = keep_clear(space.room, doors, stairs)
-        taken += _columns(soup, things, space, plans[space.storey], taken, difficulty, rng)
-        _overhead(soup, things, space, difficulty, rng)
+        taken += _add_columns(soup, things, space, plans[space.storey], taken, difficulty, rng)
+        _add_lamps_and_beams(soup, things, space, difficulty, rng)
         if difficulty.furniture > 0 or difficulty.clutter > 0:
-            _furniture(soup, things, space, doors, taken, difficulty, rng)
+            _add_furniture(soup, things, space, doors, taken, difficulty, rng)
     return np.array(things, THING_DTYPE)
 
 
-def leaf_yaw(door: Array, pivot: Array, angle: float) -> float:
+def compute_leaf_yaw(door: Array, pivot: Array, angle: float) -> float:
     """rad, where a leaf that turns about `pivot` points when it is opened by `angle`, away from its wall."""
     along = np.array([np.sin(door["direction"]), -np.cos(door["direction"])])
     normal = np.array([np.cos(door["direction"]), np.sin(door["direction"])])
@@ -62,7 +64,9 @@ def leaf_yaw(door: Array, pivot: Array, angle: float) -> float:
     return float(np.arctan2(reach[1], reach[0]))
 
 
-def _leaves(soup: Soup, things: list[tuple], spaces: list[Space], doors: Array, frames: float, rng: np.random.Generator) -> None:
+def _add_leaves(
+    soup: TriangleSoup, things: list[tuple], spaces: list[RoomCells], doors: Array, frames: float, rng: np.random.Generator
+) -> None:
     """One leaf a door, two for wide ones, hung so that it swings into the room and not into the corridor.
 
     Args:
@@ -83,23 +87,23 @@ def _leaves(soup: Soup, things: list[tuple], spaces: list[Space], doors: Array, 
         ends = (-1.0, 1.0) if door["width"] > TWO_LEAVES else (float(rng.choice([-1.0, 1.0])),)
         angle = float(rng.uniform(*SWING[str(door["state"])]))
         framed = bool(frames) and rng.random() < frames
-        depth = _frame(soup, door, rng) if framed else 0.0
+        depth = _add_door_frame(soup, door, rng) if framed else 0.0
         for end in ends:
             pivot = door["centre"][:2] + end * along * (door["width"] / 2 - 0.01)
             pivot = pivot + side * normal * (door["thickness"] / 2 - LEAF_THICKNESS / 2 - depth)
-            yaw, length = leaf_yaw(door, pivot, angle), door["width"] / len(ends) - 0.02
+            yaw, length = compute_leaf_yaw(door, pivot, angle), door["width"] / len(ends) - 0.02
             centre = [*(pivot + length / 2 * np.array([np.cos(yaw), np.sin(yaw)])), door["centre"][2]]
             size = (length, LEAF_THICKNESS, door["height"] - 0.03)
             parts = [[0, 0, size[2] / 2 + 0.01, *size]]
             if framed:
                 across = LEAF_THICKNESS / 2 + HANDLE[1] / 2
                 parts += [[length / 2 - HANDLE[0], s * across, HANDLE_HEIGHT, *HANDLE] for s in (1, -1)]
-            soup.add(*boxes(np.array(parts), np.array(centre), yaw), "leaf", len(things))
+            soup.add(*triangulate_boxes(np.array(parts), np.array(centre), yaw), "leaf", len(things))
             centre[2] += size[2] / 2
             things.append(("leaf", int(into), d, tuple(centre), size, yaw, tuple(pivot), True))
 
 
-def _frame(soup: Soup, door: Array, rng: np.random.Generator) -> float:
+def _add_door_frame(soup: TriangleSoup, door: Array, rng: np.random.Generator) -> float:
     """A casing around a door on one face of its wall or both; returns how deep the leaf stands in the wall, m."""
     wide, thick = float(rng.uniform(0.05, 0.1)), float(rng.uniform(0.008, 0.025))
     half, height, out = door["width"] / 2 + wide / 2, float(door["height"]), door["thickness"] / 2 + thick / 2
@@ -107,12 +111,12 @@ def _frame(soup: Soup, door: Array, rng: np.random.Generator) -> float:
         if rng.random() < CASED:
             posts = [[face * out, s * half, height / 2, thick, wide, height] for s in (1, -1)]
             head = [face * out, 0, height + wide / 2, thick, 2 * half + wide, wide]
-            soup.add(*boxes(np.array([*posts, head]), door["centre"], float(door["direction"])), "wall")
+            soup.add(*triangulate_boxes(np.array([*posts, head]), door["centre"], float(door["direction"])), "wall")
     deep = max(float(door["thickness"]) - LEAF_THICKNESS, 0.0)
     return float(rng.uniform(0, deep if rng.random() < 0.5 else min(deep, 0.05)))
 
 
-def _pane(soup: Soup, hole: Hole) -> None:
+def _add_pane(soup: TriangleSoup, hole: WallOpening) -> None:
     """Glass in the middle of a window, with posts every 1.3 m."""
     if hole.opening.kind != "window":
         return
@@ -125,10 +129,10 @@ def _pane(soup: Soup, hole: Hole) -> None:
     posts = np.stack([xs - length / 2, 0 * xs, 0 * xs, 0 * xs + 0.06, 0 * xs + 0.06, 0 * xs + high - low], axis=1)
     rails = [[0, 0, z, length, 0.06, 0.06] for z in (low - middle + 0.03, high - middle - 0.03)]
     yaw = float(np.arctan2(b[1] - a[1], b[0] - a[0]))
-    soup.add(*boxes(np.concatenate([posts, rails]), np.array([*((a + b) / 2), middle]), yaw), "wall")
+    soup.add(*triangulate_boxes(np.concatenate([posts, rails]), np.array([*((a + b) / 2), middle]), yaw), "wall")
 
 
-def _slope(soup: Soup, space: Space) -> None:
+def _add_sloped_ceiling(soup: TriangleSoup, space: RoomCells) -> None:
     """A ceiling that falls along the room; the flat one above it is out of sight."""
     if space.plan.slope <= 0:
         return
@@ -136,28 +140,28 @@ def _slope(soup: Soup, space: Space) -> None:
     sides = np.diff(corners[:3], axis=0)
     lengths = np.hypot(sides[:, 0], sides[:, 1])
     k = int(np.argmax(lengths))
-    triangles = flat(space.shape)[0].reshape(-1, 2)
+    triangles = triangulate_polygons(space.shape)[0].reshape(-1, 2)
     share = np.clip((triangles - corners[k]) @ sides[k] / lengths[k] ** 2, 0, 1)
     vertices = np.column_stack([triangles, space.ceiling - space.plan.slope * share])
     soup.add(vertices, np.arange(len(vertices)).reshape(-1, 3)[:, ::-1], "ceiling")
 
 
 def keep_clear(room: int, doors: Array, stairs: Array) -> list[shapely.Polygon]:
-    """Where nothing may stand: before doors, and on stairs and their landings."""
+    """Return where nothing may stand: before doors, and on stairs and their landings."""
     out = []
     for door in doors[(doors["rooms"] == room).any(axis=1)]:
         half = np.array([door["thickness"] / 2 + max(door["width"], 0.95) + 0.1, door["width"] / 2 + 0.1])
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
-        out.append(shapely.Polygon(corners @ rotation(door["direction"]) + door["centre"][:2]))
+        out.append(shapely.Polygon(corners @ build_rotation(door["direction"]) + door["centre"][:2]))
     for stair in stairs[(stairs["rooms"] == room).any(axis=1)]:
         out.append(shapely.Polygon(stair["footprint"]).buffer(1.0, join_style="mitre"))
     return out
 
 
-def _columns(
-    soup: Soup,
+def _add_columns(
+    soup: TriangleSoup,
     things: list[tuple],
-    space: Space,
+    space: RoomCells,
     plan: Plan,
     taken: list[shapely.Polygon],
     difficulty: Difficulty,
@@ -177,7 +181,7 @@ def _columns(
         if not space.shape.contains(outline) or any(outline.intersects(t) for t in taken):
             continue
         turn = 0.707 if style < 0.5 else 0.5
-        mesh = column(np.array([x, y]), side * turn, space.floor, space.ceiling, 4 if style < 0.5 else 12)
+        mesh = triangulate_column(np.array([x, y]), side * turn, space.floor, space.ceiling, 4 if style < 0.5 else 12)
         soup.add(*mesh, "column", len(things))
         tall = space.ceiling - space.floor
         centre = (x, y, space.floor + tall / 2)
@@ -186,7 +190,9 @@ def _columns(
     return out
 
 
-def _overhead(soup: Soup, things: list[tuple], space: Space, difficulty: Difficulty, rng: np.random.Generator) -> None:
+def _add_lamps_and_beams(
+    soup: TriangleSoup, things: list[tuple], space: RoomCells, difficulty: Difficulty, rng: np.random.Generator
+) -> None:
     """Lamps below the ceiling and beams along it."""
     del things
     if space.shape.area < 4 or space.plan.slope > 0:
@@ -206,16 +212,20 @@ def _overhead(soup: Soup, things: list[tuple], space: Space, difficulty: Difficu
     if rng.random() < difficulty.beams and space.ceiling - space.floor > 2.5:
         deep = min(0.3, space.ceiling - space.floor - 2.3)
         parts += [[x, 0, -deep / 2, 0.25, wide, deep] for x in np.arange(2.0, long - 1.0, 3.6) - long / 2]
-    turned = [[*(np.array(p[:2]) @ rotation(yaw) + middle), *p[2:]] for p in parts]
-    _ducts(soup, space, (middle, yaw, float(long), float(wide)), difficulty, rng)
+    turned = [[*(np.array(p[:2]) @ build_rotation(yaw) + middle), *p[2:]] for p in parts]
+    _add_ducts(soup, space, (middle, yaw, float(long), float(wide)), difficulty, rng)
     for part, at in zip(parts, turned, strict=True):
         if space.shape.buffer(0.01).contains(shapely.Point(at[:2]).buffer(min(part[3], part[4]) / 2)):
             where = np.array([at[0], at[1], space.ceiling])
-            soup.add(*boxes(np.array([[0, 0, *part[2:]]]), where, yaw), "beam")
+            soup.add(*triangulate_boxes(np.array([[0, 0, *part[2:]]]), where, yaw), "beam")
 
 
-def _ducts(
-    soup: Soup, space: Space, frame: tuple[Array, float, float, float], difficulty: Difficulty, rng: np.random.Generator
+def _add_ducts(
+    soup: TriangleSoup,
+    space: RoomCells,
+    frame: tuple[Array, float, float, float],
+    difficulty: Difficulty,
+    rng: np.random.Generator,
 ) -> None:
     """Air ducts, pipes and cable trays under the ceiling, along the room or across it.
 
@@ -235,32 +245,32 @@ def _ducts(
         across = bool(not rows and rng.random() < 0.25)
         offset = ((k + 0.5) / number - 0.5 if rows else rng.uniform(-0.4, 0.4)) * (long if across else wide)
         reach, drop = (wide if across else long), deep * min(0.6 if rows else 0.4, spare - high)
-        place = middle + (np.array([offset, 0.0]) if across else np.array([0.0, offset])) @ rotation(yaw)
+        place = middle + (np.array([offset, 0.0]) if across else np.array([0.0, offset])) @ build_rotation(yaw)
         turn, reach = yaw + np.pi / 2 * across, max(reach - 0.02, 0.5)
-        box = shapely.Polygon(footprints(place[None], np.array([turn]), (reach, broad))[0]).intersection(space.shape)
+        box = shapely.Polygon(compute_footprints(place[None], np.array([turn]), (reach, broad))[0]).intersection(space.shape)
         if box.area > 0.98 * reach * broad:
             at = np.array([*place, space.ceiling])
-            soup.add(*boxes(np.array([[0, 0, -drop - high / 2, reach, broad, high]]), at, turn), "beam")
+            soup.add(*triangulate_boxes(np.array([[0, 0, -drop - high / 2, reach, broad, high]]), at, turn), "beam")
 
 
-def _furniture(
-    soup: Soup,
+def _add_furniture(
+    soup: TriangleSoup,
     things: list[tuple],
-    space: Space,
+    space: RoomCells,
     doors: Array,
     taken: list[shapely.Polygon],
     difficulty: Difficulty,
     rng: np.random.Generator,
 ) -> None:
     own = doors[(doors["rooms"] == space.room).any(axis=1)]
-    floor = Floor(shapely.orient_polygons(space.shape), list(taken), rng, space.ceiling - space.plan.slope - space.floor)
+    floor = FurnishedFloor(shapely.orient_polygons(space.shape), list(taken), rng, space.ceiling - space.plan.slope - space.floor)
     items = furnish(floor, space.plan.kind, difficulty.furniture, difficulty.clutter, own["centre"][:, :2])
     for item in items:
         add_item(soup, things, item, space.room, space.floor)
 
 
-def add_item(soup: Soup, things: list[tuple], item: Item, room: int, floor: float) -> None:
+def add_item(soup: TriangleSoup, things: list[tuple], item: Item, room: int, floor: float) -> None:
     """Put an item into a building that is being made."""
-    soup.add(*boxes(item.parts, np.array([*item.at, floor]), item.yaw), SURFACES.index(item.label), len(things))
+    soup.add(*triangulate_boxes(item.parts, np.array([*item.at, floor]), item.yaw), SURFACES.index(item.label), len(things))
     centre = (*item.at, floor + item.size[2] / 2)
     things.append((item.kind, room, -1, centre, item.size, item.yaw, tuple(item.at), item.movable))

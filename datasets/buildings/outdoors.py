@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import shapely
 from topomerge.datasets.core.building import Building
-from topomerge.datasets.core.solids import BOX, BOX_FACES, Soup
+from topomerge.datasets.core.solids import BOX, BOX_FACES, TriangleSoup
 
 from topomerge.types import Array
 
@@ -27,19 +27,19 @@ LEAF = 0.35  # m, of a side
 CAR = (4.3, 1.8, 1.45)  # m
 
 
-def with_outdoors(building: Building, rng: np.random.Generator) -> Building:
-    """The building with ground around its lowest storey and with what stands there, all labelled `facade`."""
+def add_outdoors(building: Building, rng: np.random.Generator) -> Building:
+    """Return the building with ground around its lowest storey and with what stands there, all labelled `facade`."""
     low = float(building.storeys["floor"][0]) - float(rng.uniform(*DROP))
-    taken = footprint_of(building)
+    taken = compute_footprint(building)
     x0, y0, x1, y1 = taken.bounds
     sides = rng.uniform(*DEPTH, 4)
     box = np.array([[x0 - sides[0], y0 - sides[1]], [x1 + sides[2], y1 + sides[3]]])
-    soup = Soup()
+    soup = TriangleSoup()
     _add_ground(soup, box, taken, low, rng)
     for side in range(4):
         _add_bound(soup, box, side, low, rng)
     _add_plants(soup, box, taken, low, rng)
-    vertices, triangles, labels, _ = soup.arrays()
+    vertices, triangles, labels, _ = soup.build_arrays()
     return replace(
         building,
         vertices=np.concatenate([building.vertices, vertices]),
@@ -49,12 +49,12 @@ def with_outdoors(building: Building, rng: np.random.Generator) -> Building:
     )
 
 
-def footprint_of(building: Building) -> shapely.Geometry:
-    """The outline of a building's rooms with their walls."""
+def compute_footprint(building: Building) -> shapely.Geometry:
+    """Compute the outline of a building's rooms with their walls."""
     return shapely.union_all([shapely.Polygon(room.polygon).buffer(WALL, join_style="mitre") for room in building.rooms])
 
 
-def _add_ground(soup: Soup, box: Array, taken: shapely.Geometry, low: float, rng: np.random.Generator) -> None:
+def _add_ground(soup: TriangleSoup, box: Array, taken: shapely.Geometry, low: float, rng: np.random.Generator) -> None:
     counts = np.ceil((box[1] - box[0]) / GROUND_CELL).astype(int) + 1
     x, y = (np.linspace(box[0, k], box[1, k], counts[k]) for k in (0, 1))
     places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -66,7 +66,7 @@ def _add_ground(soup: Soup, box: Array, taken: shapely.Geometry, low: float, rng
     soup.add(vertices, triangles[~shapely.contains_xy(taken, middle)], "facade")
 
 
-def _add_bound(soup: Soup, box: Array, side: int, low: float, rng: np.random.Generator) -> None:
+def _add_bound(soup: TriangleSoup, box: Array, side: int, low: float, rng: np.random.Generator) -> None:
     """What ends a side of the ground: 0 west, 1 south, 2 east, 3 north."""
     kind, axis = str(rng.choice(BOUNDS)), side % 2
     if kind == "open":
@@ -87,7 +87,7 @@ def _add_bound(soup: Soup, box: Array, side: int, low: float, rng: np.random.Gen
             _add_box(soup, at + inward * rng.uniform(1.8, 2.6), along[0] + start, size, axis, low, float(rng.normal(0, 0.03)))
 
 
-def _add_box(soup: Soup, across: float, along: float, size: Array, axis: int, low: float, yaw: float) -> None:
+def _add_box(soup: TriangleSoup, across: float, along: float, size: Array, axis: int, low: float, yaw: float) -> None:
     """A box on the ground: `size` across the side, along it, and up."""
     corners = BOX * size
     turned = np.column_stack([np.cos(yaw) * corners[:, 0] - np.sin(yaw) * corners[:, 1],
@@ -96,7 +96,7 @@ def _add_box(soup: Soup, across: float, along: float, size: Array, axis: int, lo
     soup.add(np.column_stack([place if axis == 0 else place[:, ::-1], corners[:, 2] + low + size[2] / 2]), BOX_FACES, "facade")
 
 
-def _add_plants(soup: Soup, box: Array, taken: shapely.Geometry, low: float, rng: np.random.Generator) -> None:
+def _add_plants(soup: TriangleSoup, box: Array, taken: shapely.Geometry, low: float, rng: np.random.Generator) -> None:
     """Trees, and bushes that begin at the ground; their leaves are triangles that hang about."""
     area = float(np.prod(box[1] - box[0])) - taken.area
     for place in rng.uniform(box[0], box[1], (rng.poisson(rng.uniform(0, 1) * area / PLANT_AREA), 2)):

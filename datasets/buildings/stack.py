@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 import shapely
 from scipy.spatial import cKDTree
-from topomerge.datasets.buildings.stairwell import add_stairs
-from topomerge.datasets.core.plan import Opening, Plan, Wall
-from topomerge.datasets.plans.floorplans import Refusal, frame_of, iter_plans, landed, siblings
+from topomerge.datasets.buildings.stairs import add_stairs
+from topomerge.datasets.core.building import Opening, Plan, Wall
+from topomerge.datasets.plans.floorplans import Refusal, group_siblings, iter_plans, map_plans_to_frames, remove_dead_flights
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -76,8 +76,8 @@ def iter_stacks(folder: str | Path, plans: dict[str, Plan | Refusal] | None = No
         InputError: no such folder.
     """
     plan_of = dict(iter_plans(folder)) if plans is None else plans
-    frames = frame_of(folder)
-    for group in siblings(folder):
+    frames = map_plans_to_frames(folder)
+    for group in group_siblings(folder):
         for names in pairwise(group):
             storeys = [plan_of.get(name) for name in names]
             refused = [n for n, p in zip(names, storeys, strict=True) if not isinstance(p, Plan)]
@@ -86,12 +86,12 @@ def iter_stacks(folder: str | Path, plans: dict[str, Plan | Refusal] | None = No
                 if refused:
                     raise InputError(f"a storey is missing or was refused: {', '.join(refused)}")
                 common = frames[names[0]] == frames[names[1]]
-                yield name, stack([p for p in storeys if isinstance(p, Plan)], names, common)
+                yield name, stack_storeys([p for p in storeys if isinstance(p, Plan)], names, common)
             except InputError as error:
                 yield name, Refusal(name, str(error))
 
 
-def stack(plans: Sequence[Plan], names: Sequence[str] = (), common: bool = False) -> Stack:
+def stack_storeys(plans: Sequence[Plan], names: Sequence[str] = (), common: bool = False) -> Stack:
     """Put plans over each other, lowest first.
 
     Args:
@@ -114,26 +114,26 @@ def stack(plans: Sequence[Plan], names: Sequence[str] = (), common: bool = False
     placed, scale, shift = [plans[0]], 1.0, np.zeros(2)
     for plan, fit in zip(plans[1:], fits, strict=True):
         shift, scale = scale * np.array(fit.shift) + shift, scale * fit.scale
-        placed.append(moved(plan, scale, shift))
+        placed.append(transform_plan(plan, scale, shift))
     if not common:
-        unit = _unit(plans, placed)
-        placed = [moved(plan, unit, np.zeros(2)) for plan in placed]
-    built, stairs = add_stairs(landed(placed))
+        unit = _estimate_unit(plans, placed)
+        placed = [transform_plan(plan, unit, np.zeros(2)) for plan in placed]
+    built, stairs = add_stairs(remove_dead_flights(placed))
     return Stack(names, tuple(built), tuple(fits), stairs)
 
 
-def _unit(plans: Sequence[Plan], placed: Sequence[Plan]) -> float:
+def _estimate_unit(plans: Sequence[Plan], placed: Sequence[Plan]) -> float:
     """Factor for all: the scale of the plan whose stairwells (whose storey, if there are none) are nearest to a usual size."""
     best, factor = np.inf, 1.0
     for plan, now in zip(plans, placed, strict=True):
-        wells = [_shape(r).area for r in plan.rooms if r.kind == "stairs"]
+        wells = [_build_polygon(r).area for r in plan.rooms if r.kind == "stairs"]
         if wells and abs(np.log(np.median(wells) / STAIRWELL)) < best:
             best = abs(float(np.log(np.median(wells) / STAIRWELL)))
-            factor = float(np.sqrt(_shape(plan.rooms[0]).area / _shape(now.rooms[0]).area))
+            factor = float(np.sqrt(_build_polygon(plan.rooms[0]).area / _build_polygon(now.rooms[0]).area))
     return round(factor, 4)
 
 
-def moved(plan: Plan, scale: float, shift: Array) -> Plan:
+def transform_plan(plan: Plan, scale: float, shift: Array) -> Plan:
     """A plan scaled, then shifted. Doors keep their width (in a shrinking plan they shrink to 0.7 m), walls their thickness."""
 
     def place(points: Array) -> Array:
@@ -146,9 +146,9 @@ def moved(plan: Plan, scale: float, shift: Array) -> Plan:
     def opening(o: Opening) -> Opening:
         ends = np.array([o.start, o.end], float)
         width = float(np.hypot(*(ends[1] - ends[0])))
-        wanted = width if o.kind == "window" and scale > 1 else min(width, max(width * scale, 0.7))
+        requested = width if o.kind == "window" and scale > 1 else min(width, max(width * scale, 0.7))
         middle = ends.mean(axis=0) * scale + shift
-        a, b = np.round(middle + (ends - ends.mean(axis=0)) * wanted / width, 4).tolist()
+        a, b = np.round(middle + (ends - ends.mean(axis=0)) * requested / width, 4).tolist()
         return replace(o, start=tuple(a), end=tuple(b), thickness=round(o.thickness * max(scale, 1.0), 3))
 
     if scale == 1 and not np.any(shift):
@@ -163,11 +163,11 @@ def moved(plan: Plan, scale: float, shift: Array) -> Plan:
 
 
 def register(low: Plan, high: Plan, common: bool = False) -> Fit:
-    """How the plan `high` lies over the plan `low`: the best of all hypotheses; with a common frame only that one."""
-    target, source = _Storey.of(low), _Storey.of(high)
+    """Register the plan `high` over the plan `low` by the best of all hypotheses; with a common frame only that one."""
+    target, source = _StoreyShape.from_plan(low), _StoreyShape.from_plan(high)
     if common:
         return _fit(target, source, 1.0, np.zeros(2), True)
-    guesses = np.array(list(_hypotheses(target, source)))
+    guesses = np.array(list(_iter_hypotheses(target, source)))
     rough = [_score(target, source, g[0], g[1:], 8) for g in guesses]
     best = sorted(np.argsort(rough)[::-1][:12].tolist())
     refined = [_refine(target, source, *guesses[i]) for i in best]
@@ -176,15 +176,15 @@ def register(low: Plan, high: Plan, common: bool = False) -> Fit:
 
 
 @dataclass(frozen=True, eq=False)
-class _Storey:
+class _StoreyShape:
     points: Array  # (n, 2) along the walls
     tree: cKDTree
     floor: shapely.Geometry
     shafts: list[tuple[str, float, Array]]  # kind, area, middle; largest first
 
     @classmethod
-    def of(cls, plan: Plan) -> _Storey:
-        shapes = [_shape(room) for room in plan.rooms]
+    def from_plan(cls, plan: Plan) -> _StoreyShape:
+        shapes = [_build_polygon(room) for room in plan.rooms]
         rings = [s.exterior for s in shapes]
         points = np.concatenate([shapely.get_coordinates(shapely.segmentize(ring, SAMPLE)) for ring in rings])
         floor = shapely.union_all([s.buffer(0.4, join_style="mitre") for s in shapes]).simplify(0.2)
@@ -196,11 +196,11 @@ class _Storey:
         return cls(points, cKDTree(points), floor, sorted(shafts, key=lambda shaft: -shaft[1])[:SHAFTS])
 
 
-def _shape(room: object) -> shapely.Polygon:
+def _build_polygon(room: object) -> shapely.Polygon:
     return shapely.Polygon(room.polygon)  # type: ignore[attr-defined]
 
 
-def _hypotheses(target: _Storey, source: _Storey) -> Iterator[tuple[float, float, float]]:
+def _iter_hypotheses(target: _StoreyShape, source: _StoreyShape) -> Iterator[tuple[float, float, float]]:
     """Scale and shift from: nothing, two shafts of each, one shaft and its size, the corners of the boxes around."""
     yield 1.0, 0.0, 0.0
     shafts = [(a, b) for a, b in product(target.shafts, source.shafts) if a[0] == b[0]]
@@ -223,7 +223,7 @@ def _hypotheses(target: _Storey, source: _Storey) -> Iterator[tuple[float, float
             yield scale, *corner.tolist()
 
 
-def _refine(target: _Storey, source: _Storey, scale: float, x: float, y: float) -> tuple[float, float, float]:
+def _refine(target: _StoreyShape, source: _StoreyShape, scale: float, x: float, y: float) -> tuple[float, float, float]:
     points, shift = source.points[::2], np.array([x, y])
     for reach in np.geomspace(1.5, WALL_NEAR, 12):
         apart, nearest = target.tree.query(scale * points + shift)
@@ -236,12 +236,14 @@ def _refine(target: _Storey, source: _Storey, scale: float, x: float, y: float) 
     return scale, float(shift[0]), float(shift[1])
 
 
-def _score(target: _Storey, source: _Storey, scale: float, shift: Array, step: int = 1) -> float:
-    walls, cover = _overlay(target, source, scale, shift, step)
+def _score(target: _StoreyShape, source: _StoreyShape, scale: float, shift: Array, step: int = 1) -> float:
+    walls, cover = _measure_overlay(target, source, scale, shift, step)
     return walls * min(cover / COVER, 1.0)
 
 
-def _overlay(target: _Storey, source: _Storey, scale: float, shift: Array, step: int = 1) -> tuple[float, float]:
+def _measure_overlay(
+    target: _StoreyShape, source: _StoreyShape, scale: float, shift: Array, step: int = 1
+) -> tuple[float, float]:
     """Shares of walls over walls, and of floor over floor."""
     near = WALL_NEAR * min(
         scale, 1.0
@@ -263,14 +265,14 @@ def _overlay(target: _Storey, source: _Storey, scale: float, shift: Array, step:
     return float(over.mean() + under.mean()) / 2, float(cover)
 
 
-def _fit(target: _Storey, source: _Storey, scale: float, shift: Array, common: bool) -> Fit:
-    walls, cover = _overlay(target, source, scale, np.asarray(shift))
+def _fit(target: _StoreyShape, source: _StoreyShape, scale: float, shift: Array, common: bool) -> Fit:
+    walls, cover = _measure_overlay(target, source, scale, np.asarray(shift))
     return Fit(float(scale), (float(shift[0]), float(shift[1])), round(walls, 3), round(cover, 3), common)
 
 
-def alike(low: Plan, high: Plan) -> int:
-    """Number of rooms of one storey that lie over a room of the same outline (IoU above `SAME_OUTLINE`)."""
-    a, b = ([_shape(r) for r in plan.rooms if r.kind != "lift"] for plan in (low, high))
+def count_matching_rooms(low: Plan, high: Plan) -> int:
+    """Count the rooms of one storey that lie over a room of the same outline (IoU above `SAME_OUTLINE`)."""
+    a, b = ([_build_polygon(r) for r in plan.rooms if r.kind != "lift"] for plan in (low, high))
     i, j = shapely.STRtree(b).query(a, predicate="intersects")
     one, other = np.array(a)[i], np.array(b)[j]
     both = shapely.area(shapely.intersection(one, other))

@@ -1,16 +1,12 @@
-"""The builder of cached sets: an item makes one file, written whole; what was killed goes on where it was.
-
-Pairs to train on (`pairs.build`), plans with their truth (`pairs.plan_examples`), pairs of grids (`pairs.grid_pairs`) and what is
-worked out from each of them (`core.derived`) are all made by it. A file is ``<hash of the inputs>.npz``, or ``.refused`` with the
-reason; the manifest ``<name>.jsonl`` lists what the files say about themselves. Work is shared out by joblib, over processes of
-this machine or a Dask cluster.
-"""
+"""The builder of cached sets, what is derived from them, and its scripts."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import signal
+import sys
 import threading
 import time
 from collections import Counter
@@ -20,18 +16,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn, Protocol
 
+import numpy as np
+
+from topomerge.code_digest import compute_code_digest
 from topomerge.errors import InputError
 from topomerge.io import archive
-from topomerge.io.atomic import replacing
+from topomerge.io.archive import replace_on_success
+from topomerge.io.listing import convert_to_plain
 from topomerge.types import Array
 
 PATIENCE = 20.0  # s to wait for the scheduler of a cluster
 OLD = 3600.0  # s; half-written files of a build that was killed are deleted when they are older
 Task = tuple[Any, Any, str]  # an item, which has a name; what it is made from; the folder of its file
-Say = Callable[[str], None]
+LogFn = Callable[[str], None]
 
 
-class Sharing(Protocol):
+class BuildSettings(Protocol):
     """How the work is shared out: the folder of the cache, processes, scheduler of a cluster, and [k, n]: every n-th item from
     the k-th on."""
 
@@ -46,7 +46,7 @@ class TooLongError(InputError):
 
 
 @dataclass(frozen=True)
-class Row:
+class BuildRow:
     """What became of an item: `reason` is empty where its file was made."""
 
     name: str
@@ -54,11 +54,11 @@ class Row:
     seconds: float
 
 
-Work = Callable[[Any, Any, str], Row]
+Work = Callable[[Any, Any, str], BuildRow]
 
 
 @dataclass(frozen=True)
-class Report:
+class BuildReport:
     """What a build did; `refused` counts reasons."""
 
     manifest: Path
@@ -68,7 +68,7 @@ class Report:
     refused: dict[str, int]
 
 
-def check_sharing(sharing: Sharing) -> None:
+def check_sharing(sharing: BuildSettings) -> None:
     """Refuse what work can't be shared out by.
 
     Raises:
@@ -81,36 +81,37 @@ def check_sharing(sharing: Sharing) -> None:
 
 
 def build_set(
-    manifest: Path, tasks: Sequence[Task], work: Work, sharing: Sharing, say: Say = lambda text: None, every: float = 10.0,
+    manifest: Path, tasks: Sequence[Task], work: Work, sharing: BuildSettings, log_line: LogFn = lambda text: None,
+    every: float = 10.0,
     unit: str = "pairs",
-) -> Report:  # fmt: skip
+) -> BuildReport:  # fmt: skip
     """Make the files of a set that are missing, the first tasks first, then write its manifest.
 
     Args:
         manifest: file to write; the tasks name the folder of the files.
         work: makes the file of a task (`make_item`).
-        say: is told the progress, a line each `every` seconds.
+        log_line: is told the progress, a line each `every` seconds.
         unit: what the items are called there.
     """
     folders = {item.name: Path(folder) for item, _, folder in tasks}
     for folder in set(folders.values()):
         folder.mkdir(parents=True, exist_ok=True)
         _tidy(folder)
-    rows = {n: row for n, folder in folders.items() if (row := _cached_row(folder / f"{n}.npz")) is not None}
-    refusals = {n: reason for n, folder in folders.items() if n not in rows and (reason := refusal(folder, n))}
+    rows = {n: row for n, folder in folders.items() if (row := _read_cached_row(folder / f"{n}.npz")) is not None}
+    refusals = {n: reason for n, folder in folders.items() if n not in rows and (reason := read_refusal(folder, n))}
     missing = {task[0].name: task for task in tasks if task[0].name not in rows and task[0].name not in refusals}
-    say(f"{len(rows)} of {len(folders)} {unit} are in the cache, {len(refusals)} are known to be refused")
-    made = run_tasks(list(missing.values()), sharing, Progress(len(missing), say, every, unit), work)
-    rows |= {row.name: about(folders[row.name] / f"{row.name}.npz") for row in made if not row.reason}
-    with replacing(manifest) as beside:
+    log_line(f"{len(rows)} of {len(folders)} {unit} are in the cache, {len(refusals)} are known to be refused")
+    made = run_tasks(list(missing.values()), sharing, BuildProgress(len(missing), log_line, every, unit), work)
+    rows |= {row.name: read_about(folders[row.name] / f"{row.name}.npz") for row in made if not row.reason}
+    with replace_on_success(manifest) as beside:
         lines = [json.dumps(rows[name], sort_keys=True, ensure_ascii=False) for name in sorted(rows)]
         beside.write_text("".join(line + "\n" for line in lines), encoding="utf-8")
-    refused = Counter(_kind(reason) for reason in (*refusals.values(), *(row.reason for row in made)) if reason)
+    refused = Counter(_generalize_reason(reason) for reason in (*refusals.values(), *(row.reason for row in made)) if reason)
     seconds = sum(row.seconds for row in made if not row.reason)
-    return Report(manifest, len(rows), sum(not row.reason for row in made), seconds, dict(refused.most_common()))
+    return BuildReport(manifest, len(rows), sum(not row.reason for row in made), seconds, dict(refused.most_common()))
 
 
-def make_item(name: str, folder: str, make: Callable[[], Mapping[str, Array]], longest: float) -> Row:
+def make_item(name: str, folder: str, make: Callable[[], Mapping[str, Array]], longest: float) -> BuildRow:
     """Make an item's file in a folder, or one that says why there is none. It never raises: what went wrong is in the row.
 
     One thread is used, so that as many workers as cores don't fight for them.
@@ -121,26 +122,26 @@ def make_item(name: str, folder: str, make: Callable[[], Mapping[str, Array]], l
     """
     began = time.perf_counter()
     try:
-        with one_thread(), time_limit(longest):
+        with limit_threads(), limit_time(longest):
             archive.write(make(), Path(folder) / f"{name}.npz")
         reason = ""
     except Exception as error:  # one bad item must not end a build
         reason = " ".join(str(error).split())[:200]
         reason = reason if isinstance(error, InputError) else f"{type(error).__name__}: {reason}"
         if isinstance(error, InputError) and not isinstance(error, TooLongError):
-            with replacing(Path(folder) / f"{name}.refused") as beside:  # the same inputs would be refused again
+            with replace_on_success(Path(folder) / f"{name}.refused") as beside:  # the same inputs would be refused again
                 beside.write_text(reason + "\n", encoding="utf-8")
-    return Row(name, reason, time.perf_counter() - began)
+    return BuildRow(name, reason, time.perf_counter() - began)
 
 
-def refusal(folder: Path, name: str) -> str:
-    """Why an item was refused before; empty where it was not."""
+def read_refusal(folder: Path, name: str) -> str:
+    """Read why an item was refused before; empty where it was not."""
     path = folder / f"{name}.refused"
     return path.read_text(encoding="utf-8").strip() if path.is_file() else ""
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
+def limit_threads() -> Iterator[None]:
     """Keep BLAS, OpenMP and numba to one thread."""
     import numba
     from threadpoolctl import threadpool_limits
@@ -155,7 +156,7 @@ def one_thread() -> Iterator[None]:
 
 
 @contextmanager
-def time_limit(seconds: float) -> Iterator[None]:
+def limit_time(seconds: float) -> Iterator[None]:
     """End what takes too long with an `InputError`; without effect in threads, which get no signals."""
     if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
         yield
@@ -173,8 +174,8 @@ def time_limit(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def about(path: Path) -> dict[str, Any]:
-    """What a cached file says about itself, after checking that the whole file can be read.
+def read_about(path: Path) -> dict[str, Any]:
+    """Read the description in a cached file, after checking that the whole file can be read.
 
     Raises:
         InputError: it is damaged.
@@ -189,80 +190,80 @@ def _tidy(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def _cached_row(path: Path) -> dict[str, Any] | None:
+def _read_cached_row(path: Path) -> dict[str, Any] | None:
     """What a file of the cache is; a damaged one is made again."""
     try:
-        return about(path) if path.exists() else None
+        return read_about(path) if path.exists() else None
     except InputError:
         return None
 
 
-def _kind(reason: str) -> str:
+def _generalize_reason(reason: str) -> str:
     """A reason without the names and numbers, to be counted."""
     return re.sub(r"\S*\d\S*", "#", reason)
 
 
-class Progress:
+class BuildProgress:
     """Tells now and then how far a build is."""
 
-    def __init__(self, total: int, say: Say, every: float, unit: str = "pairs") -> None:
-        self.total, self.say, self.every, self.unit = total, say, every, unit
+    def __init__(self, total: int, log_line: LogFn, every: float, unit: str = "pairs") -> None:
+        self.total, self.log_line, self.every, self.unit = total, log_line, every, unit
         self.done = self.refused = 0
         self.began = self.last = time.monotonic()
 
-    def __call__(self, row: Row) -> None:
+    def __call__(self, row: BuildRow) -> None:
         self.done += 1
         if row.reason:
             self.refused += 1
-            self.say(f"refused {row.name}: {row.reason}")
+            self.log_line(f"refused {row.name}: {row.reason}")
         now = time.monotonic()
         if now - self.last >= self.every or self.done == self.total:
             self.last = now
             each = (now - self.began) / self.done
             left = time.strftime("%H:%M:%S", time.gmtime(each * (self.total - self.done)))
-            self.say(f"{self.done} of {self.total} {self.unit}, {self.refused} refused, {each:.2f} s each, {left} left")
+            self.log_line(f"{self.done} of {self.total} {self.unit}, {self.refused} refused, {each:.2f} s each, {left} left")
 
 
-def run_tasks(tasks: list[Task], sharing: Sharing, note: Callable[[Row], None], work: Work) -> list[Row]:
+def run_tasks(tasks: list[Task], sharing: BuildSettings, note: Callable[[BuildRow], None], work: Work) -> list[BuildRow]:
     """Rows of all tasks. A task that kills its worker is found by running those that were under way one by one."""
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    rows: dict[str, Row] = {}
+    rows: dict[str, BuildRow] = {}
     while pending := [task for task in tasks if task[0].name not in rows]:
         names = {task[0].name for task in pending}
         try:
-            for row in _parallel(pending, sharing, work):
+            for row in _run_parallel(pending, sharing, work):
                 if row.name not in names:  # it would be made for ever
                     raise ValueError(f"{row.name} was made, but no task has this name")
                 rows[row.name] = row
                 note(row)
         except TerminatedWorkerError:
             left = [task for task in pending if task[0].name not in rows]
-            for row in (_alone(task, sharing, work) for task in left[: 2 * sharing.jobs]):
+            for row in (_run_alone(task, sharing, work) for task in left[: 2 * sharing.jobs]):
                 rows[row.name] = row
                 note(row)
     return list(rows.values())
 
 
-def _alone(task: Task, sharing: Sharing, work: Work) -> Row:
+def _run_alone(task: Task, sharing: BuildSettings, work: Work) -> BuildRow:
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
     try:
-        return next(iter(list(_parallel([task], sharing, work))))
+        return next(iter(list(_run_parallel([task], sharing, work))))
     except TerminatedWorkerError:
-        return Row(task[0].name, "killed its worker (out of memory?)", 0.0)
+        return BuildRow(task[0].name, "killed its worker (out of memory?)", 0.0)
 
 
-def _parallel(tasks: Iterable[Task], sharing: Sharing, work: Work) -> Iterator[Row]:
+def _run_parallel(tasks: Iterable[Task], sharing: BuildSettings, work: Work) -> Iterator[BuildRow]:
     from joblib import Parallel, delayed
 
-    with _backend(sharing):
+    with _configure_backend(sharing):
         parallel = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="2 * n_jobs")
         yield from parallel(delayed(work)(*task) for task in tasks)
 
 
 @contextmanager
-def _backend(sharing: Sharing) -> Iterator[None]:
+def _configure_backend(sharing: BuildSettings) -> Iterator[None]:
     """Where joblib works: processes started afresh (never forked: numba's threads don't survive that), or a cluster."""
     from joblib import parallel_config
 
@@ -280,3 +281,100 @@ def _backend(sharing: Sharing) -> Iterator[None]:
         raise InputError(f"cluster: no scheduler answers at {sharing.cluster}") from error
     with client, parallel_config(backend="dask", client=client, n_jobs=-1):
         yield
+
+
+LONGEST_STEP = 900.0  # s an item
+Step = Callable[..., Mapping[str, Array]]  # of paths and options
+
+
+@dataclass(frozen=True)
+class DerivedItem:
+    """Everything that the bytes of one file depend on."""
+
+    step: str
+    sources: tuple[str, ...]
+    options: str
+    code: str
+
+    @property
+    def name(self) -> str:
+        """A hash of it."""
+        return hashlib.sha256(json.dumps(convert_to_plain(vars(self)), sort_keys=True).encode()).hexdigest()[:24]
+
+
+def make_derived(item: DerivedItem, given: tuple[Step, Sequence[Path]], folder: str) -> BuildRow:
+    """Make one file of a step."""
+    step, paths = given
+    options = json.loads(item.options)
+
+    def make() -> dict[str, Array]:
+        arrays = dict(step(*paths, **options))
+        about = json.dumps({"file": f"{item.name}.npz", "sources": list(item.sources)}, sort_keys=True)
+        return {**arrays, "about": np.frombuffer(about.encode(), np.uint8)}
+
+    return make_item(item.name, folder, make, LONGEST_STEP)
+
+
+def derive(
+    name: str, step: Step, sources: Sequence[Sequence[Path]], sharing: BuildSettings, options: Mapping[str, Any] | None = None,
+    log_line: LogFn = lambda text: None,
+) -> tuple[list[Path], BuildReport]:  # fmt: skip
+    """Files of a step, made where they are missing, in the order of their sources; those that were refused are left out.
+
+    Args:
+        name: of the manifest and of the folder.
+        step: a function of a module, which other processes can import.
+        sources: the paths that each file is made from, which are named by hashes themselves.
+        options: more arguments, as JSON has them.
+    """
+    cache = Path(sharing.cache).resolve()
+    folder, code = cache / name, compute_code_digest(step.__module__)
+    text = json.dumps(convert_to_plain(dict(options or {})), sort_keys=True)
+    items = [DerivedItem(step.__name__, tuple(p.stem for p in paths), text, code) for paths in sources]
+    tasks = [(item, (step, list(paths)), str(folder)) for item, paths in zip(items, sources, strict=True)]
+    report = build_set(cache / f"{name}.jsonl", tasks, make_derived, sharing, log_line, unit=name)
+    return [path for item in items if (path := folder / f"{item.name}.npz").exists()], report
+
+
+def read_sources(path: Path) -> list[str]:
+    """Stems of the names of the files that a file was made from."""
+    about: dict[str, Any] = json.loads(archive.read(path, "cached item", only=["about"])["about"].tobytes())
+    sources: list[str] = about["sources"]
+    return sources
+
+
+def read_derived(path: Path) -> dict[str, Array]:
+    """Read the arrays of a file, but for what it says about itself."""
+    arrays = archive.read(path, "cached item")
+    del arrays["about"]
+    return arrays
+
+
+def print_lines(lines: Iterable[object]) -> int:
+    """Print lines as they are made; the exit status of the script."""
+    try:
+        for line in lines:
+            print(line, flush=True)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 1
+    return 0
+
+
+def run_script(name: str, work: Callable[[], None], after_interrupt: str = "start it again to go on") -> int:
+    """Run a script and return the exit status: 0 done, 1 a fault of the input, 130 interrupted.
+
+    Args:
+        name: of the script, before what it says.
+        work: prints its results by itself.
+        after_interrupt: what one may do after Ctrl-C.
+    """
+    try:
+        work()
+    except InputError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(f"{name}: interrupted; {after_interrupt}", file=sys.stderr)
+        return 130
+    return 0

@@ -22,7 +22,7 @@ BOX_FACES = np.array(
 
 
 @dataclass(eq=False)
-class Soup:
+class TriangleSoup:
     """Triangles that are being collected; each addition has one label and one thing."""
 
     vertices: list[Array] = field(default_factory=list)
@@ -42,8 +42,8 @@ class Soup:
         self.things.append(np.full(len(triangles), thing, np.int32))
         self.count += len(vertices)
 
-    def arrays(self) -> tuple[Array, Array, Array, Array]:
-        """vertices, triangles, labels and things; triangles without area are left out."""
+    def build_arrays(self) -> tuple[Array, Array, Array, Array]:
+        """Build vertices, triangles, labels and things; triangles without area are left out."""
         if not self.count:
             return (
                 np.zeros((0, 3), np.float32),
@@ -58,14 +58,14 @@ class Soup:
         return vertices, triangles[solid], np.concatenate(self.labels)[solid], np.concatenate(self.things)[solid]
 
 
-def rotation(yaw: float | Array) -> Array:
+def build_rotation(yaw: float | Array) -> Array:
     """(2, 2) matrix that turns row vectors: `points @ rotation(yaw)`; (2, 2, n) for n angles."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, s], [-s, c]])
 
 
-def boxes(parts: Array, at: Array | None = None, yaw: float = 0.0) -> tuple[Array, Array]:
-    """Triangles of boxes.
+def triangulate_boxes(parts: Array, at: Array | None = None, yaw: float = 0.0) -> tuple[Array, Array]:
+    """Return triangles of boxes.
 
     Args:
         parts: (n, 6) centre and size of each box.
@@ -74,13 +74,13 @@ def boxes(parts: Array, at: Array | None = None, yaw: float = 0.0) -> tuple[Arra
     """
     parts = np.asarray(parts, np.float64).reshape(-1, 6)
     corners = (parts[:, None, :3] + BOX * parts[:, None, 3:]).reshape(-1, 3)
-    corners[:, :2] = corners[:, :2] @ rotation(yaw)
+    corners[:, :2] = corners[:, :2] @ build_rotation(yaw)
     triangles = (BOX_FACES + 8 * np.arange(len(parts))[:, None, None]).reshape(-1, 3)
     return corners if at is None else corners + np.asarray(at), triangles
 
 
-def column(centre: Array, radius: float, bottom: float, top: float, sides: int = 12) -> tuple[Array, Array]:
-    """Triangles of an upright prism with a regular base."""
+def triangulate_column(centre: Array, radius: float, bottom: float, top: float, sides: int = 12) -> tuple[Array, Array]:
+    """Return triangles of an upright prism with a regular base."""
     angle = (np.arange(sides) + 0.5) * 2 * np.pi / sides
     ring = np.asarray(centre)[:2] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     low, high = (np.column_stack([ring, np.full(sides, z)]) for z in (bottom, top))
@@ -90,16 +90,16 @@ def column(centre: Array, radius: float, bottom: float, top: float, sides: int =
     return np.concatenate([low, high]), np.concatenate([walls, fan[:, ::-1], fan + sides])
 
 
-def rectangle(start: Sequence[float], end: Sequence[float], thickness: float) -> shapely.Polygon:
-    """The rectangle around a segment."""
+def build_rectangle(start: Sequence[float], end: Sequence[float], thickness: float) -> shapely.Polygon:
+    """Build the rectangle around a segment."""
     a, b = np.asarray(start, float), np.asarray(end, float)
     along = (b - a) / max(float(np.hypot(*(b - a))), 1e-9)
     side = np.array([-along[1], along[0]]) * thickness / 2
     return shapely.Polygon([a - side, b - side, b + side, a + side])
 
 
-def flat(polygons: shapely.Geometry) -> tuple[Array, Array]:
-    """(t, 3, 2) triangles of polygons, counter-clockwise, and their parts' index."""
+def triangulate_polygons(polygons: shapely.Geometry) -> tuple[Array, Array]:
+    """Return (t, 3, 2) triangles of polygons, counter-clockwise, and their parts' index."""
     parts = np.asarray([p for p in shapely.get_parts(polygons) if p.geom_type == "Polygon" and p.area > 1e-5], object)
     if not len(parts):
         return np.zeros((0, 3, 2)), np.zeros(0, int)
@@ -126,8 +126,8 @@ class Faces:
     downs: Array  # ceilings
 
 
-def boundary(prisms: Sequence[Prism]) -> Faces:
-    """The surfaces around the union of prisms.
+def build_boundary(prisms: Sequence[Prism]) -> Faces:
+    """Build the surfaces around the union of prisms.
 
     Rooms, doorways, windows, stair wells and the world outside are all prisms of free space; everything else is solid. Between
     two neighbouring heights at which a prism starts or ends, the union has one plan; walls stand on its outline, and floors
@@ -144,12 +144,12 @@ def boundary(prisms: Sequence[Prism]) -> Faces:
     downs: list[Any] = []
     for z, (below, above) in zip(levels, pairwise(layers), strict=True):
         for out, free, solid, turn in ((ups, above, below, 1), (downs, below, above, -1)):
-            corners = flat(shapely.difference(free, solid, grid_size=GRID))[0][:, ::turn]
+            corners = triangulate_polygons(shapely.difference(free, solid, grid_size=GRID))[0][:, ::turn]
             out.append(np.concatenate([corners, np.full((*corners.shape[:2], 1), z)], axis=2))
-    return Faces(_sides(layers[1:-1], levels), np.concatenate(ups), np.concatenate(downs))
+    return Faces(_build_sides(layers[1:-1], levels), np.concatenate(ups), np.concatenate(downs))
 
 
-def _sides(layers: list[shapely.Geometry], levels: Array) -> Array:
+def _build_sides(layers: list[shapely.Geometry], levels: Array) -> Array:
     """(n, 4, 3) upright rectangles; those that go on in the next layer are made one."""
     keys = []
     for k, layer in enumerate(layers):

@@ -6,17 +6,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from topomerge.datasets.core.building import Building
-from topomerge.datasets.core.difficulty import Difficulty
-from topomerge.datasets.pairs.drawing import architects_drawing
-from topomerge.datasets.pairs.flat import storey_of
-from topomerge.datasets.pairs.pairs import ROOMS_A_MAP, Atlas, draw_frames, seen_by_both
-from topomerge.datasets.pairs.parts import room_graph
-from topomerge.datasets.pairs.robot_grid import robot_grid
-from topomerge.datasets.simulation.scanner import scan
-from topomerge.datasets.simulation.session import session
-from topomerge.datasets.simulation.spoils import drifting
-from topomerge.datasets.simulation.walk import part
+from topomerge.datasets.core.building import Building, Difficulty
+from topomerge.datasets.pairs.drawing import simulate_drawing
+from topomerge.datasets.pairs.flat_maps import find_storey, simulate_robot_grid
+from topomerge.datasets.pairs.pairs import ROOMS_A_MAP, Atlas, draw_frames, find_common_rooms
+from topomerge.datasets.pairs.parts import build_room_graph
+from topomerge.datasets.simulation.scanner import scan_building
+from topomerge.datasets.simulation.sensors import scale_sensor_drift
+from topomerge.datasets.simulation.session import simulate_session
+from topomerge.datasets.simulation.walk import sample_part
 
 from topomerge.errors import InputError
 from topomerge.types import Array, PointCloud, Sim3
@@ -35,7 +33,7 @@ def make_atlas(
     source: str = "procedural",
     drifts: Sequence[float] = (),
 ) -> Atlas:
-    """One session and one walk for each sensor; each walk starts in a room that an earlier one visited.
+    """Make one session and one walk for each sensor; each walk starts in a room that an earlier one visited.
 
     Args:
         sensors: names, two or more, also of `FLAT_KINDS`; they set the number of maps.
@@ -54,29 +52,29 @@ def make_atlas(
         replace(frame, scale=frame.scale * float(np.exp(rng.normal(0, READ_SCALE)))) if sensor == "drawing" else frame
         for frame, sensor in zip(draw_frames(len(sensors), scale, rng), sensors, strict=True)
     ]
-    reachable = sorted(room_graph(building))
+    reachable = sorted(build_room_graph(building))
     maps, visited = [], set[int]()
     for k, (sensor, frame) in enumerate(zip(sensors, frames, strict=True)):
         start = int(rng.choice(sorted(visited) or reachable))
-        walked = part(building, rooms, rng, start=start)
+        walked = sample_part(building, rooms, rng, start=start)
         visited |= set(walked.tolist())
         drift = drifts[k] if len(drifts) else 1.0
-        maps.append(partial_map(session(building, difficulty, rng), sensor, walked, rng, frame, drift))
+        maps.append(simulate_partial_map(simulate_session(building, difficulty, rng), sensor, walked, rng, frame, drift))
     return Atlas(
         name=f"{building.name}:{'-'.join(sensors)}",
         maps=tuple(maps),
         truth=tuple(frames[0] @ frame.inverse() for frame in frames),
-        shared={(k, m): seen_by_both(maps[k], maps[m]) for m in range(len(maps)) for k in range(m)},
+        shared={(k, m): find_common_rooms(maps[k], maps[m]) for m in range(len(maps)) for k in range(m)},
         sensors=tuple(sensors),
         source=source,
         building=building.name,
     )
 
 
-def partial_map(
+def simulate_partial_map(
     building: Building, sensor: str, rooms: Array, rng: np.random.Generator, frame: Sim3, drift: float = 1.0
 ) -> PointCloud:
-    """Rooms of a building as a sensor, a robot with a 2D laser ("grid") or an architect ("drawing") maps them.
+    """Simulate rooms of a building as a sensor, a robot with a 2D laser ("grid") or an architect ("drawing") maps them.
 
     Args:
         sensor: its name, or one of `FLAT_KINDS`: these show one storey, that of most of the rooms; a drawing shows also what lies
@@ -88,9 +86,9 @@ def partial_map(
         InputError: an unknown name, or a room can't be reached.
     """
     if sensor == "drawing":
-        return architects_drawing(building, rooms, storey_of(building, rooms), rng, frame)
+        return simulate_drawing(building, rooms, find_storey(building, rooms), rng, frame)
     if sensor == "grid":
-        storey = storey_of(building, rooms)
+        storey = find_storey(building, rooms)
         level = np.array([i for i in rooms.tolist() if building.rooms[i].storey == storey])
-        return robot_grid(building, drifting("laser2d", drift), level, rng, frame)
-    return scan(building, drifting(sensor, drift), rooms, rng, frame=frame)
+        return simulate_robot_grid(building, scale_sensor_drift("laser2d", drift), level, rng, frame)
+    return scan_building(building, scale_sensor_drift(sensor, drift), rooms, rng, frame=frame)

@@ -16,14 +16,12 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from topomerge.datasets.core.builder import Report, build_set, check_sharing
-from topomerge.datasets.core.script import exit_status
+from topomerge.datasets.core.builder import BuildReport, build_set, check_sharing, run_script
 from topomerge.datasets.pairs.example import make_file
-from topomerge.datasets.pairs.items import draw_items, plans_of
-from topomerge.datasets.pairs.recipe import Recipe, check, library
+from topomerge.datasets.pairs.items import Recipe, check, draw_items, load_library, select_plans
 
-from topomerge.io.atomic import replacing
-from topomerge.io.listing import plain
+from topomerge.io.archive import replace_on_success
+from topomerge.io.listing import convert_to_plain
 
 
 @dataclass
@@ -37,11 +35,11 @@ class Build:
     part: list[int] = field(default_factory=lambda: [1, 1])
 
 
-def build(settings: Build, say: Callable[[str], None] = lambda text: None, every: float = 10.0) -> Report:
+def build(settings: Build, log_line: Callable[[str], None] = lambda text: None, every: float = 10.0) -> BuildReport:
     """Make what is missing of a set, then write its manifest.
 
     Args:
-        say: gets the progress, a line each `every` seconds.
+        log_line: gets the progress, a line each `every` seconds.
 
     Raises:
         InputError: a recipe that nothing can be made of, or a cluster that can't be reached.
@@ -49,15 +47,15 @@ def build(settings: Build, say: Callable[[str], None] = lambda text: None, every
     check(settings.data)
     check_sharing(settings)
     folder = Path(settings.cache).resolve() / "pairs"
-    say("reading plans")
-    plans = library(settings.data)
+    log_line("reading plans")
+    plans = load_library(settings.data)
     first, step = settings.part
     items = {item.name: item for item in draw_items(settings.data, plans)[first - 1 :: step]}
     order = sorted(items.values(), key=lambda item: -item.rooms)  # the longest first: all workers end at about the same time
-    tasks = [(item, list(plans_of(item, plans)), str(folder)) for item in order]
-    report = build_set(folder.parent / f"{settings.data.name}.jsonl", tasks, make_file, settings, say, every)
-    with replacing(folder.parent / f"{settings.data.name}.recipe.json") as beside:
-        beside.write_text(json.dumps(plain(asdict(settings.data)), indent=1) + "\n", encoding="utf-8")
+    tasks = [(item, list(select_plans(item, plans)), str(folder)) for item in order]
+    report = build_set(folder.parent / f"{settings.data.name}.jsonl", tasks, make_file, settings, log_line, every)
+    with replace_on_success(folder.parent / f"{settings.data.name}.recipe.json") as beside:
+        beside.write_text(json.dumps(convert_to_plain(asdict(settings.data)), indent=1) + "\n", encoding="utf-8")
     return report
 
 
@@ -67,7 +65,7 @@ def main(words: list[str] | None = None) -> int:
     if {"-h", "--help"} & set(words):
         print(f"{__doc__}\nKeys: configs/build.yaml and configs/data/*.yaml; for example data.pairs=100 cache=/tmp/cache jobs=2")
         return 0
-    return exit_status("build", lambda: _build_and_print(words))
+    return run_script("build", lambda: _build_and_print(words))
 
 
 def _build_and_print(words: list[str]) -> None:

@@ -9,11 +9,11 @@ import numpy as np
 import shapely
 from scipy import ndimage
 from topomerge.datasets.core.building import Building
-from topomerge.datasets.pairs.flat import Flat, from_masks, labelled, moved_room, raise_flat
-from topomerge.datasets.pairs.pairs import Pair, seen_by_both
-from topomerge.datasets.pairs.parts import share
-from topomerge.datasets.pairs.plan_truth import HUNG_KINDS, footprints
-from topomerge.datasets.simulation.floors import draw_floors
+from topomerge.datasets.pairs.flat_maps import FlatMap, build_from_masks, extrude_flat, label_points, transform_room
+from topomerge.datasets.pairs.pairs import Pair, find_common_rooms
+from topomerge.datasets.pairs.parts import compute_dice
+from topomerge.datasets.pairs.plan_truth import HUNG_KINDS, compute_footprints
+from topomerge.datasets.simulation.floor_truth import rasterize_floors
 
 from topomerge.errors import InputError
 from topomerge.types import Array, PointCloud, Sim3
@@ -26,8 +26,8 @@ LETTER_SIZES = (0.25, 0.5)  # m
 SAME_LEVEL = 1.0  # m between a door and the floor of its storey, at most
 
 
-def with_plan(pair: Pair, building: Building) -> Pair:
-    """The pair with the floor plan of the whole building instead of its second map.
+def replace_map_with_plan(pair: Pair, building: Building) -> Pair:
+    """Return the pair with the floor plan of the whole building instead of its second map.
 
     Raises:
         InputError: the building has several storeys, or the pair is of two buildings.
@@ -35,27 +35,27 @@ def with_plan(pair: Pair, building: Building) -> Pair:
     if len(building.storeys) > 1 or pair.frames is None or pair.kind != "overlap":
         raise InputError(f"{pair.name}: a floor plan is drawn of buildings of one storey, and of the one that was mapped")
     frame = pair.frames[1]
-    flat = draw(building).moved(replace(frame, translation=(*frame.translation[:2], 0.0)))
-    b = raise_flat(flat, frame.translation[2] + frame.scale * float(building.storeys["floor"][0]))
+    flat = draw(building).transform(replace(frame, translation=(*frame.translation[:2], 0.0)))
+    b = extrude_flat(flat, frame.translation[2] + frame.scale * float(building.storeys["floor"][0]))
     visited = tuple(i for i, r in enumerate(building.rooms) if r.kind != "lift")
     return replace(
         pair,
         b=b,
-        shared=seen_by_both(pair.a, b),
-        overlap=share(list(pair.visited[0]), list(visited)),
+        shared=find_common_rooms(pair.a, b),
+        overlap=compute_dice(list(pair.visited[0]), list(visited)),
         sensors=(pair.sensors[0], "drawing"),
         visited=(pair.visited[0], visited),
     )
 
 
-def draw(building: Building, storey: int = 0) -> Flat:
-    """Walls and floor of a storey; inner doors are open, outer ones shut."""
-    floors = draw_floors(building, DRAWING_CELL)
+def draw(building: Building, storey: int = 0) -> FlatMap:
+    """Draw walls and floor of a storey; inner doors are open, outer ones shut."""
+    floors = rasterize_floors(building, DRAWING_CELL)
     room = floors.room[storey] >= 0
-    return _flat(building, floors.origin, inner_doors(building, storey), room, np.zeros(room.shape, bool))
+    return _build_drawing(building, floors.origin, find_inner_doors(building, storey), room, np.zeros(room.shape, bool))
 
 
-def _flat(building: Building, origin: Array, doors: Array, room: Array, ink: Array) -> Flat:
+def _build_drawing(building: Building, origin: Array, doors: Array, room: Array, ink: Array) -> FlatMap:
     """The drawing of the cells (rows, columns) bool of rooms, with doors, and with lines that are no walls."""
     door = np.zeros(room.shape, bool)
     for one in doors:
@@ -63,46 +63,46 @@ def _flat(building: Building, origin: Array, doors: Array, room: Array, ink: Arr
     walls = ~room & ~door & (ndimage.distance_transform_edt(~room) * DRAWING_CELL <= DRAWN_WALL)
     walls, floor = walls | ink, (room | door) & ~ink
     source = f"{building.name}:drawing"
-    flat = from_masks(walls[::-1], floor[::-1], DRAWING_CELL, (*origin.tolist(), 0.0), rays=False, source=source)
+    flat = build_from_masks(walls[::-1], floor[::-1], DRAWING_CELL, (*origin.tolist(), 0.0), rays=False, source=source)
     return replace(flat, rooms=tuple(replace(r, floor=0.0, ceiling=r.ceiling - r.floor) for r in building.rooms))
 
 
-def architects_drawing(building: Building, rooms: Array, storey: int, rng: np.random.Generator, frame: Sim3) -> PointCloud:
+def simulate_drawing(building: Building, rooms: Array, storey: int, rng: np.random.Generator, frame: Sim3) -> PointCloud:
     """The drawing of rooms and of what lies about them on a storey as an architect leaves it, in a frame, with the true rooms of
     its points: leaves and arcs of doors, outlines of what stands there, and names of rooms, each on some of the drawings."""
     arcs, outlines, names = (rng.random(3) < SYMBOLS_SHARES).tolist()
-    floors = draw_floors(building, DRAWING_CELL)
+    floors = rasterize_floors(building, DRAWING_CELL)
     visited = shapely.union_all([shapely.Polygon(building.rooms[i].polygon) for i in rooms.tolist()])
     shown = np.array([visited.distance(shapely.Polygon(room.polygon)) < DRAWN_AROUND for room in building.rooms])
     sheet = np.isin(floors.room[storey], np.flatnonzero(shown))
-    doors = inner_doors(building, storey)
+    doors = find_inner_doors(building, storey)
     doors = doors[shown[doors["rooms"]].all(axis=1)]
     lines = []
     if arcs:
-        lines += [line for door in doors for line in _leaf_and_arc(door, rng)]
+        lines += [line for door in doors for line in _draw_leaf_and_arc(door, rng)]
     if outlines:
-        lines += [box[[0, 1, 2, 3, 0]] for box in _standing(building, storey)]
+        lines += [box[[0, 1, 2, 3, 0]] for box in _list_furniture_outlines(building, storey)]
     if names:
-        lines += [line for room in building.rooms if room.storey == storey for line in _name(room.polygon, rng)]
+        lines += [line for room in building.rooms if room.storey == storey for line in _draw_letters(room.polygon, rng)]
     ink = np.zeros(sheet.shape, bool)
     for line in lines:
-        row, column = floors.cells(_along(line)).T
+        row, column = floors.compute_cells(_sample_line(line)).T
         ink[row, column] = True
-    flat = _flat(building, floors.origin, doors, sheet, ink & sheet)
-    flat = flat.moved(replace(frame, translation=(*frame.translation[:2], 0.0)))
+    flat = _build_drawing(building, floors.origin, doors, sheet, ink & sheet)
+    flat = flat.transform(replace(frame, translation=(*frame.translation[:2], 0.0)))
     height = frame.translation[2] + frame.scale * float(building.storeys["floor"][storey])
-    outlined = tuple(moved_room(room, frame) for room in building.rooms)
-    return labelled(raise_flat(replace(flat, rooms=()), height), outlined, storey)
+    outlined = tuple(transform_room(room, frame) for room in building.rooms)
+    return label_points(extrude_flat(replace(flat, rooms=()), height), outlined, storey)
 
 
-def inner_doors(building: Building, storey: int) -> Array:
-    """The doors of a storey that lead from room to room."""
+def find_inner_doors(building: Building, storey: int) -> Array:
+    """Find the doors of a storey that lead from room to room."""
     level = np.abs(building.doors["centre"][:, 2] - building.storeys["floor"][storey]) < SAME_LEVEL
     doors: Array = building.doors[level & (building.doors["rooms"] >= 0).all(axis=1)]
     return doors
 
 
-def _leaf_and_arc(door: Array, rng: np.random.Generator) -> list[Array]:
+def _draw_leaf_and_arc(door: Array, rng: np.random.Generator) -> list[Array]:
     """Lines (k, 2), m, of an open leaf and of the way that it swings; none of an opening without a leaf."""
     if door["state"] == "none":
         return []
@@ -114,14 +114,14 @@ def _leaf_and_arc(door: Array, rng: np.random.Generator) -> list[Array]:
     return [np.stack([hinge, arc[-1]]), arc]
 
 
-def _standing(building: Building, storey: int) -> list[Array]:
+def _list_furniture_outlines(building: Building, storey: int) -> list[Array]:
     """(4, 2) m, footprints of what stands in the rooms of a storey."""
     things = building.things[~np.isin(building.things["kind"], HUNG_KINDS) & (building.things["room"] >= 0)]
     here = [t for t in things if building.rooms[t["room"]].storey == storey]
-    return [box for thing in here for box in footprints(thing, legs=False)]
+    return [box for thing in here for box in compute_footprints(thing, legs=False)]
 
 
-def _name(polygon: Array, rng: np.random.Generator) -> list[Array]:
+def _draw_letters(polygon: Array, rng: np.random.Generator) -> list[Array]:
     """Lines (k, 2), m, of letters in a room, two to eight of them, of strokes at random."""
     place = np.asarray(shapely.Polygon(polygon).representative_point().coords)[0]
     size, count = rng.uniform(*LETTER_SIZES), int(rng.integers(2, 9))
@@ -130,7 +130,7 @@ def _name(polygon: Array, rng: np.random.Generator) -> list[Array]:
     return [start + stroke for start, stroke in zip(starts, strokes, strict=True)]
 
 
-def _along(line: Array) -> Array:
+def _sample_line(line: Array) -> Array:
     """(n, 2) points on a line through (k, 2) corners, no farther apart than half a cell."""
     parts = []
     for start, end in itertools.pairwise(line):

@@ -1,6 +1,6 @@
 """Pairs of extracted maps that are kept for evaluation: two `.tmap` beside the pair's file, and what judges them.
 
-Beside what `example.pair_arrays` gives, the file holds for each room whether another room of the other map looks the same
+Beside what `example.build_pair_arrays` gives, the file holds for each room whether another room of the other map looks the same
 (`a.twin`, `b.twin`), a point of b at which errors of a pose are measured (`anchor`) and, for real pairs whose rooms nobody
 labelled, the rooms that lie over each other under the true transform (`laid`).
 """
@@ -17,16 +17,16 @@ import numpy as np
 import shapely
 from topomerge.datasets.pairs.pairs import Pair
 
-from topomerge.embedding.schema import column
+from topomerge.embedding.graph import find_column
 from topomerge.errors import InputError
 from topomerge.io import archive
 from topomerge.io.maps import load_map, save_map
-from topomerge.matching.consistency import matches_under
-from topomerge.matching.room_plans import room_plans
+from topomerge.matching.consistency import find_matches
+from topomerge.matching.room_plans import build_room_plans
 from topomerge.types import Array, Sim3, TopometricMap, TrueRoom
 
 TWIN_AREA, TWIN_SIDE = 0.05, 0.25  # share, m: rooms that differ by less are near-identical
-GLIMPSED_COLUMN = column("x", "glimpsed")
+GLIMPSED_COLUMN = find_column("x", "glimpsed")
 COLUMN_SIZE = 0.2  # m, columns by which the area in common is measured
 UNDER_FLOOR = 0.15  # m: what is that far below a floor is the ceiling of the storey below
 STOREY_APART = 1.0  # m between two storeys, at least
@@ -69,8 +69,8 @@ class EvaluationPair:
     anchor: Array
     about: dict[str, Any]
 
-    def maps(self) -> tuple[TopometricMap, TopometricMap]:
-        """The two extracted maps."""
+    def load_maps(self) -> tuple[TopometricMap, TopometricMap]:
+        """Load the two extracted maps."""
         a, b = (load_map(self.folder / f"{self.name}{side}.tmap") for side in "ab")
         return a, b
 
@@ -82,7 +82,7 @@ def save_maps(maps: Sequence[TopometricMap], folder: Path, name: str) -> None:
 
 
 def load_evaluation_pair(path: Path) -> EvaluationPair:
-    """What is true of an evaluation pair, from its file.
+    """Load an evaluation pair from its file.
 
     Raises:
         InputError: no such file, damaged, or its maps were not kept.
@@ -96,14 +96,14 @@ def load_evaluation_pair(path: Path) -> EvaluationPair:
     laid = about["rooms"] == "laid"
     matches = data["laid" if laid else "matches"]
     if laid:  # no labels: the rooms that lie over each other stand for true ones
-        true = _rooms_of_matches(matches, tuple(len(t) for t in true))
+        true = _number_matched_rooms(matches, tuple(len(t) for t in true))
         one = (true[0] >= 0, true[1] >= 0)
-    pose = sim3_of(data["transform"])
+    pose = convert_to_sim3(data["transform"])
     return EvaluationPair(path.stem, path.parent, matches, true, one, twin, glimpsed, pose, data["anchor"], about)
 
 
 def load_set(manifest: Path) -> list[EvaluationPair]:
-    """All pairs of a manifest that `build` wrote.
+    """Load all pairs of a manifest that `build` wrote.
 
     Raises:
         InputError: no such manifest, or a pair's maps were not kept.
@@ -114,7 +114,7 @@ def load_set(manifest: Path) -> list[EvaluationPair]:
     return [load_evaluation_pair(manifest.parent / "pairs" / row["file"]) for row in rows]
 
 
-def _rooms_of_matches(matches: Array, sizes: Sequence[int]) -> tuple[Array, Array]:
+def _number_matched_rooms(matches: Array, sizes: Sequence[int]) -> tuple[Array, Array]:
     """A number of its own for each match; rooms without one have -1."""
     out = [np.full(n, -1) for n in sizes]
     for k, (i, j) in enumerate(matches.tolist()):
@@ -122,38 +122,38 @@ def _rooms_of_matches(matches: Array, sizes: Sequence[int]) -> tuple[Array, Arra
     return out[0], out[1]
 
 
-def sim3_of(matrix: Array) -> Sim3 | None:
-    """The similarity of a (4, 4) matrix; None of nan."""
+def convert_to_sim3(matrix: Array) -> Sim3 | None:
+    """Return the similarity of a (4, 4) matrix; None of nan."""
     if np.isnan(matrix).any():
         return None
     x, y, z = matrix[:3, 3].tolist()
     return Sim3(float(np.arctan2(matrix[1, 0], matrix[0, 0])), (x, y, z), float(matrix[2, 2]))
 
 
-def pair_statistics(pair: Pair, maps: Sequence[TopometricMap]) -> dict[str, Any]:
-    """What the file of an evaluation pair tells beside the usual."""
+def compute_pair_statistics(pair: Pair, maps: Sequence[TopometricMap]) -> dict[str, Any]:
+    """Compute the statistics that the file of an evaluation pair has beside the usual."""
     return {
         "source": pair.source,
         "kind": pair.kind,
         "sensors": pair.sensors,
-        "common": round(common_area(maps, pair.truth if pair.kind == "overlap" else None), 2),
+        "common": round(measure_common_area(maps, pair.truth if pair.kind == "overlap" else None), 2),
         "rooms": "labelled" if pair.a.rooms else "laid",
         "scale_free": pair.truth is not None and abs(pair.truth.scale - 1) > 0.03,
     }
 
 
-def evaluation_arrays(pair: Pair, maps: Sequence[TopometricMap], true: tuple[Array, Array]) -> dict[str, Array]:
-    """The arrays that the file of an evaluation pair has beside the usual."""
-    arrays = {"anchor": anchor(pair, maps)}
+def build_evaluation_arrays(pair: Pair, maps: Sequence[TopometricMap], true: tuple[Array, Array]) -> dict[str, Array]:
+    """Build the arrays that the file of an evaluation pair has beside the usual."""
+    arrays = {"anchor": compute_anchor(pair, maps)}
     rooms = (pair.a.rooms, pair.b.rooms)
     same = pair.kind == "overlap"
     for k, side in enumerate("ab"):
-        arrays[f"{side}.twin"] = twins(true[k], true[1 - k], rooms[k], rooms[1 - k], same)
-    arrays["laid"] = laid(pair, maps) if not pair.a.rooms else np.zeros((0, 2), np.int64)
+        arrays[f"{side}.twin"] = find_twins(true[k], true[1 - k], rooms[k], rooms[1 - k], same)
+    arrays["laid"] = match_overlapping_rooms(pair, maps) if not pair.a.rooms else np.zeros((0, 2), np.int64)
     return arrays
 
 
-def twins(true: Array, other: Array, rooms: Sequence[TrueRoom], others: Sequence[TrueRoom], same: bool = True) -> Array:
+def find_twins(true: Array, other: Array, rooms: Sequence[TrueRoom], others: Sequence[TrueRoom], same: bool = True) -> Array:
     """(R,) bool: does the other map hold a room, another than the true partner, whose plan has the same area and sides?
 
     Args:
@@ -164,7 +164,7 @@ def twins(true: Array, other: Array, rooms: Sequence[TrueRoom], others: Sequence
     out = np.zeros(len(true), bool)
     if not rooms or not others:
         return out
-    here, there = np.array([_plan(r) for r in rooms]), np.array([_plan(r) for r in others])
+    here, there = np.array([_measure_plan(r) for r in rooms]), np.array([_measure_plan(r) for r in others])
     held = np.unique(other[other >= 0])
     for i in np.flatnonzero(true >= 0):
         mine, these = here[true[i]], there[held[held != true[i]] if same else held]
@@ -173,7 +173,7 @@ def twins(true: Array, other: Array, rooms: Sequence[TrueRoom], others: Sequence
     return out
 
 
-def _plan(room: TrueRoom) -> tuple[float, float, float]:
+def _measure_plan(room: TrueRoom) -> tuple[float, float, float]:
     """Area, m2, and sides of the smallest rectangle about it, m."""
     shape = shapely.Polygon(room.polygon)
     corners = np.array(shapely.minimum_rotated_rectangle(shape).exterior.coords)
@@ -181,28 +181,28 @@ def _plan(room: TrueRoom) -> tuple[float, float, float]:
     return float(shape.area), float(sides.min()), float(sides.max())
 
 
-def common_area(maps: Sequence[TopometricMap], truth: Sim3 | None) -> float:
-    """Area, m2, of which both maps saw something, on the same storey; 0 where they are of two places."""
+def measure_common_area(maps: Sequence[TopometricMap], truth: Sim3 | None) -> float:
+    """Measure the area, m2, of which both maps saw something, on the same storey; 0 where they are of two places."""
     if truth is None:
         return 0.0
     floors = np.sort([*maps[0].storeys["floor"], *(truth.scale * maps[1].storeys["floor"] + truth.translation[2])])
     floors = floors[np.diff(floors, prepend=-np.inf) > STOREY_APART] - UNDER_FLOOR
-    both = np.intersect1d(_columns(maps[0], Sim3(), floors), _columns(maps[1], truth, floors))
+    both = np.intersect1d(_compute_columns(maps[0], Sim3(), floors), _compute_columns(maps[1], truth, floors))
     return float(len(both) * COLUMN_SIZE**2)
 
 
-def _columns(map: TopometricMap, into: Sim3, floors: Array) -> Array:
+def _compute_columns(map: TopometricMap, into: Sim3, floors: Array) -> Array:
     """Sorted keys of the (storey, x, y) columns of which a map knows anything, in another frame."""
-    at = into.apply(np.concatenate([map.grid.centroids(), map.navigable.centroids()]))
+    at = into.apply(np.concatenate([map.grid.compute_centroids(), map.navigable.compute_centroids()]))
     rows = np.column_stack([np.searchsorted(floors, at[:, 2]) - 1, np.floor(at[:, :2] / COLUMN_SIZE)]).astype(np.int64)
     return np.unique(rows[:, 0] * 2**40 + (rows[:, 1] + 2**18) * 2**20 + rows[:, 2] + 2**18)
 
 
-def anchor(pair: HasTruth, maps: Sequence[TopometricMap]) -> Array:
-    """(3,) middle of the cells of b that a has seen, too; of all where these are hardly any."""
-    cells = maps[1].grid.centroids()
+def compute_anchor(pair: HasTruth, maps: Sequence[TopometricMap]) -> Array:
+    """Compute (3,) middle of the cells of b that a has seen, too; of all where these are hardly any."""
+    cells = maps[1].grid.compute_centroids()
     if pair.truth is not None:
-        seen = [np.floor(c / 0.5).astype(np.int64) for c in (maps[0].grid.centroids(), pair.truth.apply(cells))]
+        seen = [np.floor(c / 0.5).astype(np.int64) for c in (maps[0].grid.compute_centroids(), pair.truth.apply(cells))]
         keys = [k[:, 0] * 2**42 + k[:, 1] * 2**21 + k[:, 2] for k in seen]
         both = np.isin(keys[1], keys[0])
         cells = cells[both] if both.sum() > FEWEST_COLUMNS else cells
@@ -210,12 +210,12 @@ def anchor(pair: HasTruth, maps: Sequence[TopometricMap]) -> Array:
     return middle
 
 
-def laid(pair: Pair, maps: Sequence[TopometricMap]) -> Array:
+def match_overlapping_rooms(pair: Pair, maps: Sequence[TopometricMap]) -> Array:
     """(M, 2) rooms of which most of both lies over each other under the true transform, one to one."""
     t = pair.truth
     if t is None or pair.kind != "overlap":
         return np.zeros((0, 2), np.int64)
-    rooms, fit = matches_under(t, (room_plans(maps[0]), room_plans(maps[1])))
+    rooms, fit = find_matches(t, (build_room_plans(maps[0]), build_room_plans(maps[1])))
     matches: list[tuple[int, int]] = []
     for i, j in rooms[np.argsort(-fit, kind="stable")][: int((fit >= LAID_IOU).sum())].tolist():
         if i not in {k[0] for k in matches} and j not in {k[1] for k in matches}:

@@ -10,26 +10,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from topomerge.datasets.buildings.erect import erect
+from topomerge.datasets.buildings.construction import build_building
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.core.builder import Row, make_item
-from topomerge.datasets.core.building import Building
-from topomerge.datasets.core.plan import Plan
+from topomerge.datasets.core.builder import BuildRow, make_item
+from topomerge.datasets.core.building import Building, Plan
 from topomerge.datasets.pairs.atlases import make_atlas
-from topomerge.datasets.pairs.degrade import UNCHANGED, degraded
-from topomerge.datasets.pairs.drawing import with_plan
-from topomerge.datasets.pairs.evaluation_pair import evaluation_arrays, pair_statistics, save_maps
-from topomerge.datasets.pairs.items import Item, difficulty_of
+from topomerge.datasets.pairs.drawing import replace_map_with_plan
+from topomerge.datasets.pairs.evaluation_pair import build_evaluation_arrays, compute_pair_statistics, save_maps
+from topomerge.datasets.pairs.items import SIDES, UNCHANGED, Item, corrupt_pair, get_difficulty
 from topomerge.datasets.pairs.pairs import Atlas, Pair, make_pair
-from topomerge.datasets.pairs.recipe import SIDES
-from topomerge.datasets.pairs.truth import room_truth, true_matches
+from topomerge.datasets.pairs.parts import find_true_matches, match_true_rooms
 
-from topomerge.embedding.graph import from_arrays, graph_arrays
-from topomerge.embedding.sheets import sheet_arrays
+from topomerge.embedding.graph import build_graph_arrays, convert_to_tensors
+from topomerge.embedding.sheets import build_sheet_arrays
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.io import archive
-from topomerge.io.listing import plain
+from topomerge.io.listing import convert_to_plain
 from topomerge.types import Array, PointCloud, TopometricMap
 
 if TYPE_CHECKING:
@@ -46,7 +43,7 @@ class Example:
     """A cached pair.
 
     Args:
-        a, b: graphs of the two maps (`embedding.graph`), with `true_room` (-1: none), `true_iou` and `true_one`.
+        a, b: graphs of the two maps (`embedding.graph`), with `build_true_room` (-1: none), `true_iou` and `true_one`.
         matches: (M, 2) extracted rooms of a and of b that are the same true room; rooms may be in several.
         transform: (4, 4) float64 T_ab; nan where there is none.
         about: sensors, overlap, kind, building, ...
@@ -59,7 +56,7 @@ class Example:
     about: dict[str, Any]
 
 
-def make_file(item: Item, plans: Sequence[Sequence[Plan]], folder: str) -> Row:
+def make_file(item: Item, plans: Sequence[Sequence[Plan]], folder: str) -> BuildRow:
     """Make an item's file in a folder, or one that says why there is none (`core.builder.make_item`)."""
     return make_item(
         item.name,
@@ -76,12 +73,12 @@ def make_arrays(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array]
         InputError: no candidate has such a pair, or a map has hardly a room.
     """
     if item.more:
-        return several_maps(item, plans)
-    pair = degraded(_first_pair(item, plans), item.change, item.seed)
-    return pair_arrays(pair, extracted((pair.a, pair.b), item), entries_of(item))
+        return build_several_maps(item, plans)
+    pair = corrupt_pair(_make_first_pair(item, plans), item.change, item.seed)
+    return build_pair_arrays(pair, extract_maps((pair.a, pair.b), item), describe_item(item))
 
 
-def several_maps(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array]:
+def build_several_maps(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array]:
     """The arrays of an item of three or more maps of a building: those of each map, and under "matches.ac", "transform.ac" and so
     on what is true of each two; "matches" and "transform" are those of the first two.
 
@@ -92,44 +89,46 @@ def several_maps(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array
 
     def make(k: int, rng: np.random.Generator) -> Atlas:
         return make_atlas(
-            candidate(item, k, plans)[0], sensors, rng, item.rooms, False, difficulty_of(item), item.source, item.drifts
+            build_candidate(item, k, plans)[0], sensors, rng, item.rooms, False, get_difficulty(item), item.source, item.drifts
         )
 
-    atlas = _first(item, make)
-    maps = extracted(atlas.maps, item)
-    truths = [room_truth(m, cloud) for m, cloud in zip(maps, atlas.maps, strict=True)]
-    arrays = _map_arrays(sides, maps, truths, item.points_per_room)
+    atlas = _make_first(item, make)
+    maps = extract_maps(atlas.maps, item)
+    truths = [match_true_rooms(m, cloud) for m, cloud in zip(maps, atlas.maps, strict=True)]
+    arrays = _build_map_arrays(sides, maps, truths, item.points_per_room)
     for i, j in itertools.combinations(range(len(maps)), 2):
         ending = "" if (i, j) == (0, 1) else f".{sides[i]}{sides[j]}"
-        arrays[f"matches{ending}"] = true_matches(truths[i], truths[j], atlas.shared[i, j])
+        arrays[f"matches{ending}"] = find_true_matches(truths[i], truths[j], atlas.shared[i, j])
         arrays[f"transform{ending}"] = (atlas.truth[i].inverse() @ atlas.truth[j]).matrix
-    entries = {**entries_of(item), "building": atlas.building, "sides": sides, "sensors": list(sensors)}
-    text = json.dumps(plain({**entries, "extracted": [len(t) for t in truths]}), sort_keys=True, ensure_ascii=False)
+    entries = {**describe_item(item), "building": atlas.building, "sides": sides, "sensors": list(sensors)}
+    text = json.dumps(convert_to_plain({**entries, "extracted": [len(t) for t in truths]}), sort_keys=True, ensure_ascii=False)
     return arrays | {"about": np.frombuffer(text.encode(), np.uint8)}
 
 
-def _map_arrays(sides: str, maps: Sequence[TopometricMap], truths: Sequence[Array], points_per_room: int) -> dict[str, Array]:
+def _build_map_arrays(
+    sides: str, maps: Sequence[TopometricMap], truths: Sequence[Array], points_per_room: int
+) -> dict[str, Array]:
     """Graph, storeys from above and true rooms of each map."""
     arrays: dict[str, Array] = {}
     for side, map, truth in zip(sides, maps, truths, strict=True):
-        arrays |= {f"{side}.{name}": array for name, array in graph_arrays(map, points_per_room).items()}
-        arrays |= {f"{side}.{name}": array for name, array in sheet_arrays(map).items()}
+        arrays |= {f"{side}.{name}": array for name, array in build_graph_arrays(map, points_per_room).items()}
+        arrays |= {f"{side}.{name}": array for name, array in build_sheet_arrays(map).items()}
         arrays |= {f"{side}.true_{name}": truth[name] for name in ("room", "iou", "one")}
     return arrays
 
 
 def make_evaluation_arrays(item: Item, plans: Sequence[Sequence[Plan]], folder: Path) -> dict[str, Array]:
-    """As `make_arrays`, with what evaluation needs (`evaluation_pair`); the maps are written into the folder."""
-    pair = degraded(_first_pair(item, plans), item.change, item.seed)
-    maps = extracted((pair.a, pair.b), item)
-    arrays = pair_arrays(pair, maps, {**entries_of(item), **pair_statistics(pair, maps)})
-    arrays |= evaluation_arrays(pair, maps, (arrays["a.true_room"], arrays["b.true_room"]))
+    """Make the arrays of `make_arrays` and those for evaluation (`evaluation_pair`); the maps are written into the folder."""
+    pair = corrupt_pair(_make_first_pair(item, plans), item.change, item.seed)
+    maps = extract_maps((pair.a, pair.b), item)
+    arrays = build_pair_arrays(pair, maps, {**describe_item(item), **compute_pair_statistics(pair, maps)})
+    arrays |= build_evaluation_arrays(pair, maps, (arrays["a.true_room"], arrays["b.true_room"]))
     save_maps(maps, folder, item.name)
     return arrays
 
 
-def extracted(clouds: Sequence[PointCloud], item: Item) -> tuple[TopometricMap, ...]:
-    """The maps of clouds; with the space that rays crossed where they are kept.
+def extract_maps(clouds: Sequence[PointCloud], item: Item) -> tuple[TopometricMap, ...]:
+    """Extract the maps of clouds, with the space that rays crossed where they are kept.
 
     Raises:
         InputError: hardly a room comes out of one of them.
@@ -140,8 +139,8 @@ def extracted(clouds: Sequence[PointCloud], item: Item) -> tuple[TopometricMap, 
     return maps
 
 
-def entries_of(item: Item) -> dict[str, Any]:
-    """What stands in a file about its item; names of what came later are left out where they say nothing."""
+def describe_item(item: Item) -> dict[str, Any]:
+    """Describe an item as in a file; fields that came later are left out where they have their defaults."""
     entries = asdict(item)
     if item.change == UNCHANGED:
         del entries["change"]
@@ -154,11 +153,11 @@ def entries_of(item: Item) -> dict[str, Any]:
     return {**entries, "file": f"{item.name}.npz", "asked_overlap": item.overlap, "points_per_room": item.points_per_room}
 
 
-def pair_arrays(pair: Pair, maps: Sequence[TopometricMap], item_entries: Mapping[str, Any]) -> dict[str, Array]:
-    """The arrays of a file: the graphs of two maps, their true rooms, and what stands about them."""
-    truths = [room_truth(m, cloud) for m, cloud in zip(maps, (pair.a, pair.b), strict=True)]
-    matches = true_matches(truths[0], truths[1], pair.shared)
-    arrays = _map_arrays("ab", maps, truths, item_entries["points_per_room"])
+def build_pair_arrays(pair: Pair, maps: Sequence[TopometricMap], item_entries: Mapping[str, Any]) -> dict[str, Array]:
+    """Build the arrays of a file: the graphs of two maps, their true rooms, and what stands about them."""
+    truths = [match_true_rooms(m, cloud) for m, cloud in zip(maps, (pair.a, pair.b), strict=True)]
+    matches = find_true_matches(truths[0], truths[1], pair.shared)
+    arrays = _build_map_arrays("ab", maps, truths, item_entries["points_per_room"])
     arrays["matches"] = matches
     arrays["transform"] = np.full((4, 4), np.nan) if pair.truth is None else pair.truth.matrix
     entries = {
@@ -172,23 +171,23 @@ def pair_arrays(pair: Pair, maps: Sequence[TopometricMap], item_entries: Mapping
         "partners": [len(set(matches[:, k].tolist())) for k in (0, 1)],
         "points": [len(pair.a), len(pair.b)],
     }
-    text = json.dumps(plain(entries), sort_keys=True, ensure_ascii=False)
+    text = json.dumps(convert_to_plain(entries), sort_keys=True, ensure_ascii=False)
     arrays["about"] = np.frombuffer(text.encode(), np.uint8)
     return arrays
 
 
-def _first_pair(item: Item, plans: Sequence[Sequence[Plan]]) -> Pair:
+def _make_first_pair(item: Item, plans: Sequence[Sequence[Plan]]) -> Pair:
     """The pair of the first candidate that has one."""
 
     def make(k: int, rng: np.random.Generator) -> Pair:
-        building, other = candidate(item, k, plans)
-        pair = make_pair(building, item.pair_settings, rng, other, difficulty_of(item), item.source)
-        return with_plan(pair, building) if item.change[0] == "plan" else pair
+        building, other = build_candidate(item, k, plans)
+        pair = make_pair(building, item.pair_settings, rng, other, get_difficulty(item), item.source)
+        return replace_map_with_plan(pair, building) if item.change[0] == "plan" else pair
 
-    return _first(item, make)
+    return _make_first(item, make)
 
 
-def _first(item: Item, make: Callable[[int, np.random.Generator], Made]) -> Made:
+def _make_first(item: Item, make: Callable[[int, np.random.Generator], Made]) -> Made:
     """What is made of the first of an item's candidates that has it, from its number and a generator of its own."""
     refused: InputError | None = None
     for k in range(len(item.buildings)):
@@ -199,18 +198,18 @@ def _first(item: Item, make: Callable[[int, np.random.Generator], Made]) -> Made
     raise refused or InputError("an item without buildings")
 
 
-def candidate(item: Item, k: int, plans: Sequence[Sequence[Plan]]) -> tuple[Building, Building | None]:
-    """Candidate k of an item's buildings, and its other building where the item is a hard negative that has one."""
-    other = _building(item, len(item.buildings), plans) if item.hard == "other-building" else None
-    return _building(item, k, plans), other
+def build_candidate(item: Item, k: int, plans: Sequence[Sequence[Plan]]) -> tuple[Building, Building | None]:
+    """Build candidate k of an item's buildings, and its other building where the item is a hard negative that has one."""
+    other = _build_building(item, len(item.buildings), plans) if item.hard == "other-building" else None
+    return _build_building(item, k, plans), other
 
 
-def _building(item: Item, k: int, plans: Sequence[Sequence[Plan]]) -> Building:
+def _build_building(item: Item, k: int, plans: Sequence[Sequence[Plan]]) -> Building:
     """Candidate k; after the last one comes the other building."""
     name = (*item.buildings, item.other[0])[k]
     if item.source == "procedural":
-        return make_building(item.kind, int(name), item.storeys, difficulty_of(item))
-    return erect(plans[k], difficulty_of(item), item.seed % 100_000 + k, name, item.source)
+        return make_building(item.kind, int(name), item.storeys, get_difficulty(item))
+    return build_building(plans[k], get_difficulty(item), item.seed % 100_000 + k, name, item.source)
 
 
 def load_example(path: str | Path) -> Example:
@@ -223,7 +222,7 @@ def load_example(path: str | Path) -> Example:
 
     arrays = archive.read(path, "cached pair")
     entries = json.loads(arrays.pop("about").tobytes())
-    sides = [from_arrays({n[2:]: a for n, a in arrays.items() if n.startswith(f"{s}.")}) for s in "ab"]
+    sides = [convert_to_tensors({n[2:]: a for n, a in arrays.items() if n.startswith(f"{s}.")}) for s in "ab"]
     matches, transform = torch.from_numpy(arrays["matches"]), torch.from_numpy(arrays["transform"])
     return Example(sides[0], sides[1], matches, transform, entries)
 

@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
-from topomerge.datasets.core.builder import Report, Row, Say, Sharing, build_set, make_item
+from topomerge.datasets.core.builder import BuildReport, BuildRow, BuildSettings, LogFn, build_set, make_item
 from topomerge.datasets.core.building import Building
 from topomerge.datasets.pairs.drawing import draw
-from topomerge.datasets.pairs.evaluation_pair import sim3_of
-from topomerge.datasets.pairs.example import candidate
-from topomerge.datasets.pairs.flat import raise_flat
+from topomerge.datasets.pairs.evaluation_pair import convert_to_sim3
+from topomerge.datasets.pairs.example import build_candidate
+from topomerge.datasets.pairs.flat_maps import extrude_flat
 from topomerge.datasets.pairs.grid_pairs import (
     COLUMN_EDGE,
     GRID_FORMAT,
@@ -28,15 +28,15 @@ from topomerge.datasets.pairs.grid_pairs import (
     GridItem,
     GridPair,
     GridRecipe,
-    columns_seen,
-    grid_items,
-    grid_of,
+    build_grid,
+    compute_seen_columns,
+    draw_grid_items,
     load_grids,
-    outline_misfit,
-    unpacked,
+    measure_outline_misfit,
+    unpack_pair,
 )
-from topomerge.datasets.pairs.items import plans_of
-from topomerge.datasets.pairs.pairs import draw_frames, visited_places
+from topomerge.datasets.pairs.items import select_plans
+from topomerge.datasets.pairs.pairs import choose_visited_places, draw_frames
 
 from topomerge.errors import InputError
 from topomerge.io import archive
@@ -50,7 +50,7 @@ Plans = Sequence[tuple[object, ...]]
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class MapOrigin:
     """Where a cached map was taken: building, frame (building -> map), storey, and the rooms that were visited."""
 
     name: str
@@ -77,49 +77,51 @@ class DrawingItem:
         return hashlib.sha256(json.dumps(inputs).encode()).hexdigest()[:24]
 
 
-def build_drawings(recipe: GridRecipe, sharing: Sharing, say: Say = lambda text: None) -> tuple[list[Path], Report]:
-    """The files of drawings of a set whose pairs were built (`grid_pairs.build_grids`), made where they are missing.
+def build_drawings(
+    recipe: GridRecipe, sharing: BuildSettings, log_line: LogFn = lambda text: None
+) -> tuple[list[Path], BuildReport]:
+    """Build the files of drawings of a set whose pairs were built (`grid_pairs.build_grids`), made where they are missing.
 
     Raises:
         InputError: more drawings than pairs.
     """
     if len(recipe.drawings) > len(recipe.sets) or any(d > s for d, s in zip(recipe.drawings, recipe.sets, strict=False)):
         raise InputError(f"data.drawings must be at most the pairs of each of data.sets, not {recipe.drawings}")
-    items, plans = grid_items(recipe)
+    items, plans = draw_grid_items(recipe)
     folder = Path(sharing.cache).resolve() / "grids"
     made = [item for item in items if (folder / f"{item.name}.npz").exists()]
     tasks = []
     for k, item in enumerate(made):
         if item.set < len(recipe.drawings) and item.number < recipe.drawings[item.set]:
             before = tuple(made[max(k - LOOKED_BACK, 0) : k][::-1])
-            given = [list(plans_of(one.item, plans)) for one in (item, *before)]
+            given = [list(select_plans(one.item, plans)) for one in (item, *before)]
             for side in "ab":
                 tasks += [(DrawingItem(item, before, side, own), given, str(folder)) for own in (True, False)]
-    report = build_set(folder.parent / f"{recipe.name}_drawings.jsonl", tasks, make_drawing, sharing, say, unit="drawings")
+    report = build_set(folder.parent / f"{recipe.name}_drawings.jsonl", tasks, make_drawing, sharing, log_line, unit="drawings")
     return [path for item, _, _ in tasks if (path := folder / f"{item.name}.npz").exists()], report
 
 
-def make_drawing(item: DrawingItem, plans: Sequence[Plans], folder: str) -> Row:
+def make_drawing(item: DrawingItem, plans: Sequence[Plans], folder: str) -> BuildRow:
     """Make an item's file."""
 
     def make() -> dict[str, Array]:
-        here, there, storey, kind = drawn_place(item, plans, Path(folder))
+        here, there, storey, kind = choose_drawn_place(item, plans, Path(folder))
         number = 4 * item.pair.number + 2 * "ab".index(item.side) + (not item.own)
         rng = np.random.default_rng([item.pair.set, number, 1])
         frame = draw_frames(2, number % UNSCALED_EVERY == 0, rng)[1]
         path = Path(folder) / f"{item.pair.name}.npz"
-        return _with_common(drawing_arrays(path, here, there, storey, kind, frame, f"{item.name}.npz"), here)
+        return _add_common_area(build_drawing_arrays(path, here, there, storey, kind, frame, f"{item.name}.npz"), here)
 
     return make_item(item.name, folder, make, LONGEST_GRID_PAIR)
 
 
-def drawn_place(item: DrawingItem, plans: Sequence[Plans], folder: Path) -> tuple[Place, Place, int, str]:
-    """The map's place, the place that is drawn, its storey, and the kind of the pair.
+def choose_drawn_place(item: DrawingItem, plans: Sequence[Plans], folder: Path) -> tuple[MapOrigin, MapOrigin, int, str]:
+    """Choose the map's place, the place that is drawn, its storey, and the kind of the pair.
 
     Raises:
         InputError: there is no such drawing.
     """
-    places = places_of(load_grids(folder / f"{item.pair.name}.npz"), item.pair, plans[0])
+    places = find_places(load_grids(folder / f"{item.pair.name}.npz"), item.pair, plans[0])
     here = next((p for p in places if p.side == item.side), None)
     hard = item.pair.item.hard
     if here is None:
@@ -134,20 +136,20 @@ def drawn_place(item: DrawingItem, plans: Sequence[Plans], folder: Path) -> tupl
     if len(here.building.storeys) > 1:
         return here, here, 1 - min(here.storey, 1), "other-storey"
     for one, given in zip(item.before, plans[1:], strict=True):
-        earlier = places_of(load_grids(folder / f"{one.name}.npz"), one, given)
+        earlier = find_places(load_grids(folder / f"{one.name}.npz"), one, given)
         if earlier and earlier[-1].building.name != here.building.name:
             return here, earlier[-1], earlier[-1].storey, "other-building"
     raise InputError("no pair before it is of another building")
 
 
-def places_of(pair: GridPair, item: GridItem, plans: Plans) -> list[Place]:
+def find_places(pair: GridPair, item: GridItem, plans: Plans) -> list[MapOrigin]:
     """Both maps of a cached pair; maps of several storeys are left out. None where the generator gives another pair by now."""
     simulated = item.item
     for k in range(len(simulated.buildings)):
         try:
-            building, other = candidate(simulated, k, plans)  # type: ignore[arg-type]
+            building, other = build_candidate(simulated, k, plans)  # type: ignore[arg-type]
             rng = np.random.default_rng([simulated.seed, k])
-            buildings, visited = visited_places(building, simulated.pair_settings, other, rng)
+            buildings, visited = choose_visited_places(building, simulated.pair_settings, other, rng)
         except InputError:
             continue
         frames = draw_frames(2, simulated.scale, rng)
@@ -158,19 +160,21 @@ def places_of(pair: GridPair, item: GridItem, plans: Plans) -> list[Place]:
         for side, place, rooms, frame in zip("ab", buildings, visited, frames, strict=True):
             levels = {place.rooms[i].storey for i in rooms.tolist()}
             if len(levels) == 1:
-                places.append(Place(pair.name, side, place, frame, levels.pop(), rooms))
+                places.append(MapOrigin(pair.name, side, place, frame, levels.pop(), rooms))
         return places
     return []
 
 
-def drawing_arrays(path: Path, here: Place, there: Place, storey: int, kind: str, frame: Sim3, file: str) -> dict[str, Array]:
-    """What is cached of a map of the pair at `path` and a drawing in `frame`: as `grid_pairs.pair_arrays`."""
+def build_drawing_arrays(
+    path: Path, here: MapOrigin, there: MapOrigin, storey: int, kind: str, frame: Sim3, file: str
+) -> dict[str, Array]:
+    """Build the cached arrays of a map of the pair at `path` and a drawing in `frame`: as `grid_pairs.build_pair_arrays`."""
     data = archive.read(path, "cached pair")
     about = json.loads(data["about"].tobytes())
     out = {f"a{key[1:]}": data[key] for key in data if key.startswith(f"{here.side}.")}
-    flat = draw(there.building, storey).moved(replace(frame, translation=(*frame.translation[:2], 0.0)))
+    flat = draw(there.building, storey).transform(replace(frame, translation=(*frame.translation[:2], 0.0)))
     floor = float(there.building.storeys["floor"][storey])
-    grid = grid_of(raise_flat(replace(flat, rooms=()), frame.translation[2] + frame.scale * floor))
+    grid = build_grid(extrude_flat(replace(flat, rooms=()), frame.translation[2] + frame.scale * floor))
     out |= {"b.cells": grid.cells.astype(np.int16), "b.origin": grid.origin, "b.shape": np.array(grid.shape)}
     out["b.mean"] = grid.properties["offset"]
     truth = here.frame @ frame.inverse() if kind in ("overlap", "other-storey") else None
@@ -179,18 +183,18 @@ def drawing_arrays(path: Path, here: Place, there: Place, storey: int, kind: str
     names = [here.building.name] + [there.building.name] * (there.building.name != here.building.name)
     description = {"sensors": [sensor, "drawing"], "kind": kind, "building": " + ".join(names), "source": about["source"]}
     description |= {"overlap": float(kind == "overlap"), "scaled": frame.scale != 1.0, "common": 0.0}
-    description |= differing(here, there, storey) if kind in ("twin-wing", "other-storey") else {}
+    description |= measure_differences(here, there, storey) if kind in ("twin-wing", "other-storey") else {}
     out["about"] = np.frombuffer(json.dumps({**description, "file": file, "difficulty": about["difficulty"]}).encode(), np.uint8)
     return out
 
 
-def differing(here: Place, there: Place, storey: int) -> dict[str, float]:
-    """How far the two plans differ where the map was taken, as a drawing shows nothing else: twin wings by ``differs`` (m, as
-    `grid_pairs.differs`), storeys by ``walls_differ`` (m2 of walls that only one of them has)."""
+def measure_differences(here: MapOrigin, there: MapOrigin, storey: int) -> dict[str, float]:
+    """Measure how two plans differ where the map was taken: twin wings by ``differs`` (m, as
+    `grid_pairs.measure_wing_difference`), storeys by ``walls_differ`` (m2 of walls that only one of them has)."""
     if here.building is not there.building:
         outlines = [[p.building.rooms[i].polygon for i in here.visited.tolist()] for p in (here, there)]
         first = np.concatenate(outlines[0])
-        return {"differs": min(outline_misfit(first, np.concatenate([p[::k] for p in outlines[1]])) for k in (1, -1))}
+        return {"differs": min(measure_outline_misfit(first, np.concatenate([p[::k] for p in outlines[1]])) for k in (1, -1))}
     walls = [draw(here.building, k).walls for k in (here.storey, storey)]
     low = np.concatenate(walls).min(axis=0) - 1.0
     cells = [np.floor((w - low) / WALL_CELL).astype(int) for w in walls]
@@ -205,14 +209,16 @@ def differing(here: Place, there: Place, storey: int) -> dict[str, float]:
     return {"walls_differ": float(((image[0] & far[1]) | (image[1] & far[0]))[seen].sum() * WALL_CELL**2)}
 
 
-def _with_common(arrays: dict[str, Array], here: Place) -> dict[str, Array]:
+def _add_common_area(arrays: dict[str, Array], here: MapOrigin) -> dict[str, Array]:
     """With the area that the map saw of what is drawn."""
     about = json.loads(arrays["about"].tobytes())
     if about["kind"] == "overlap":
-        pair = unpacked(here.name, arrays)
+        pair = unpack_pair(here.name, arrays)
         floors = np.unique(np.round([r.floor + here.frame.translation[2] for r in here.building.rooms], 1))
-        truth = sim3_of(arrays["truth"])
+        truth = convert_to_sim3(arrays["truth"])
         assert truth is not None
-        both = np.intersect1d(columns_seen(pair.a, pair.free[0], Sim3(), floors), columns_seen(pair.b, None, truth, floors))
+        both = np.intersect1d(
+            compute_seen_columns(pair.a, pair.free[0], Sim3(), floors), compute_seen_columns(pair.b, None, truth, floors)
+        )
         about["common"] = float(len(both) * COLUMN_EDGE**2)
     return {**arrays, "about": np.frombuffer(json.dumps(about, sort_keys=True).encode(), np.uint8)}

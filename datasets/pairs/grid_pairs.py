@@ -14,15 +14,14 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from topomerge.datasets.core.builder import Report, Row, Say, Sharing, build_set, check_sharing, make_item
-from topomerge.datasets.pairs.evaluation_pair import sim3_of
-from topomerge.datasets.pairs.example import _first_pair
-from topomerge.datasets.pairs.items import Item, draw_items, plans_of
+from topomerge.datasets.core.builder import BuildReport, BuildRow, BuildSettings, LogFn, build_set, check_sharing, make_item
+from topomerge.datasets.pairs.evaluation_pair import convert_to_sim3
+from topomerge.datasets.pairs.example import _make_first_pair
+from topomerge.datasets.pairs.items import Item, Library, Recipe, check, draw_items, load_library, select_plans
 from topomerge.datasets.pairs.pairs import Pair
-from topomerge.datasets.pairs.recipe import Library, Recipe, check, library
 
 from topomerge.errors import InputError
-from topomerge.extraction.cleaning import with_means
+from topomerge.extraction.cleaning import add_means
 from topomerge.extraction.voxels import voxelise
 from topomerge.io import archive
 from topomerge.types import Array, PointCloud, Sim3, VoxelGrid
@@ -94,9 +93,9 @@ class GridPair:
     @cached_property
     def anchor(self) -> Array:
         """(3,) a point of b in the middle of what both maps saw: drift bends maps, and no pose is right everywhere."""
-        cells = self.b.centroids()
+        cells = self.b.compute_centroids()
         if self.truth is not None:
-            a = np.unique(np.floor(self.a.centroids() / 0.5).astype(np.int64), axis=0)
+            a = np.unique(np.floor(self.a.compute_centroids() / 0.5).astype(np.int64), axis=0)
             b = np.floor(self.truth.apply(cells) / 0.5).astype(np.int64)
             key = [k[:, 0] * 2**42 + k[:, 1] * 2**21 + k[:, 2] for k in (a, b)]
             both = np.isin(key[1], key[0])
@@ -120,8 +119,8 @@ class GridItem:
         return hashlib.sha256(json.dumps(inputs).encode()).hexdigest()[:24]
 
 
-def simulated_recipe(recipe: GridRecipe, number: int) -> Recipe:
-    """What the pairs of a set are simulated from."""
+def make_recipe(recipe: GridRecipe, number: int) -> Recipe:
+    """Return the recipe that the pairs of a set are simulated from."""
     return Recipe(
         name=recipe.name, split=recipe.split, pairs=recipe.sets[number], seed=number, folder=recipe.folder,
         sources=dict(WEIGHTS["sources"] if recipe.folder else {"procedural": 1.0}), kinds=dict(WEIGHTS["kinds"]),
@@ -130,8 +129,8 @@ def simulated_recipe(recipe: GridRecipe, number: int) -> Recipe:
     )  # fmt: skip
 
 
-def grid_items(recipe: GridRecipe) -> tuple[list[GridItem], Library]:
-    """The items of all sets, some made harder, and the plans that they are drawn from.
+def draw_grid_items(recipe: GridRecipe) -> tuple[list[GridItem], Library]:
+    """Draw the items of all sets, some made harder, and the plans that they are drawn from.
 
     Raises:
         InputError: a recipe that nothing can be made of.
@@ -143,18 +142,18 @@ def grid_items(recipe: GridRecipe) -> tuple[list[GridItem], Library]:
     for number, count in enumerate(recipe.sets):
         if not count:
             continue
-        simulated = simulated_recipe(recipe, number)
+        simulated = make_recipe(recipe, number)
         check(simulated)
-        plans = plans or library(simulated)
+        plans = plans or load_library(simulated)
         for k, item in enumerate(draw_items(simulated, plans)):
-            harder = _harder(k, item)
+            harder = _increase_difficulty(k, item)
             if number == SLICED_SET:
                 harder = replace(harder, sensors=(harder.sensors[0], "laser2d"))
             items.append(GridItem(harder, number, k))
     return items, plans
 
 
-def _harder(k: int, item: Item) -> Item:
+def _increase_difficulty(k: int, item: Item) -> Item:
     difficulty = dict(item.difficulty)
     if k % 6 == 5:
         difficulty |= {"moved": 0.6, "gone": 0.25}
@@ -163,34 +162,36 @@ def _harder(k: int, item: Item) -> Item:
     return replace(item, difficulty=tuple(sorted(difficulty.items())))
 
 
-def build_grids(recipe: GridRecipe, sharing: Sharing, say: Say = lambda text: None) -> tuple[list[Path], Report]:
-    """The files of all sets, made where they are missing, in the order of their items."""
+def build_grids(
+    recipe: GridRecipe, sharing: BuildSettings, log_line: LogFn = lambda text: None
+) -> tuple[list[Path], BuildReport]:
+    """Build the files of all sets, made where they are missing, in the order of their items."""
     check_sharing(sharing)
-    items, plans = grid_items(recipe)
+    items, plans = draw_grid_items(recipe)
     folder = Path(sharing.cache).resolve() / "grids"
     begin, step = sharing.part
-    tasks = [(item, list(plans_of(item.item, plans)), str(folder)) for item in items[begin - 1 :: step]]
-    report = build_set(folder.parent / f"{recipe.name}.jsonl", tasks, make_grids, sharing, say)
+    tasks = [(item, list(select_plans(item.item, plans)), str(folder)) for item in items[begin - 1 :: step]]
+    report = build_set(folder.parent / f"{recipe.name}.jsonl", tasks, make_grids, sharing, log_line)
     return [path for item in items if (path := folder / f"{item.name}.npz").exists()], report
 
 
-def make_grids(item: GridItem, plans: list[tuple[object, ...]], folder: str) -> Row:
+def make_grids(item: GridItem, plans: list[tuple[object, ...]], folder: str) -> BuildRow:
     """Make an item's file."""
 
     def make() -> dict[str, Array]:
         about = {"difficulty": dict(item.item.difficulty), "source": item.item.source, "set": item.set, "item": item.number}
-        return pair_arrays(_first_pair(item.item, plans), {**about, "file": f"{item.name}.npz"})  # type: ignore[arg-type]
+        return build_pair_arrays(_make_first_pair(item.item, plans), {**about, "file": f"{item.name}.npz"})  # type: ignore[arg-type]
 
     return make_item(item.name, folder, make, LONGEST_GRID_PAIR)
 
 
-def grid_of(cloud: PointCloud) -> VoxelGrid:
-    """Occupied cells with the middle of their points, rounded as in the files that are cached."""
-    return with_means(voxelise(cloud, GRID_EDGE), cloud.points.astype(np.float64) + cloud.shift)
+def build_grid(cloud: PointCloud) -> VoxelGrid:
+    """Build occupied cells with the middle of their points, rounded as in the files that are cached."""
+    return add_means(voxelise(cloud, GRID_EDGE), cloud.points.astype(np.float64) + cloud.shift)
 
 
-def free_of(cloud: PointCloud, grid: VoxelGrid) -> VoxelGrid | None:
-    """Cells that the rays of a cloud with poses crossed and that are not occupied."""
+def compute_free_grid(cloud: PointCloud, grid: VoxelGrid) -> VoxelGrid | None:
+    """Compute cells that the rays of a cloud with poses crossed and that are not occupied."""
     if cloud.poses is None or cloud.pose_of is None:
         return None
     pick = np.flatnonzero(cloud.pose_of >= 0)
@@ -204,29 +205,29 @@ def free_of(cloud: PointCloud, grid: VoxelGrid) -> VoxelGrid | None:
         inside = ((cells >= 0) & (cells < grid.shape)).all(axis=1)
         seen.append(np.unique(cells[inside], axis=0))
     cells = np.unique(np.concatenate(seen), axis=0)
-    return grid.with_cells(cells[~grid.contains(cells)])
+    return grid.replace_cells(cells[~grid.contains(cells)])
 
 
-def columns_seen(grid: VoxelGrid, free: VoxelGrid | None, into: Sim3, floors: Array) -> Array:
-    """Unique (storey, ix, iy) of the columns of which a map knows anything, in another frame."""
-    points = [grid.centroids()] + ([free.centroids()] if free is not None else [])
+def compute_seen_columns(grid: VoxelGrid, free: VoxelGrid | None, into: Sim3, floors: Array) -> Array:
+    """Compute unique (storey, ix, iy) of the columns of which a map knows anything, in another frame."""
+    points = [grid.compute_centroids()] + ([free.compute_centroids()] if free is not None else [])
     at = into.apply(np.concatenate(points))
     storey = np.searchsorted(floors - CEILING_BELOW, at[:, 2]) - 1
     rows = np.column_stack([storey, np.floor(at[:, :2] / COLUMN_EDGE)]).astype(np.int64)
     return np.unique(rows[:, 0] * 2**40 + (rows[:, 1] + 2**18) * 2**20 + rows[:, 2] + 2**18)
 
 
-def common_area(pair: Pair, a: VoxelGrid, b: VoxelGrid, free: tuple[VoxelGrid | None, VoxelGrid | None]) -> float:
-    """Area, m2, of which both maps saw something, on the same storey."""
+def measure_common_area(pair: Pair, a: VoxelGrid, b: VoxelGrid, free: tuple[VoxelGrid | None, VoxelGrid | None]) -> float:
+    """Measure the area, m2, of which both maps saw something, on the same storey."""
     if pair.truth is None or pair.kind != "overlap":
         return 0.0
     floors = np.unique(np.round([r.floor for r in pair.a.rooms] or [-1e3], 1))
-    both = np.intersect1d(columns_seen(a, free[0], Sim3(), floors), columns_seen(b, free[1], pair.truth, floors))
+    both = np.intersect1d(compute_seen_columns(a, free[0], Sim3(), floors), compute_seen_columns(b, free[1], pair.truth, floors))
     return float(len(both) * COLUMN_EDGE**2)
 
 
-def differs(pair: Pair) -> float | None:
-    """Of a twin wing: by how much, m, the outlines of the rooms that both maps show differ at most when one lies on the other.
+def measure_wing_difference(pair: Pair) -> float | None:
+    """Measure, m, how far the outlines of rooms in a twin wing differ at most when one map lies on the other.
 
     Where that is little, nobody can tell the wings apart.
     """
@@ -238,34 +239,36 @@ def differs(pair: Pair) -> float | None:
     if not len(both):
         return NOTHING_IN_COMMON
     outlines = [[np.asarray(c.rooms[i].polygon)[:, :2] for i in both] for c in (pair.a, pair.b)]
-    turned = [outline_misfit(np.concatenate(outlines[0]), np.concatenate([p[::k] for p in outlines[1]])) for k in (1, -1)]
+    turned = [measure_outline_misfit(np.concatenate(outlines[0]), np.concatenate([p[::k] for p in outlines[1]])) for k in (1, -1)]
     return min(turned)
 
 
-def outline_misfit(a: Array, b: Array) -> float:
-    """Largest distance of points that belong to each other, after turning and moving b."""
+def measure_outline_misfit(a: Array, b: Array) -> float:
+    """Measure the largest distance of points that belong to each other, after turning and moving b."""
     p, q = a - a.mean(axis=0), b - b.mean(axis=0)
     turn = np.angle(((p @ (1, 1j)) * np.conj(q @ (1, 1j))).sum())
     return float(np.abs(p @ (1, 1j) - np.exp(1j * turn) * (q @ (1, 1j))).max())
 
 
-def pair_arrays(pair: Pair, about: dict[str, object]) -> dict[str, Array]:
-    """What is cached of a pair."""
-    grids = [grid_of(c) for c in (pair.a, pair.b)]
-    free = tuple(free_of(c, g) if s == "laser2d" else None for c, g, s in zip((pair.a, pair.b), grids, pair.sensors, strict=True))
-    common = common_area(pair, grids[0], grids[1], (free[0], free[1]))
+def build_pair_arrays(pair: Pair, about: dict[str, object]) -> dict[str, Array]:
+    """Build the cached arrays of a pair."""
+    grids = [build_grid(c) for c in (pair.a, pair.b)]
+    free = tuple(
+        compute_free_grid(c, g) if s == "laser2d" else None for c, g, s in zip((pair.a, pair.b), grids, pair.sensors, strict=True)
+    )
+    common = measure_common_area(pair, grids[0], grids[1], (free[0], free[1]))
     out: dict[str, Array] = {}
     for side, grid, empty in zip("ab", grids, free, strict=True):
-        out |= grid_arrays(side, grid, empty)
+        out |= build_grid_arrays(side, grid, empty)
     out["truth"] = np.full((4, 4), np.nan) if pair.truth is None else pair.truth.matrix
     of_pair = {k: getattr(pair, k) for k in ("sensors", "kind", "building", "overlap")}
-    about = {**about, **of_pair, "common": common, "differs": differs(pair)}
+    about = {**about, **of_pair, "common": common, "differs": measure_wing_difference(pair)}
     out["about"] = np.frombuffer(json.dumps(about, sort_keys=True, default=str).encode(), np.uint8)
     return out
 
 
-def grid_arrays(side: str, grid: VoxelGrid, empty: VoxelGrid | None) -> dict[str, Array]:
-    """What is cached of a map: occupied cells with the middles of their points, and empty cells where they are known."""
+def build_grid_arrays(side: str, grid: VoxelGrid, empty: VoxelGrid | None) -> dict[str, Array]:
+    """Build the cached arrays of a map: occupied cells with the middles of their points, and empty cells where they are known."""
     out = {f"{side}.cells": grid.cells.astype(np.int16), f"{side}.origin": grid.origin, f"{side}.shape": np.array(grid.shape)}
     out[f"{side}.mean"] = grid.properties["offset"]
     if empty is None:
@@ -275,12 +278,12 @@ def grid_arrays(side: str, grid: VoxelGrid, empty: VoxelGrid | None) -> dict[str
 
 
 def load_grids(path: str | Path) -> GridPair:
-    """A cached pair."""
-    return unpacked(Path(path).stem, archive.read(path, "cached pair"))
+    """Load a cached pair."""
+    return unpack_pair(Path(path).stem, archive.read(path, "cached pair"))
 
 
-def unpacked(name: str, data: Mapping[str, Array]) -> GridPair:
-    """The pair of the arrays of a file."""
+def unpack_pair(name: str, data: Mapping[str, Array]) -> GridPair:
+    """Return the pair of the arrays of a file."""
     about = json.loads(data["about"].tobytes())
     grids, free = [], []
     for side in "ab":
@@ -289,5 +292,5 @@ def unpacked(name: str, data: Mapping[str, Array]) -> GridPair:
         grids.append(VoxelGrid(cells, origin, GRID_EDGE, shape, {"offset": data[f"{side}.mean"]}))  # type: ignore[arg-type]
         empty = data.get(f"{side}.free")
         free.append(None if empty is None else VoxelGrid(empty.astype(np.int32), origin, GRID_EDGE, shape))  # type: ignore[arg-type]
-    truth = sim3_of(data["truth"])
+    truth = convert_to_sim3(data["truth"])
     return GridPair(name, grids[0], grids[1], (free[0], free[1]), truth, float(about["common"]), about)

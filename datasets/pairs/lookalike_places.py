@@ -19,20 +19,29 @@ from dataclasses import dataclass, replace
 import numpy as np
 import shapely
 from scipy.signal import fftconvolve
+from topomerge.datasets.buildings.construction import build_building
 from topomerge.datasets.buildings.drafting import Draft
-from topomerge.datasets.buildings.erect import erect
-from topomerge.datasets.buildings.modules import EQUAL, ROOM_KINDS, ModuleRow, draw_module, make_row, rooms_of
-from topomerge.datasets.buildings.procedural import connected, make_building, make_plans
-from topomerge.datasets.buildings.profiles import PROFILES
-from topomerge.datasets.buildings.refurnish import Added, copied, refurnished, replaced, restrewn
-from topomerge.datasets.core.building import SURFACES, Building
-from topomerge.datasets.core.difficulty import Difficulty
-from topomerge.datasets.core.plan import Plan, Point
-from topomerge.datasets.core.solids import boxes
+from topomerge.datasets.buildings.layouts import PROFILES
+from topomerge.datasets.buildings.modules import (
+    EQUAL,
+    ROOM_KINDS,
+    AddedThing,
+    ModuleRow,
+    copy_furniture,
+    draw_module,
+    find_module_rooms,
+    make_row,
+    replace_clutter,
+    replace_furniture,
+    replace_things,
+)
+from topomerge.datasets.buildings.procedural import is_connected, make_building, make_plans
+from topomerge.datasets.core.building import SURFACES, Building, Difficulty, Plan, Point
+from topomerge.datasets.core.solids import triangulate_boxes
 from topomerge.datasets.pairs.parts import CONNECTING
-from topomerge.datasets.simulation.floors import fill
-from topomerge.datasets.simulation.twin_wing import bent
-from topomerge.datasets.simulation.walk import part
+from topomerge.datasets.simulation.floor_truth import fill
+from topomerge.datasets.simulation.twin_wing import stretch_building
+from topomerge.datasets.simulation.walk import sample_part
 
 from topomerge.types import Array, Sim3
 
@@ -55,7 +64,7 @@ HALF_SHAPES = ("single", "double")  # of corridors that reach the end of their b
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class LookalikePlaces:
     """Two places made to be alike.
 
     Args:
@@ -74,8 +83,8 @@ class Places:
     repeats: bool = False
 
 
-def draw_places(kind: str, furniture: str, seed: int) -> Places:
-    """The places of a pair of a kind of `LOOKALIKES`; the same arguments give the same buildings."""
+def sample_places(kind: str, furniture: str, seed: int) -> LookalikePlaces:
+    """Sample the places of a pair of a kind of `LOOKALIKES`; the same arguments give the same buildings."""
     rng = np.random.default_rng([seed, LOOKALIKES.index(kind), FURNISHED.index(furniture)])
     difficulty = Difficulty(
         furniture=0.0 if furniture == "empty" else float(rng.uniform(0.8, 1.6)),
@@ -86,104 +95,110 @@ def draw_places(kind: str, furniture: str, seed: int) -> Places:
     return PLACES_OF[kind](kind, furniture, seed, difficulty, rng)
 
 
-def _row(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> Places:
+def _sample_row(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> LookalikePlaces:
     """Parts of a row: of a row of rooms (at most half of it) or of one of modules."""
     layout = str(rng.choice(["room", "ensuite"] if kind == "shifted-row" else ["pair", "suite"]))
     count = int(rng.integers(6, 11)) if kind == "shifted-row" else 9
     row = make_row(draw_module(layout, rng), count, difficulty, seed, f"{kind}-{seed}")
-    most = max(MOST_ROOMS_SEEN // len(rooms_of(row.module, 0)), 1)
+    most = max(MOST_ROOMS_SEEN // len(find_module_rooms(row.module, 0)), 1)
     seen = min(int(rng.integers(2, 5)) if kind == "shifted-row" else 1 + int(rng.random() < 0.3), most, count // 2)
     ends = int(rng.random() < INNER_SHARE)  # modules at each end that neither map visits
     apart = int(rng.integers(1 if kind == "shifted-row" else seen, count - seen - 2 * ends + 1))
     first = int(rng.integers(ends, count - seen - apart - ends + 1))
     starts = [first, first + apart] if rng.random() < 0.5 else [first + apart, first]
-    building = _furnished_row(row, furniture, difficulty, rng)
+    building = _furnish_row(row, furniture, difficulty, rng)
     visited = [np.flatnonzero((row.module >= s) & (row.module < s + seen)) for s in starts]
-    poses = row_poses(row, starts[0], starts[1], seen)
-    return Places((building, building), (visited[0], visited[1]), poses, same=True, repeats=seen > 1)
+    poses = compute_row_poses(row, starts[0], starts[1], seen)
+    return LookalikePlaces((building, building), (visited[0], visited[1]), poses, same=True, repeats=seen > 1)
 
 
-def row_poses(row: ModuleRow, first: int, second: int, seen: int) -> tuple[Sim3, ...]:
+def compute_row_poses(row: ModuleRow, first: int, second: int, seen: int) -> tuple[Sim3, ...]:
     """Poses by whole periods, but the true one, that lay a module of b on one of a: each shows `seen`, from `first` and from
     `second` on."""
     shifts = [first - second + k for k in range(1 - seen, seen)]
     return tuple(Sim3(0.0, (k * row.period, 0.0, 0.0)) for k in shifts if k)
 
 
-def _furnished_row(row: ModuleRow, furniture: str, difficulty: Difficulty, rng: np.random.Generator) -> Building:
+def _furnish_row(row: ModuleRow, furniture: str, difficulty: Difficulty, rng: np.random.Generator) -> Building:
     """The row with things; an inner module is furnished and copied, as those at the ends are longer."""
     building, density, clutter = row.building, difficulty.furniture, difficulty.clutter
     if furniture == "other":
-        return refurnished(building, range(len(building.rooms)), density, clutter, rng)
-    building = refurnished(building, rooms_of(row.module, 1), density, clutter, rng)
+        return replace_furniture(building, range(len(building.rooms)), density, clutter, rng)
+    building = replace_furniture(building, find_module_rooms(row.module, 1), density, clutter, rng)
     for k in (k for k in range(row.count) if k != 1):
-        building = copied(building, rooms_of(row.module, 1), rooms_of(row.module, k), np.array([(k - 1) * row.period, 0.0]))
-    return restrewn(building, range(len(building.rooms)), clutter, rng) if furniture == "clutter" else building
+        building = copy_furniture(
+            building, find_module_rooms(row.module, 1), find_module_rooms(row.module, k), np.array([(k - 1) * row.period, 0.0])
+        )
+    return replace_clutter(building, range(len(building.rooms)), clutter, rng) if furniture == "clutter" else building
 
 
-def _corridors(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> Places:
+def _sample_corridors(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> LookalikePlaces:
     """A corridor with rooms beside it, and another one like it elsewhere: the same plan a second time."""
     a = make_building(str(rng.choice(CORRIDOR_KINDS)), seed, 1, difficulty, str(rng.choice(["single", "double"])))
-    rooms = part(a, int(rng.integers(4, 8)), rng, start=_largest_corridor(a))
-    return Places((a, _again(a, furniture, rooms, difficulty, rng)), (rooms, rooms), (Sim3(),))
+    rooms = sample_part(a, int(rng.integers(4, 8)), rng, start=_find_largest_corridor(a))
+    return LookalikePlaces((a, _vary_furniture(a, furniture, rooms, difficulty, rng)), (rooms, rooms), (Sim3(),))
 
 
-def _same_room(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> Places:
+def _sample_same_room(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> LookalikePlaces:
     """One room of a size, and another one."""
     wide, deep = np.round(rng.uniform([4.0, 3.6], [9.0, 7.5]), 2).tolist()
     draft = Draft(round(float(rng.uniform(0.1, 0.2)), 2), rng)
-    room = draft.box((0.0, 0.0), (wide, deep), str(rng.choice([*ROOM_KINDS, "openplan", "storage"])))
+    room = draft.add_box((0.0, 0.0), (wide, deep), str(rng.choice([*ROOM_KINDS, "openplan", "storage"])))
     sides = shapely.box(0.0, 0.0, wide, deep).exterior
     door = shapely.LineString(np.asarray(sides.coords)[[1, 2]])
     draft.cut(door, 0.95, "door", round(float(rng.uniform(0.2, 0.8)), 2))
-    draft.windows(room, 1.4, 0.9, 2.4)
+    draft.add_windows(room, 1.4, 0.9, 2.4)
     height = round(float(rng.uniform(3.0, 3.6)), 2)
     equal = replace(EQUAL, furniture=difficulty.furniture, clutter=difficulty.clutter)
-    a = erect([draft.plan(height, round(height - 0.5, 2))], equal, rng, f"{kind}-{seed}", "room")
+    a = build_building([draft.build_plan(height, round(height - 0.5, 2))], equal, rng, f"{kind}-{seed}", "room")
     a, rooms = replace(a, seed=seed), np.array([0])
-    b = _again(a, furniture, rooms, difficulty, rng)
-    return Places((a, b), (rooms, rooms), (Sim3(), Sim3(np.pi, (wide, deep, 0.0))))
+    b = _vary_furniture(a, furniture, rooms, difficulty, rng)
+    return LookalikePlaces((a, b), (rooms, rooms), (Sim3(), Sim3(np.pi, (wide, deep, 0.0))))
 
 
-def _mirror(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> Places:
+def _mirror(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> LookalikePlaces:
     """A part of a building and its mirror image."""
     a = make_building(str(rng.choice(MIRRORED_KINDS)), seed, 1, difficulty)
-    rooms = part(a, int(rng.choice(ROOMS_MIRRORED)), rng, start=_a_room(a, rng))
-    b = bent(_again(a, furniture, rooms, difficulty, rng), 0, lambda x: x, mirrored=True)
-    return Places((a, b), (rooms, rooms), tuple(laid(a, b, rooms, yaw) for yaw in (0.0, np.pi)))
+    rooms = sample_part(a, int(rng.choice(ROOMS_MIRRORED)), rng, start=_sample_room(a, rng))
+    b = stretch_building(_vary_furniture(a, furniture, rooms, difficulty, rng), 0, lambda x: x, mirrored=True)
+    return LookalikePlaces((a, b), (rooms, rooms), tuple(estimate_overlay_pose(a, b, rooms, yaw) for yaw in (0.0, np.pi)))
 
 
-def _draw_storeys(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> Places:
+def _draw_storeys(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> LookalikePlaces:
     """Parts of two storeys of one plan. They begin in one corridor, where there is one."""
     difficulty = replace(difficulty, furniture=_draw_density(furniture, rng))
     a = make_building(str(rng.choice(MIRRORED_KINDS)), seed, 1, difficulty)
-    start = _largest_corridor(a) if rng.random() < 0.7 else _a_room(a, rng)
-    visited = [part(a, int(rng.integers(*ROOMS_OF_STOREY)), rng, start=start)]
-    visited.append(visited[0] if rng.random() < SAME_PART else part(a, int(rng.integers(*ROOMS_OF_STOREY)), rng, start=start))
-    b = _again(a, furniture, np.arange(len(a.rooms)), difficulty, rng)
+    start = _find_largest_corridor(a) if rng.random() < 0.7 else _sample_room(a, rng)
+    visited = [sample_part(a, int(rng.integers(*ROOMS_OF_STOREY)), rng, start=start)]
+    visited.append(
+        visited[0] if rng.random() < SAME_PART else sample_part(a, int(rng.integers(*ROOMS_OF_STOREY)), rng, start=start)
+    )
+    b = _vary_furniture(a, furniture, np.arange(len(a.rooms)), difficulty, rng)
     if rng.random() < ALTERED:
         share = float(rng.uniform(*PILASTERS))
         a, b = add_pilasters(a, share, rng), add_pilasters(b, share, rng)
-    return Places((a, b), (visited[0], visited[1]), (Sim3(),))
+    return LookalikePlaces((a, b), (visited[0], visited[1]), (Sim3(),))
 
 
-def _draw_halves(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> Places:
+def _draw_halves(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> LookalikePlaces:
     """Parts of the two halves of a building that half a turn lays on itself; each has furniture of its own."""
     difficulty = replace(difficulty, furniture=_draw_density(furniture, rng), curved=0.0)
     for _ in range(HALVES_TRIED):
         profile = replace(PROFILES[str(rng.choice(MIRRORED_KINDS))], shapes=HALF_SHAPES)
         half = make_plans(profile, 1, difficulty, rng)[0]
         whole, middle = mirror_by_point(half)
-        building = replace(erect([whole], difficulty, rng, f"{kind}-{seed}", "halves"), seed=seed)
-        if connected(building):
+        building = replace(build_building([whole], difficulty, rng, f"{kind}-{seed}", "halves"), seed=seed)
+        if is_connected(building):
             break
     count = len(half.rooms)
     starts = [int(np.argmax([shapely.Polygon(r.polygon).area * (r.kind == "corridor") for r in half.rooms]))] * 2
     rooms = [int(rng.integers(*ROOMS_OF_STOREY)) for _ in range(2)]
-    first, second = (part(building, n, rng, start=s + k * count) for k, (n, s) in enumerate(zip(rooms, starts, strict=True)))
+    first, second = (
+        sample_part(building, n, rng, start=s + k * count) for k, (n, s) in enumerate(zip(rooms, starts, strict=True))
+    )
     visited = (first[first < count], second[second >= count])
     x, y = (2 * middle).tolist()
-    return Places((building, building), visited, (Sim3(np.pi, (x, y, 0.0)),), same=True)
+    return LookalikePlaces((building, building), visited, (Sim3(np.pi, (x, y, 0.0)),), same=True)
 
 
 def mirror_by_point(half: Plan) -> tuple[Plan, Array]:
@@ -235,46 +250,49 @@ def add_pilasters(building: Building, share: float, rng: np.random.Generator) ->
             along = (q - p) / wide
             middle = (p + q) / 2 + deep / 2 * np.array([-along[1], along[0]])  # outlines run with the room to their left
             yaw, tall = float(np.arctan2(along[1], along[0])), room.ceiling - room.floor
-            vertices, triangles = boxes(np.array([[0, 0, tall / 2, wide, deep, tall]]), np.array([*middle, room.floor]), yaw)
+            vertices, triangles = triangulate_boxes(
+                np.array([[0, 0, tall / 2, wide, deep, tall]]), np.array([*middle, room.floor]), yaw
+            )
             footprint = shapely.MultiPoint(vertices[:, :2]).convex_hull
             if footprint.intersects(clear) or footprint.intersection(shape).area < 0.9 * footprint.area:
                 continue
             centre = (*middle.tolist(), room.floor + tall / 2)
             row = ("column", number, -1, centre, (wide, deep, tall), yaw, tuple(middle.tolist()), False)
-            added.append(Added(row, vertices, triangles, SURFACES.index("column")))
-    return replaced(building, np.zeros(len(building.things), bool), added)
+            added.append(AddedThing(row, vertices, triangles, SURFACES.index("column")))
+    return replace_things(building, np.zeros(len(building.things), bool), added)
 
 
 def _draw_density(furniture: str, rng: np.random.Generator) -> float:
     return 0.0 if furniture == "empty" else float(rng.uniform(FEW_THINGS, ORDINARY_THINGS))
 
 
-def _largest_corridor(building: Building) -> int:
+def _find_largest_corridor(building: Building) -> int:
     areas = [shapely.Polygon(r.polygon).area if r.kind == "corridor" else 0.0 for r in building.rooms]
     return int(np.argmax(areas))
 
 
-PLACES_OF: dict[str, Callable[[str, str, int, Difficulty, np.random.Generator], Places]] = {
-    "shifted-row": _row, "modules": _row, "hotel-corridors": _corridors, "same-room": _same_room, "mirror": _mirror,
+PLACES_OF: dict[str, Callable[[str, str, int, Difficulty, np.random.Generator], LookalikePlaces]] = {
+    "shifted-row": _sample_row, "modules": _sample_row, "hotel-corridors": _sample_corridors, "same-room": _sample_same_room,
+    "mirror": _mirror,
     "storeys": _draw_storeys, "point-symmetric": _draw_halves,
 }  # fmt: skip
 
 
-def _again(a: Building, furniture: str, rooms: Array, difficulty: Difficulty, rng: np.random.Generator) -> Building:
+def _vary_furniture(a: Building, furniture: str, rooms: Array, difficulty: Difficulty, rng: np.random.Generator) -> Building:
     """The same plan a second time."""
     every = range(len(a.rooms)) if furniture == "clutter" else rooms
     if furniture == "other":
-        return refurnished(a, every, difficulty.furniture, difficulty.clutter, rng)
-    return restrewn(a, every, difficulty.clutter, rng) if furniture == "clutter" else a
+        return replace_furniture(a, every, difficulty.furniture, difficulty.clutter, rng)
+    return replace_clutter(a, every, difficulty.clutter, rng) if furniture == "clutter" else a
 
 
-def _a_room(building: Building, rng: np.random.Generator) -> int:
+def _sample_room(building: Building, rng: np.random.Generator) -> int:
     """A room that is no corridor and not tiny."""
     fits = [i for i, r in enumerate(building.rooms) if r.kind not in CONNECTING and shapely.Polygon(r.polygon).area > LEAST_AREA]
     return int(rng.choice(fits))
 
 
-def laid(a: Building, b: Building, rooms: Array, yaw: float) -> Sim3:
+def estimate_overlay_pose(a: Building, b: Building, rooms: Array, yaw: float) -> Sim3:
     """The pose b -> a of a turn at which the floors of these rooms lie on each other the most."""
     turn = Sim3(yaw)
     floors = []

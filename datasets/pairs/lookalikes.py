@@ -1,39 +1,163 @@
-"""Look-alikes: pairs of maps of places that were made to be alike and must not be put together there (perceptual aliasing).
-
-The files are those of `grid_pairs`, made by the builder (`core.builder`): the same item gives the same bytes, and what was killed
-goes on where it was. Kinds and furniture are in `lookalike_places`; who could tell a pair apart, and by what, in
-`lookalike_rule`.
-
-What `about` tells beside the usual: ``lookalike`` (the kind), ``furniture``, ``tellable``, ``amount`` (what that stands on),
-``repeats`` (a map shows the repetition by itself), ``alike`` (4 x 4, the false pose T_ab at which they differ least), ``scaled``
-(the scale of b is unknown).
-
-Maps that show places apart have no truth, and ``kind`` lookalike. Parts of a row that really overlap, by `LEAST_SHARED` or more,
-have their true pose, and ``kind`` overlap: a pose there is right, and the wrong ones are off by whole rooms.
-"""
+"""Look-alikes: pairs of maps of places made to be alike that must not be merged."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from topomerge.datasets.core.builder import Report, Row, Say, Sharing, build_set, check_sharing, make_item
-from topomerge.datasets.core.difficulty import Difficulty
-from topomerge.datasets.pairs.grid_pairs import GRID_FORMAT, LONGEST_GRID_PAIR, WEIGHTS, pair_arrays, unpacked
-from topomerge.datasets.pairs.lookalike_places import FURNISHED, LOOKALIKES, Places, draw_places
-from topomerge.datasets.pairs.lookalike_rule import Shown, judged_poses
+from scipy import ndimage
+from topomerge.datasets.buildings.furniture import compute_footprints
+from topomerge.datasets.core.builder import BuildReport, BuildRow, BuildSettings, LogFn, build_set, check_sharing, make_item
+from topomerge.datasets.core.building import Building, Difficulty
+from topomerge.datasets.core.solids import build_rotation
+from topomerge.datasets.pairs.grid_pairs import GRID_FORMAT, LONGEST_GRID_PAIR, WEIGHTS, build_pair_arrays, unpack_pair
+from topomerge.datasets.pairs.lookalike_places import FURNISHED, LOOKALIKES, LookalikePlaces, sample_places
 from topomerge.datasets.pairs.pairs import Pair, draw_frames
 from topomerge.datasets.plans import splits
-from topomerge.datasets.simulation.scanner import scan
+from topomerge.datasets.simulation.floor_truth import fill
+from topomerge.datasets.simulation.scanner import scan_building
 from topomerge.datasets.simulation.sensors import get_sensor
-from topomerge.datasets.simulation.session import session
+from topomerge.datasets.simulation.session import simulate_session
 
 from topomerge.errors import InputError
 from topomerge.types import Array, Sim3, VoxelGrid
+
+RULE_CELL = 0.1  # m
+WALL_INSIDE, THING_APART = 0.3, 0.3  # m
+WALLS_TELL, FITTED_TELLS, FURNITURE_TELLS, LEAST_FURNITURE = 1.0, 0.5, 0.3, 1.5  # m, m2, share, m2
+SMALLEST_THING = 0.2  # m2 of its footprint
+SHOWN_ABOVE = 0.2  # m by which a thing must reach into what a sensor shows
+PASSING = ("leaf", "clutter", "person", "plant", "armchair")  # things that tell nothing
+MARGIN = 1.0  # m around the rooms
+COMPARABLE = 0.5  # share of the largest area that both show, from which on a pose counts
+
+
+@dataclass(frozen=True, eq=False)
+class VisiblePlace:
+    """A place as it stood when it was scanned, and what the map shows of it.
+
+    Args:
+        building: after `session`.
+        seen: (n, 2) columns, m, of which the map knows anything, in the building's coordinates.
+        sensor: its name.
+    """
+
+    building: Building
+    seen: Array
+    sensor: str
+
+
+@dataclass(frozen=True, eq=False)
+class _PlaceRasters:
+    """Rasters (rows, columns) of one place in a frame: floor with doorways, columns that are shown, furniture, fixtures."""
+
+    floor: Array
+    shown: Array
+    movable: Array
+    fitted: Array
+    walls: Array  # (n, 2) row and column of points along the outlines
+
+
+def measure_differences(a: VisiblePlace, b: VisiblePlace, pose: Sim3) -> dict[str, float]:
+    """Amounts by which two places differ when b's coordinates are mapped into a's; ``common``: m2 that both maps show."""
+    corners = np.concatenate([r.polygon for r in a.building.rooms])
+    low, high = corners.min(axis=0) - MARGIN, corners.max(axis=0) + MARGIN
+    shape = tuple(np.ceil((high - low)[::-1] / RULE_CELL).astype(int).tolist())
+    lowest = max(get_sensor(s.sensor).lowest for s in (a, b)) + SHOWN_ABOVE
+    first, second = (_rasterize_place(s, t, low, shape, lowest) for s, t in ((a, Sim3()), (b, pose)))
+    both = first.shown & second.shown
+    walls = fitted = stray = standing = 0.0
+    for one, other in ((first, second), (second, first)):
+        inside = ndimage.distance_transform_edt(other.floor) * RULE_CELL >= WALL_INSIDE
+        rows, columns = one.walls.T
+        walls += float((inside & both)[rows, columns].sum()) * RULE_CELL
+        clear = other.floor & both & (ndimage.distance_transform_edt(~(other.movable | other.fitted)) * RULE_CELL > THING_APART)
+        fitted += float((one.fitted & clear).sum()) * RULE_CELL**2
+        stray += float((one.movable & clear).sum()) * RULE_CELL**2
+        standing += float((one.movable & other.floor & both).sum()) * RULE_CELL**2
+    share = stray / standing if standing >= LEAST_FURNITURE else 0.0
+    common = float((both & first.floor & second.floor).sum()) * RULE_CELL**2
+    rounded = {"walls": walls, "fitted": fitted, "furniture": share, "standing": standing, "common": common}
+    return {name: round(value, 2) for name, value in rounded.items()}
+
+
+def is_distinguishable(amount: Mapping[str, float]) -> bool:
+    """Return whether the amounts of one pose tell the places apart."""
+    return compute_strength(amount) >= 1.0
+
+
+def compute_strength(amount: Mapping[str, float]) -> float:
+    """Compute the largest amount in units of what tells."""
+    return max(amount["walls"] / WALLS_TELL, amount["fitted"] / FITTED_TELLS, amount["furniture"] / FURNITURE_TELLS)
+
+
+def evaluate_poses(a: VisiblePlace, b: VisiblePlace, poses: Sequence[Sim3]) -> tuple[bool, dict[str, Any], Sim3 | None]:
+    """Is the pair tellable; the amounts of the pose at which it differs least, and that pose. Without one that both maps show
+    anything of, nothing is alike: tellable, no amounts."""
+    rows = [(measure_differences(a, b, pose), pose) for pose in poses]
+    most = max((r["common"] for r, _ in rows), default=0.0)
+    alike = [(r, p) for r, p in rows if r["common"] >= COMPARABLE * most and r["common"] > 0]
+    if not alike:
+        return True, {}, None
+    amount, pose = min(alike, key=lambda k: compute_strength(k[0]))
+    return is_distinguishable(amount), amount, pose
+
+
+def _rasterize_place(shown: VisiblePlace, pose: Sim3, low: Array, shape: tuple[int, ...], lowest: float) -> _PlaceRasters:
+    building = shown.building
+
+    def cells(points: Array) -> Array:
+        flat = np.asarray(points, np.float64).reshape(-1, 2)
+        return (pose.apply(np.pad(flat, ((0, 0), (0, 1))))[:, :2] - low) / RULE_CELL
+
+    def drawn(polygons: Sequence[Array]) -> Array:
+        out = np.zeros(shape, bool)
+        for polygon in polygons:
+            fill(out, cells(polygon), 1)
+        return out
+
+    doorways = [_build_doorway(d) for d in building.doors]
+    rooms = [r.polygon for r in building.rooms]
+    edges = np.concatenate([_sample_outline(p) for p in rooms])
+    openings, outline = drawn(doorways), np.floor(cells(edges)[:, ::-1]).astype(np.int64)
+    outline = outline[((outline >= 0) & (outline < shape)).all(axis=1)]
+    openings = ndimage.binary_dilation(openings, iterations=1)
+    outline = outline[~openings[tuple(outline.T)]]
+    seen = np.zeros(shape, bool)
+    at = np.floor(cells(shown.seen)[:, ::-1]).astype(np.int64)
+    at = at[((at >= 0) & (at < shape)).all(axis=1)]
+    seen[tuple(at.T)] = True
+    things = building.things[~np.isin(building.things["kind"], PASSING)]
+    floors = np.array([r.floor for r in building.rooms])[things["room"]] if len(things) else np.zeros(0)
+    top = things["centre"][:, 2] + things["size"][:, 2] / 2 - floors
+    things = things[(things["size"][:, 0] * things["size"][:, 1] >= SMALLEST_THING) & (top >= lowest)]
+    boxes = [compute_footprints(t["centre"][None, :2], t["yaw"][None], t["size"].tolist())[0] for t in things]
+    movable, fitted = ([p for p, t in zip(boxes, things, strict=True) if t["movable"] == m] for m in (True, False))
+    floor = drawn([*rooms, *doorways])
+    return _PlaceRasters(floor, ndimage.binary_dilation(seen, np.ones((5, 5))), drawn(movable), drawn(fitted), outline)
+
+
+def _build_doorway(door: Array) -> Array:
+    """(4, 2) floor of a doorway."""
+    half = np.array([door["thickness"] / 2 + 0.05, door["width"] / 2])
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
+    return np.asarray(corners @ build_rotation(float(door["direction"])) + door["centre"][:2])
+
+
+def _sample_outline(polygon: Array) -> Array:
+    """(n, 2) points along a closed outline, a cell apart."""
+    ends = np.roll(polygon, -1, axis=0)
+    pieces = []
+    for p, q in zip(polygon, ends, strict=True):
+        steps = max(round(float(np.hypot(*(q - p))) / RULE_CELL), 1)
+        pieces.append(p + (np.arange(steps) + 0.5)[:, None] / steps * (q - p))
+    return np.concatenate(pieces)
+
 
 LOOKALIKE_FORMAT = 1  # raise it when the same item gives other bytes: it is part of the files' names
 LEAST_SHARED = 1.0  # m2 of the same place that both maps show, from which on a pair has a truth
@@ -104,8 +228,8 @@ class LookalikeItem:
         return hashlib.sha256(json.dumps(inputs).encode()).hexdigest()[:24]
 
 
-def lookalike_items(recipe: LookalikeRecipe) -> list[LookalikeItem]:
-    """The items of a set, kinds in turn; a longer set of a kind begins with the shorter one.
+def draw_lookalike_items(recipe: LookalikeRecipe) -> list[LookalikeItem]:
+    """Draw the items of a set, kinds in turn; a longer set of a kind begins with the shorter one.
 
     Raises:
         InputError: an unknown kind, sensor or split, or numbers out of range.
@@ -115,7 +239,7 @@ def lookalike_items(recipe: LookalikeRecipe) -> list[LookalikeItem]:
             raise InputError(f"data.pairs.{kind}: {count}: give a number of pairs of {', '.join(LOOKALIKES)}")
     if not any((*recipe.pairs.values(), *recipe.again.values())) or not 0 <= recipe.scaled <= 1:
         raise InputError("data.pairs: give pairs of a kind or more, and data.scaled from 0 to 1")
-    first, last = splits.seeds(recipe.split)
+    first, last = splits.get_seed_range(recipe.split)
     out = []
     both = ((recipe.pairs, False), (recipe.again, True))
     rows = [
@@ -133,33 +257,35 @@ def lookalike_items(recipe: LookalikeRecipe) -> list[LookalikeItem]:
     return out
 
 
-def build_lookalikes(recipe: LookalikeRecipe, sharing: Sharing, say: Say = lambda text: None) -> tuple[list[Path], Report]:
-    """The files of a set, made where they are missing, in the order of their items."""
+def build_lookalikes(
+    recipe: LookalikeRecipe, sharing: BuildSettings, log_line: LogFn = lambda text: None
+) -> tuple[list[Path], BuildReport]:
+    """Build the files of a set, made where they are missing, in the order of their items."""
     check_sharing(sharing)
     folder = Path(sharing.cache).resolve() / "grids"
-    items = lookalike_items(recipe)
+    items = draw_lookalike_items(recipe)
     begin, step = sharing.part
     tasks = [(item, None, str(folder)) for item in items[begin - 1 :: step]]
-    report = build_set(folder.parent / f"{recipe.name}.jsonl", tasks, make_lookalike, sharing, say)
+    report = build_set(folder.parent / f"{recipe.name}.jsonl", tasks, make_lookalike, sharing, log_line)
     return [path for item in items if (path := folder / f"{item.name}.npz").exists()], report
 
 
-def make_lookalike(item: LookalikeItem, given: None, folder: str) -> Row:
+def make_lookalike(item: LookalikeItem, given: None, folder: str) -> BuildRow:
     """Make an item's file."""
-    return make_item(item.name, folder, lambda: lookalike_arrays(item), LONGEST_GRID_PAIR)
+    return make_item(item.name, folder, lambda: build_lookalike_arrays(item), LONGEST_GRID_PAIR)
 
 
-def lookalike_arrays(item: LookalikeItem) -> dict[str, Array]:
-    """The arrays of a pair: places, two days, two scans, and who could tell."""
-    places = draw_places(item.kind, item.furniture, item.seed)
+def build_lookalike_arrays(item: LookalikeItem) -> dict[str, Array]:
+    """Build the arrays of a pair: places, two days, two scans, and who could tell."""
+    places = sample_places(item.kind, item.furniture, item.seed)
     if item.again:
         first, rooms = places.buildings[0], places.visited[0]
         places = replace(places, buildings=(first, first), visited=(rooms, rooms), poses=(), same=True)
     rng = np.random.default_rng([item.seed, item.number, LOOKALIKES.index(item.kind)])
     frames = draw_frames(2, item.scaled, rng)
-    days = [session(building, MONTHS if item.again else DAY, rng) for building in places.buildings]
+    days = [simulate_session(building, MONTHS if item.again else DAY, rng) for building in places.buildings]
     clouds = [
-        scan(day, name, rooms, rng, max(get_sensor(name).spacing, POINT_SPACING), frame=frame)
+        scan_building(day, name, rooms, rng, max(get_sensor(name).spacing, POINT_SPACING), frame=frame)
         for day, name, rooms, frame in zip(days, item.sensors, places.visited, frames, strict=True)
     ]
     truth = frames[0] @ frames[1].inverse()
@@ -168,12 +294,14 @@ def lookalike_arrays(item: LookalikeItem) -> dict[str, Array]:
         f"{item.kind}-{item.seed}", clouds[0], clouds[1], truth if places.same else None, (), 0.0, item.sensors, "procedural",
         f"{item.kind}-{item.seed}", kind,
     )  # fmt: skip
-    arrays = pair_arrays(pair, {"source": "procedural", "set": LOOKALIKES.index(item.kind), "item": item.number})
+    arrays = build_pair_arrays(pair, {"source": "procedural", "set": LOOKALIKES.index(item.kind), "item": item.number})
     about = json.loads(arrays["about"].tobytes())
-    grids = unpacked(item.name, arrays)
-    seen = [seen_columns(g, f, frame.inverse()) for g, f, frame in zip((grids.a, grids.b), grids.free, frames, strict=True)]
-    shown = [Shown(day, columns, name) for day, columns, name in zip(days, seen, item.sensors, strict=True)]
-    about |= _who_tells(shown, places, frames) | _shared(about["common"], seen)
+    grids = unpack_pair(item.name, arrays)
+    seen = [
+        compute_seen_columns(g, f, frame.inverse()) for g, f, frame in zip((grids.a, grids.b), grids.free, frames, strict=True)
+    ]
+    shown = [VisiblePlace(day, columns, name) for day, columns, name in zip(days, seen, item.sensors, strict=True)]
+    about |= _describe_distinguishability(shown, places, frames) | _describe_overlap(about["common"], seen)
     if about["kind"] != "overlap":
         arrays["truth"] = np.full((4, 4), np.nan)
     about |= {"lookalike": item.kind, "furniture": item.furniture, "scaled": item.scaled, "file": f"{item.name}.npz"}
@@ -181,20 +309,20 @@ def lookalike_arrays(item: LookalikeItem) -> dict[str, Array]:
     return arrays
 
 
-def seen_columns(grid: VoxelGrid, free: VoxelGrid | None, back: Sim3) -> Array:
-    """(n, 2) columns of which a map knows anything, m, in the building's coordinates."""
-    points = np.concatenate([grid.centroids(), *([free.centroids()] if free is not None else [])])
+def compute_seen_columns(grid: VoxelGrid, free: VoxelGrid | None, back: Sim3) -> Array:
+    """Compute (n, 2) columns of which a map knows anything, m, in the building's coordinates."""
+    points = np.concatenate([grid.compute_centroids(), *([free.compute_centroids()] if free is not None else [])])
     return np.unique(np.round(back.apply(points)[:, :2], 1), axis=0)
 
 
-def _who_tells(shown: list[Shown], places: Places, frames: list[Sim3]) -> dict[str, Any]:
+def _describe_distinguishability(shown: list[VisiblePlace], places: LookalikePlaces, frames: list[Sim3]) -> dict[str, Any]:
     """Who could tell, by what, and where they are alike."""
-    tellable, amount, pose = judged_poses(shown[0], shown[1], places.poses)
+    tellable, amount, pose = evaluate_poses(shown[0], shown[1], places.poses)
     alike = None if pose is None else (frames[0] @ pose @ frames[1].inverse()).matrix.round(6).tolist()
     return {"tellable": tellable, "amount": amount, "alike": alike, "repeats": places.repeats}
 
 
-def _shared(common: float, seen: list[Array]) -> dict[str, Any]:
+def _describe_overlap(common: float, seen: list[Array]) -> dict[str, Any]:
     """Kind of the pair, and the share of what both maps show of one place; hardly anything is nothing."""
     if common < LEAST_SHARED:
         return {"kind": "lookalike", "overlap": 0.0, "common": 0.0}

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from topomerge.datasets.core.builder import Row, build_set, make_item, refusal
-from topomerge.datasets.pairs.evaluation_pair import anchor
+from topomerge.datasets.core.builder import BuildRow, build_set, make_item, read_refusal
+from topomerge.datasets.pairs.evaluation_pair import compute_anchor
 from topomerge.datasets.pairs.own_truth import NO_OVERLAP, RoomOverlap, find_overlap
 from topomerge.datasets.pairs.pairs_file import (
     PARTS,
@@ -33,20 +33,19 @@ from topomerge.datasets.pairs.pairs_file import (
     read_pairs_file,
 )
 
-from topomerge.code_digest import code_digest
-from topomerge.embedding.graph import graph_arrays
-from topomerge.embedding.schema import POINTS_PER_ROOM
-from topomerge.embedding.sheets import sheet_arrays
+from topomerge.code_digest import compute_code_digest
+from topomerge.embedding.graph import POINTS_PER_ROOM, build_graph_arrays
+from topomerge.embedding.sheets import build_sheet_arrays
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.io import archive
-from topomerge.io.listing import plain
+from topomerge.io.listing import convert_to_plain
 from topomerge.io.maps import load_map, save_map
 from topomerge.io.points import OCTREES, read_chunks
-from topomerge.matching.scores import has_twin
+from topomerge.matching.assignment import has_twin
 from topomerge.types import Array, TopometricMap
 
-Say = Callable[[str], None]
+LogFn = Callable[[str], None]
 OWN_DATA = "folder"  # name of the set on the command line: configs/data/folder.yaml
 OWN_SOURCE, OWN_FOLDER = "own", "own"  # source of the pairs; folder of the cache
 LONGEST_CAPTURE, LONGEST_OWN_PAIR = 7200.0, 600.0  # s
@@ -59,7 +58,7 @@ ATTEMPTS = 100  # draws of captures into parts
 
 @dataclass
 class OwnSharing:
-    """Where and by how many processes sets are made (`core.builder.Sharing`)."""
+    """Where and by how many processes sets are made (`core.builder.BuildSettings`)."""
 
     cache: str
     jobs: int = 1
@@ -131,14 +130,14 @@ def check_own_path(data: str, path: str) -> None:
         raise InputError(f"path={path}: is of data={OWN_DATA}, not of data={data}; name this, or leave the path out")
 
 
-def build_own_sets(path: str | Path, cache: str | Path, jobs: int = 1, say: Say = lambda text: None) -> OwnSets:
+def build_own_sets(path: str | Path, cache: str | Path, jobs: int = 1, log_line: LogFn = lambda text: None) -> OwnSets:
     """Extract the captures of a folder, find the true matches of its pairs, and list the pairs of each part.
 
     Raises:
         InputError: the first thing that is wrong with the folder, in one line.
     """
     listing = read_pairs_file(path)
-    items, faults = extract_captures(listing, cache, jobs, say)
+    items, faults = extract_captures(listing, cache, jobs, log_line)
     if faults:
         raise InputError(f"{listing.path}: {next(iter(faults.values()))}")
     parts, warnings = split_pairs(listing)
@@ -152,15 +151,15 @@ def build_own_sets(path: str | Path, cache: str | Path, jobs: int = 1, say: Say 
     manifests = {part: own / f"{stem}-{part}.jsonl" for part in PARTS}
     for part, of in tasks.items():
         if not manifests[part].exists() or not all((own / "pairs" / f"{task[0].name}.npz").exists() for task in of):
-            build_set(manifests[part], of, make_pair_file, OwnSharing(str(cache), jobs), say)
+            build_set(manifests[part], of, make_pair_file, OwnSharing(str(cache), jobs), log_line)
         _check_part(part, of, manifests[part], listing)
     for text in warnings:
-        say(f"{listing.path}: {text}")
+        log_line(f"{listing.path}: {text}")
     return OwnSets(manifests, warnings)
 
 
 def extract_captures(
-    listing: PairsFile, cache: str | Path, jobs: int = 1, say: Say = lambda text: None
+    listing: PairsFile, cache: str | Path, jobs: int = 1, log_line: LogFn = lambda text: None
 ) -> tuple[dict[str, CaptureItem], dict[str, str]]:
     """Extract the captures that the cache lacks.
 
@@ -168,21 +167,21 @@ def extract_captures(
         Item of each capture by its name; and what is wrong with those that have no map.
     """
     folder = Path(cache).resolve() / OWN_FOLDER / "captures"
-    code = f"{CAPTURE_FORMAT} {code_digest(*CAPTURE_CODE)}"
+    code = f"{CAPTURE_FORMAT} {compute_code_digest(*CAPTURE_CODE)}"
     items: dict[str, CaptureItem] = {}
     tasks = []
     for capture in listing.captures.values():
-        options = json.dumps(plain(dict(capture.read)), sort_keys=True)
+        options = json.dumps(convert_to_plain(dict(capture.read)), sort_keys=True)
         item = CaptureItem(hash_capture(capture), options, listing.voxel_size, code)
         if item not in items.values():
             tasks.append((item, str(capture.path), str(folder)))
         items[capture.name] = item
     if not all((folder / f"{item.name}.npz").exists() for item, _, _ in tasks):
-        build_set(folder.parent / "captures.jsonl", tasks, make_capture, OwnSharing(str(cache), jobs), say, unit="captures")
+        build_set(folder.parent / "captures.jsonl", tasks, make_capture, OwnSharing(str(cache), jobs), log_line, unit="captures")
     faults = {}
     for name, item in items.items():
         if not (folder / f"{item.name}.npz").exists():
-            reason = refusal(folder, item.name) or "took too long or too much memory; see the lines above"
+            reason = read_refusal(folder, item.name) or "took too long or too much memory; see the lines above"
             path = str(listing.captures[name].path)
             faults[name] = reason if path in reason else f"{path}: {reason}"
     return items, faults
@@ -210,7 +209,7 @@ def hash_capture(capture: Capture) -> str:
     return digest.hexdigest()[:24]
 
 
-def make_capture(item: CaptureItem, path: str, folder: str) -> Row:
+def make_capture(item: CaptureItem, path: str, folder: str) -> BuildRow:
     """Make the map and the graph of a capture in a folder."""
 
     def make() -> dict[str, Array]:
@@ -219,7 +218,7 @@ def make_capture(item: CaptureItem, path: str, folder: str) -> Row:
             raise InputError(f"{path}: no rooms come out of it; give a capture that shows floor and walls, or leave it out")
         save_map(map, Path(folder) / f"{item.name}.tmap")
         about = json.dumps({"file": f"{item.name}.npz", "source": path, "rooms": len(map.rooms)}, sort_keys=True)
-        arrays = {**graph_arrays(map, POINTS_PER_ROOM), **sheet_arrays(map)}
+        arrays = {**build_graph_arrays(map, POINTS_PER_ROOM), **build_sheet_arrays(map)}
         return {**arrays, "about": np.frombuffer(about.encode(), np.uint8)}
 
     return make_item(item.name, folder, make, LONGEST_CAPTURE)
@@ -323,7 +322,7 @@ def _negatives(
 def _pair_item(listing: PairsFile, items: Mapping[str, CaptureItem], pair: PairTruth) -> OwnPairItem:
     a, b = listing.captures[pair.a], listing.captures[pair.b]
     apart = pair.different
-    truth = json.dumps(plain({"matrix": pair.matrix, "rooms": pair.rooms}))
+    truth = json.dumps(convert_to_plain({"matrix": pair.matrix, "rooms": pair.rooms}))
     return OwnPairItem(
         captures=(items[a.name].name, items[b.name].name),
         names=(a.name, b.name),
@@ -331,11 +330,11 @@ def _pair_item(listing: PairsFile, items: Mapping[str, CaptureItem], pair: PairT
         building=f"{a.building} + {b.building}" if a.building != b.building else a.building,
         kind=("other-building" if a.building != b.building else "other-storey") if apart else "overlap",
         truth=truth,
-        code=code_digest(__name__),
+        code=compute_code_digest(__name__),
     )
 
 
-def make_pair_file(item: OwnPairItem, given: tuple[PairTruth, str], folder: str) -> Row:
+def make_pair_file(item: OwnPairItem, given: tuple[PairTruth, str], folder: str) -> BuildRow:
     """Make the file of a pair in a folder, with both maps beside it."""
     truth, captures = given
 
@@ -354,7 +353,8 @@ def make_pair_file(item: OwnPairItem, given: tuple[PairTruth, str], folder: str)
 def build_truth_arrays(
     item: OwnPairItem, overlap: RoomOverlap, maps: tuple[TopometricMap, TopometricMap], graphs: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Build the arrays of a pair's file that say what is true (`example.pair_arrays`, `evaluation_pair.evaluation_arrays`)."""
+    """Build the arrays of a pair's file that say what is true (`example.build_pair_arrays`,
+    `evaluation_pair.build_evaluation_arrays`)."""
     sizes = [len(map.rooms) for map in maps]
     matches, pose = overlap.matches, overlap.transform
     arrays: dict[str, Array] = {"matches": matches, "laid": np.zeros((0, 2), np.int64)}
@@ -373,7 +373,7 @@ def build_truth_arrays(
         twin[rooms] = has_twin(graphs[f"{'ba'[k]}.x"][:, TWIN_COLUMNS], matches[:, [k, 1 - k]], rooms)
         arrays |= {f"{side}.true_room": true, f"{side}.true_iou": iou, f"{side}.true_one": one, f"{side}.twin": twin}
     arrays["transform"] = np.full((4, 4), np.nan) if pose is None else pose.matrix
-    arrays["anchor"] = anchor(SimpleNamespace(truth=pose), maps)
+    arrays["anchor"] = compute_anchor(SimpleNamespace(truth=pose), maps)
     partners = [len(set(matches[:, k].tolist())) for k in (0, 1)]
     about = {
         "file": f"{item.name}.npz", "title": "-".join(item.names), "captures": item.names, "source": OWN_SOURCE,
@@ -381,14 +381,16 @@ def build_truth_arrays(
         "overlap": round(sum(partners) / max(sum(sizes), 1), 4), "rooms": "labelled", "extracted": sizes, "partners": partners,
         "scale_free": pose is not None and abs(pose.scale - 1) > 0.03, "points_per_room": POINTS_PER_ROOM,
     }  # fmt: skip
-    text = json.dumps(plain(about), sort_keys=True, ensure_ascii=False)
+    text = json.dumps(convert_to_plain(about), sort_keys=True, ensure_ascii=False)
     return arrays | {"about": np.frombuffer(text.encode(), np.uint8)}
 
 
 def _check_part(part: str, tasks: Sequence[tuple[OwnPairItem, Any, str]], manifest: Path, listing: PairsFile) -> None:
     """Raise InputError for a listed pair that could not be made, or a part in which no rooms match."""
     for item, (pair, _), folder in tasks:
-        reason = "" if (Path(folder) / f"{item.name}.npz").exists() else refusal(Path(folder), item.name) or "could not be made"
+        reason = (
+            "" if (Path(folder) / f"{item.name}.npz").exists() else read_refusal(Path(folder), item.name) or "could not be made"
+        )
         if reason and (pair.listed or NO_OVERLAP not in reason):
             raise InputError(f"{listing.path}: {reason}")
     rows = [json.loads(line) for line in manifest.read_text(encoding="utf-8").splitlines()]
@@ -396,7 +398,9 @@ def _check_part(part: str, tasks: Sequence[tuple[OwnPairItem, Any, str]], manife
         raise InputError(f"{listing.path}: no rooms match in the pairs of {part}; see topomerge dataset check, or change split")
 
 
-def check_folder(path: str | Path, cache: str | Path, jobs: int = 1, say: Say = lambda text: None) -> tuple[list[str], int]:
+def check_folder(
+    path: str | Path, cache: str | Path, jobs: int = 1, log_line: LogFn = lambda text: None
+) -> tuple[list[str], int]:
     """Check the captures and pairs of a folder.
 
     Returns:
@@ -407,7 +411,7 @@ def check_folder(path: str | Path, cache: str | Path, jobs: int = 1, say: Say = 
         InputError: its `pairs.yaml` can't be used at all.
     """
     listing = read_pairs_file(path)
-    items, faults = extract_captures(listing, cache, jobs, say)
+    items, faults = extract_captures(listing, cache, jobs, log_line)
     folder = Path(cache).resolve() / OWN_FOLDER / "captures"
     maps = {name: load_map(folder / f"{item.name}.tmap") for name, item in items.items() if name not in faults}
     try:
@@ -434,4 +438,4 @@ def check_folder(path: str | Path, cache: str | Path, jobs: int = 1, say: Say = 
 
 
 def _hash(value: Any) -> str:
-    return hashlib.sha256(json.dumps(plain(value), sort_keys=True).encode()).hexdigest()[:24]
+    return hashlib.sha256(json.dumps(convert_to_plain(value), sort_keys=True).encode()).hexdigest()[:24]

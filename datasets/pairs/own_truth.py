@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from topomerge.datasets.pairs.evaluation_pair import LAID_IOU, common_area
+from topomerge.datasets.pairs.evaluation_pair import LAID_IOU, measure_common_area
 from topomerge.datasets.pairs.pairs_file import PairTruth
 
 from topomerge.errors import InputError
-from topomerge.matching.consistency import hypotheses, matches_under
-from topomerge.matching.room_plans import room_plans
-from topomerge.types import Array, Sim3, TopometricMap, between_maps
+from topomerge.matching.consistency import find_matches, propose_hypotheses
+from topomerge.matching.room_plans import build_room_plans
+from topomerge.types import Array, Sim3, TopometricMap, convert_pose_to_maps
 
 LEAST_COMMON = 1.0  # m2 that both captures of a pair see
 MOST_TILT = 3.0  # degrees by which a transform may tip a map over
@@ -45,23 +45,23 @@ def find_overlap(truth: PairTruth, maps: tuple[TopometricMap, TopometricMap]) ->
     """
     if truth.different:
         return RoomOverlap(None, np.zeros((0, 2), np.int64), np.zeros(0), 0.0)
-    plans = (room_plans(maps[0]), room_plans(maps[1]))
+    plans = (build_room_plans(maps[0]), build_room_plans(maps[1]))
     if truth.rooms is not None:
         given = np.array(truth.rooms, np.int64)
         _check_rooms(truth, given, maps)
         pose = find_pose_of_rooms(truth, given, maps)
     else:
         assert truth.matrix is not None
-        pose = find_upright_pose(truth, between_maps(truth.matrix, maps[1].levelling, maps[0].levelling), maps[1])
-    common = common_area(maps, pose)
+        pose = find_upright_pose(truth, convert_pose_to_maps(truth.matrix, maps[1].levelling, maps[0].levelling), maps[1])
+    common = measure_common_area(maps, pose)
     if common < LEAST_COMMON:
-        at = ", ".join(f"{x:.1f}" for x in pose.apply(maps[1].grid.centroids().mean(axis=0)[None])[0])
-        middle = ", ".join(f"{x:.1f}" for x in maps[0].grid.centroids().mean(axis=0))
+        at = ", ".join(f"{x:.1f}" for x in pose.apply(maps[1].grid.compute_centroids().mean(axis=0)[None])[0])
+        middle = ", ".join(f"{x:.1f}" for x in maps[0].grid.compute_centroids().mean(axis=0))
         raise InputError(
             f"{truth.a}, {truth.b}: {NO_OVERLAP} under their truth: b's middle comes to {at}, a's is {middle}; "
             f"correct it, or say different: true"
         )
-    rooms, fit = matches_under(pose, plans)
+    rooms, fit = find_matches(pose, plans)
     if truth.rooms is not None:
         found = {(int(i), int(j)): float(value) for (i, j), value in zip(rooms, fit, strict=True)}
         return RoomOverlap(pose, given, np.array([found.get((i, j), LAID_IOU) for i, j in truth.rooms]), common)
@@ -84,13 +84,13 @@ def find_pose_of_rooms(truth: PairTruth, given: Array, maps: Sequence[Topometric
     a, b = maps
     likeness = np.zeros((len(a.rooms), len(b.rooms)))
     likeness[tuple(given.T)] = 1.0
-    wanted = {(int(i), int(j)) for i, j in given}
-    poses = hypotheses(a, b, 1.0 - likeness, likeness)
-    counts = [len(wanted & {(int(i), int(j)) for i, j in pose.rooms}) for pose in poses]
-    if max(counts, default=0) < AGREEING_ROOMS * len(wanted):
+    requested = {(int(i), int(j)) for i, j in given}
+    poses = propose_hypotheses(a, b, 1.0 - likeness, likeness)
+    counts = [len(requested & {(int(i), int(j)) for i, j in pose.rooms}) for pose in poses]
+    if max(counts, default=0) < AGREEING_ROOMS * len(requested):
         raise InputError(
             f"{truth.a}, {truth.b}: rooms: no pose lays these rooms over each other (at most {max(counts, default=0)} of "
-            f"{len(wanted)}); correct their numbers, or give a transform"
+            f"{len(requested)}); correct their numbers, or give a transform"
         )
     return poses[int(np.argmax(counts))].transform
 
@@ -109,7 +109,7 @@ def find_upright_pose(truth: PairTruth, matrix: Array, b: TopometricMap) -> Sim3
             f"{truth.a}, {truth.b}: transform: tips b over by {tilt:.0f} degrees, and maps stand upright; give a turn about "
             f"the vertical, or tell which axis is up by read: {{up: y}}"
         )
-    middle = b.grid.centroids().mean(axis=0)
+    middle = b.grid.compute_centroids().mean(axis=0)
     turned = Sim3(float(np.arctan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1])), scale=scale)
     x, y, z = (matrix[:3, :3] @ middle + matrix[:3, 3] - turned.apply(middle[None])[0]).tolist()
     return Sim3(turned.yaw, (x, y, z), scale)

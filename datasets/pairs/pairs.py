@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.core.building import Building
-from topomerge.datasets.core.difficulty import Difficulty
-from topomerge.datasets.pairs.parts import share, twin_rooms, two_parts
-from topomerge.datasets.simulation.scanner import scan
-from topomerge.datasets.simulation.session import session
-from topomerge.datasets.simulation.twin_wing import twin_wing
+from topomerge.datasets.core.building import Building, Difficulty
+from topomerge.datasets.pairs.parts import compute_dice, find_twin_rooms, sample_two_parts
+from topomerge.datasets.simulation.scanner import scan_building
+from topomerge.datasets.simulation.session import simulate_session
+from topomerge.datasets.simulation.twin_wing import make_twin_wing
 
 from topomerge.errors import InputError
 from topomerge.types import Array, PointCloud, Sim3
@@ -97,7 +96,7 @@ class Atlas:
 
 
 def is_identity(transform: Sim3) -> bool:
-    """Does a transform move nothing?"""
+    """Return whether a transform moves nothing."""
     shift = max(map(abs, transform.translation))
     return abs(transform.yaw) < 1e-3 and shift < 0.01 and abs(transform.scale - 1) < 1e-3
 
@@ -112,8 +111,8 @@ class PairSettings:
         rooms: of each map, at most.
         scale: b's scale is unknown.
         hard: None, or one of `HARD`: b is another building, another storey with the same plan, or another wing with nearly the
-            same plan (other ends and other furniture, perhaps mirrored: `twin_wing`).
-        over_stairs: walks lead over stairs, where the building has any (`two_parts`).
+            same plan (other ends and other furniture, perhaps mirrored: `make_twin_wing`).
+        over_stairs: walks lead over stairs, where the building has any (`sample_two_parts`).
     """
 
     overlap: float = 0.5
@@ -138,7 +137,7 @@ def make_pair(
     difficulty: Difficulty | None = None,
     source: str = "procedural",
 ) -> Pair:
-    """Two sessions in a building, each scanned along a walk through a connected part of it.
+    """Make two sessions in a building, each scanned along a walk through a connected part of it.
 
     Args:
         rng: generator or seed; the same seed gives the same points.
@@ -150,11 +149,11 @@ def make_pair(
     """
     settings, difficulty = settings or PairSettings(), difficulty or Difficulty()
     rng, sensors, hard = np.random.default_rng(rng), settings.sensors, settings.hard
-    places, visited = visited_places(building, settings, other, rng)
+    places, visited = choose_visited_places(building, settings, other, rng)
     frames = draw_frames(2, settings.scale, rng)
     days = (difficulty, ELSEWHERE if hard == "twin-wing" else difficulty)
     a, b = (
-        scan(session(place, day, rng), sensor, part, rng, frame=frame)
+        scan_building(simulate_session(place, day, rng), sensor, part, rng, frame=frame)
         for place, part, sensor, frame, day in zip(places, visited, sensors, frames, days, strict=True)
     )
     parts = (tuple(visited[0].tolist()), tuple(visited[1].tolist()))
@@ -163,8 +162,8 @@ def make_pair(
         a=a,
         b=b,
         truth=None if hard in ("other-building", "twin-wing") else frames[0] @ frames[1].inverse(),
-        shared=() if hard else seen_by_both(a, b),
-        overlap=0.0 if hard else share(*parts),
+        shared=() if hard else find_common_rooms(a, b),
+        overlap=0.0 if hard else compute_dice(*parts),
         sensors=(sensors[0], sensors[1]),
         source=source,
         building=building.name,
@@ -174,30 +173,30 @@ def make_pair(
     )
 
 
-def seen_by_both(a: PointCloud, b: PointCloud) -> tuple[tuple[int, int], ...]:
-    """(i, i) of the rooms, numbered alike in both maps, of which both have `SEEN_POINTS` points."""
+def find_common_rooms(a: PointCloud, b: PointCloud) -> tuple[tuple[int, int], ...]:
+    """Find (i, i) of the rooms, numbered alike in both maps, of which both have `SEEN_POINTS` points."""
     seen = [np.bincount(c.labels[c.labels >= 0], minlength=len(c.rooms)) >= SEEN_POINTS for c in (a, b) if c.labels is not None]
     return tuple((int(i), int(i)) for i in np.flatnonzero(np.logical_and.reduce(seen)))
 
 
-def visited_places(
+def choose_visited_places(
     building: Building, settings: PairSettings, other: Building | None, rng: np.random.Generator
 ) -> tuple[tuple[Building, Building], tuple[Array, Array]]:
-    """The two buildings of a pair, and the rooms that are visited in each."""
+    """Choose the two buildings of a pair, and the rooms that are visited in each."""
     overlap, rooms, hard = settings.overlap, settings.rooms, settings.hard
     if hard == "other-building":
-        other = other or _another(building)
-        a, b = (two_parts(x, rooms, 1.0, rng)[0] for x in (building, other))
+        other = other or _make_other_building(building)
+        a, b = (sample_two_parts(x, rooms, 1.0, rng)[0] for x in (building, other))
         return (building, other), (a, b)
     if hard == "other-storey":
-        twins = twin_rooms(building)
-        a, b = two_parts(building, rooms, overlap, rng, twins)
+        twins = find_twin_rooms(building)
+        a, b = sample_two_parts(building, rooms, overlap, rng, twins)
         return (building, building), (a, np.array(sorted(twins[i] for i in b.tolist())))
-    parts = two_parts(building, rooms, overlap, rng, over_stairs=settings.over_stairs)
-    return (building, twin_wing(building, rng) if hard == "twin-wing" else building), parts
+    parts = sample_two_parts(building, rooms, overlap, rng, over_stairs=settings.over_stairs)
+    return (building, make_twin_wing(building, rng) if hard == "twin-wing" else building), parts
 
 
-def _another(building: Building) -> Building:
+def _make_other_building(building: Building) -> Building:
     """A building of the same kind from another seed, of the same split: seeds come in pairs there."""
     if building.seed < 0 or not building.kind:
         raise InputError(f"{building.name}: name the other building of the hard negative")

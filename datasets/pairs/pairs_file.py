@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.options import OPTION_NAMES
+from topomerge.io.piece import OPTION_NAMES
 from topomerge.types import Array
 
 PAIRS_FILE = "pairs.yaml"

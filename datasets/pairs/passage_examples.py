@@ -13,17 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from topomerge.datasets.core.builder import Row, Say, Sharing, make_item
-from topomerge.datasets.core.plan import Plan
-from topomerge.datasets.pairs.plan_examples import LONGEST_SCAN, PlanRecipe, build_scans
-from topomerge.datasets.pairs.plan_truth import truth_of
-from topomerge.datasets.pairs.scan_items import PlanItem, draw_item, scan_of_item
-from topomerge.datasets.simulation.scanner import moved
+from topomerge.datasets.core.builder import BuildRow, BuildSettings, LogFn, make_item
+from topomerge.datasets.core.building import Plan
+from topomerge.datasets.pairs.plan_examples import LONGEST_SCAN, PlanItem, PlanRecipe, build_scans, draw_item, simulate_item_scan
+from topomerge.datasets.pairs.plan_truth import compute_plan_truth
+from topomerge.datasets.simulation.scanner import transform_cloud
 
-from topomerge.extraction.extract import gather_evidence, read_navigable
+from topomerge.extraction.extract import EVIDENCE, gather_evidence, read_navigable
 from topomerge.extraction.parameters import PRESETS, DefaultParameters
-from topomerge.extraction.passages import EVIDENCE
-from topomerge.extraction.plans.passages import DOOR_FEATURES, door_features
+from topomerge.extraction.plans.passages import DOOR_FEATURES, compute_door_features
 from topomerge.extraction.segment import GrowingRooms, SegmentedStorey, log_odds, score_by_plan
 from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.io import archive
@@ -41,7 +39,7 @@ class PassageItem(PlanItem):
     @property
     def name(self) -> str:
         """A hash of the inputs and of the version of what is made from them."""
-        return self.named(PASSAGE_FORMAT)
+        return self.compute_name(PASSAGE_FORMAT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +63,12 @@ class PassageExamples:
     building: str = ""
 
 
-def build_passages(recipe: PlanRecipe, sharing: Sharing, say: Say = lambda text: None) -> list[Path]:
+def build_passages(recipe: PlanRecipe, sharing: BuildSettings, log_line: LogFn = lambda text: None) -> list[Path]:
     """The files of a set, made where they are missing, in the order of the seeds."""
-    return build_scans(recipe, "passages", partial(_draw, flat=recipe.flat), make_passage_file, sharing, say)[0]
+    return build_scans(recipe, "passages", partial(_draw, flat=recipe.flat), make_passage_file, sharing, log_line)[0]
 
 
-def make_passage_file(item: PlanItem, plan: Plan | None, folder: str) -> Row:
+def make_passage_file(item: PlanItem, plan: Plan | None, folder: str) -> BuildRow:
     """Make an item's file."""
     return make_item(item.name, folder, lambda: _arrays(item, make_passages(item, plan)), LONGEST_SCAN)
 
@@ -88,9 +86,9 @@ def load_passages(path: Path) -> PassageExamples:
 
 def make_passages(item: PlanItem, plan: Plan | None) -> PassageExamples:
     """The passages of one scan."""
-    made, p, watch = scan_of_item(item, plan), PRESETS["default"], Stopwatch()
+    made, p, watch = simulate_item_scan(item, plan), PRESETS["default"], Stopwatch()
     assert isinstance(p, DefaultParameters)
-    scan, navigable = read_navigable(moved(made.cloud, made.frame), MAP_CELL, p, watch)
+    scan, navigable = read_navigable(transform_cloud(made.cloud, made.frame), MAP_CELL, p, watch)
     found = gather_evidence(scan, navigable, p, watch)
     visited = set(made.visited.tolist())
     rows: list[tuple[Array, float, tuple[float, ...], bool]] = []
@@ -98,7 +96,9 @@ def make_passages(item: PlanItem, plan: Plan | None) -> PassageExamples:
         columns = np.stack(np.meshgrid(*(np.arange(n) for n in storey.segment.shape), indexing="ij"), axis=-1)
         flat = storey.plan.origin + (columns + 0.5) * storey.plan.edge
         places = np.concatenate([flat, storey.plan.floor[..., None]], axis=-1)
-        rows += collect_storey_passages(storey, truth_of(made.building, storey.plan, places, made.frame, made.shift)[0], visited)
+        rows += collect_storey_passages(
+            storey, compute_plan_truth(made.building, storey.plan, places, made.frame, made.shift)[0], visited
+        )
     count, kind = len(rows), "walls" if found.walls is not None else ""
     features, odds, evidence, parted = zip(*rows, strict=True) if rows else ((), (), (), ())
     return PassageExamples(
@@ -132,7 +132,7 @@ def collect_storey_passages(
         for a, b in pairs:
             if room[a] >= 0 and room[b] >= 0 and (room[a] in visited or room[b] in visited):
                 passage, odds = growing.passages[a, b], float(log_odds(np.array(growing.door_probability[a, b])))
-                features = door_features(passage, growing.peak[[a, b]], growing.area[[a, b]])
+                features = compute_door_features(passage, growing.peak[[a, b]], growing.area[[a, b]])
                 rows.append((features, odds, passage.evidence, bool(room[a] != room[b])))
 
     add(list(growing.passages))

@@ -22,14 +22,14 @@ RAISED_WALL = 2.4  # m: to this height its walls are raised
 HUNG_KINDS = ("leaf", "board", "lamp", "beam", "duct")  # in no drawn grid
 
 
-def truth_of(building: Building, plan: StoreyPlan, places: Array, frame: Sim3, shift: Any) -> tuple[Array, Array]:
-    """True room and `TRUE_CLASSES` of each column of a plan."""
+def compute_plan_truth(building: Building, plan: StoreyPlan, places: Array, frame: Sim3, shift: Any) -> tuple[Array, Array]:
+    """Compute true room and `TRUE_CLASSES` of each column of a plan."""
     at = frame.inverse().apply(places.reshape(-1, 3))
     if shift is not None:
         at = at + shift[1][cKDTree(shift[0]).query(at)[1]]
     floors = building.storeys["floor"]
     storey = int(np.argmin(np.abs(floors - np.median(at[:, 2]))))
-    room, truth, low = truth_rasters(building, storey)
+    room, truth, low = rasterize_truth(building, storey)
     ij = np.floor((at[:, 1::-1] - low[::-1]) / RASTER_CELL).astype(np.int64)
     ok = ((ij >= 0) & (ij < room.shape)).all(axis=1)
     of: list[Array] = [np.full(len(at), -1, np.int16), np.full(len(at), TRUE_CLASSES.index("outside"), np.uint8)]
@@ -38,7 +38,7 @@ def truth_of(building: Building, plan: StoreyPlan, places: Array, frame: Sim3, s
     return of[0].reshape(plan.wall.shape), of[1].reshape(plan.wall.shape)
 
 
-def truth_rasters(building: Building, storey: int) -> tuple[Array, Array, Array]:
+def rasterize_truth(building: Building, storey: int) -> tuple[Array, Array, Array]:
     """(rows, columns) true room and index into `TRUE_CLASSES` of a storey, in cells of `RASTER_CELL`, and their origin (m)."""
     floor = building.storeys["floor"][storey]
     rooms = {i: r.polygon for i, r in enumerate(building.rooms) if abs(r.floor - floor) <= LEVEL_TOLERANCE}
@@ -49,7 +49,7 @@ def truth_rasters(building: Building, storey: int) -> tuple[Array, Array, Array]
     for i, polygon in rooms.items():
         fill(room, (polygon - low) / RASTER_CELL, i)
     truth = np.full(room.shape, TRUE_CLASSES.index("outside"), np.uint8)
-    truth[near_mask(room >= 0, WALL_REACH)] = TRUE_CLASSES.index("wall")
+    truth[dilate_mask(room >= 0, WALL_REACH)] = TRUE_CLASSES.index("wall")
     truth[room >= 0] = TRUE_CLASSES.index("inside")
     for door in building.doors[np.abs(building.doors["centre"][:, 2] - floor) <= LEVEL_TOLERANCE]:
         normal = np.array([np.cos(door["direction"]), np.sin(door["direction"])])
@@ -60,23 +60,23 @@ def truth_rasters(building: Building, storey: int) -> tuple[Array, Array, Array]
     return room, truth, low
 
 
-def near_mask(mask: Array, reach: float) -> Array:
-    """Cells of a fine raster that are no further from a mask than this."""
+def dilate_mask(mask: Array, reach: float) -> Array:
+    """Return cells of a fine raster that are no further from a mask than this."""
     return np.asarray(ndimage.distance_transform_edt(~mask) * RASTER_CELL <= reach) if mask.any() else mask
 
 
-def drawn_map(building: Building, visited: Array, rng: np.random.Generator) -> PointCloud:
-    """A grid map of the visited rooms, as robots and draughtsmen make them, its walls raised as those of a file are."""
-    room, truth, low = truth_rasters(building, 0)
+def simulate_grid_map(building: Building, visited: Array, rng: np.random.Generator) -> PointCloud:
+    """Simulate a grid map of the visited rooms, as robots and draughtsmen make them, its walls raised as those of a file are."""
+    room, truth, low = rasterize_truth(building, 0)
     thin = float(rng.uniform(0.1, 0.3))
-    solid = near_mask(np.isin(room, visited), thin) & np.isin(truth, (TRUE_CLASSES.index("wall"), TRUE_CLASSES.index("shut")))
-    free = np.isin(room, visited) | (truth == TRUE_CLASSES.index("doorway")) & near_mask(np.isin(room, visited), 0.3)
+    solid = dilate_mask(np.isin(room, visited), thin) & np.isin(truth, (TRUE_CLASSES.index("wall"), TRUE_CLASSES.index("shut")))
+    free = np.isin(room, visited) | (truth == TRUE_CLASSES.index("doorway")) & dilate_mask(np.isin(room, visited), 0.3)
     legs = rng.random() < 0.6  # a laser sees the legs of tables, a draughtsman the tables
     for thing in building.things[~np.isin(building.things["kind"], HUNG_KINDS)]:
         if thing["centre"][2] - thing["size"][2] / 2 < building.storeys["floor"][0] + DRAWN_HEIGHT:
-            for box in footprints(thing, legs and thing["kind"] in ("desk", "meeting", "dining", "table", "chair")):
+            for box in compute_footprints(thing, legs and thing["kind"] in ("desk", "meeting", "dining", "table", "chair")):
                 fill(solid, (box - low) / RASTER_CELL, 1)
-    solid &= near_mask(np.isin(room, visited), 0.3)
+    solid &= dilate_mask(np.isin(room, visited), 0.3)
     solid |= free & (rng.random(free.shape) < rng.choice([0.0, 0.002]))
     levels = np.arange(0.0, RAISED_WALL + 1e-6, RASTER_CELL)  # as close as files are raised: no cell of a wall stays empty
     walls, floor = ((np.argwhere(m)[:, ::-1] + 0.5) * RASTER_CELL + low for m in (solid, free & ~solid))
@@ -85,8 +85,8 @@ def drawn_map(building: Building, visited: Array, rng: np.random.Generator) -> P
     return PointCloud((points + [0, 0, building.storeys["floor"][0]]).astype(np.float32))
 
 
-def footprints(thing: Any, legs: bool) -> list[Array]:
-    """What stands on the floor: rectangles (4, 2)."""
+def compute_footprints(thing: Any, legs: bool) -> list[Array]:
+    """Compute the footprints of a thing on the floor: rectangles (4, 2)."""
     half = thing["size"][:2] / 2
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
     boxes = [corners * half]

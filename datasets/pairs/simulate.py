@@ -1,4 +1,4 @@
-"""`topomerge simulate`: one or two partial maps of a procedural building as files, with the truth and a picture."""
+"""Simulate partial maps of a procedural building, and draw them."""
 
 from __future__ import annotations
 
@@ -8,14 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Polygon
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.core.building import Building
-from topomerge.datasets.core.difficulty import Difficulty
+from topomerge.datasets.core.building import Building, Difficulty
 from topomerge.datasets.pairs.pairs import ROOMS_A_MAP, Pair, PairSettings, draw_frames, make_pair
-from topomerge.datasets.simulation.scanner import scan
+from topomerge.datasets.simulation.scanner import scan_building
 from topomerge.datasets.simulation.sensors import get_sensor
-from topomerge.datasets.simulation.session import session
-from topomerge.datasets.simulation.walk import part
+from topomerge.datasets.simulation.session import simulate_session
+from topomerge.datasets.simulation.walk import sample_part
 
 from topomerge.errors import InputError
 from topomerge.types import Array, PointCloud, Sim3, TrueRoom
@@ -24,7 +27,7 @@ TRUTH_FORMAT = 1
 Output = tuple[Path, Callable[[Path], None]]
 
 
-def simulate(
+def simulate_maps(
     kind: str = "office",
     seed: int = 7,
     storeys: int = 1,
@@ -59,20 +62,19 @@ def simulate(
         return building, pair, pair.frames[0]
     if hard or scale:
         raise InputError("hard negatives and free scale need two sensors")
-    visited = None if rooms is None else part(building, rooms, rng)
+    visited = None if rooms is None else sample_part(building, rooms, rng)
     (frame,) = draw_frames(1, False, rng)
-    cloud = scan(session(building, None, rng), sensors[0], visited, rng, frame=frame)
+    cloud = scan_building(simulate_session(building, None, rng), sensors[0], visited, rng, frame=frame)
     return building, cloud, frame
 
 
-def outputs(building: Building, made: Pair | PointCloud, frame: Sim3, folder: Path) -> list[Output]:
-    """The files of a simulation, and what writes each."""
-    from topomerge.datasets.pairs.picture import save_picture
+def prepare_outputs(building: Building, made: Pair | PointCloud, frame: Sim3, folder: Path) -> list[Output]:
+    """Return the files of a simulation, and what writes each."""
 
     clouds = {"a": made} if isinstance(made, PointCloud) else {"a": made.a, "b": made.b}
     files: list[Output] = [(folder / f"{name}.ply", partial(save_cloud, cloud)) for name, cloud in clouds.items()]
     files.append((folder / "truth.json", partial(save_truth, building, made, frame)))
-    files.append((folder / "plan.png", partial(save_picture, building, made, frame)))
+    files.append((folder / "plan.png", partial(save_figure, building, made, frame)))
     return files
 
 
@@ -91,21 +93,21 @@ def save_cloud(cloud: PointCloud, path: Path) -> None:
 
 def save_truth(building: Building, made: Pair | PointCloud, frame: Sim3, path: Path) -> None:
     """Write `truth` as JSON."""
-    from topomerge.io.listing import json_text
+    from topomerge.io.listing import format_json
 
-    path.write_text(json_text(truth(building, made, frame)), encoding="utf-8")
+    path.write_text(format_json(describe_truth(building, made, frame)), encoding="utf-8")
 
 
-def truth(building: Building, made: Pair | PointCloud, frame: Sim3) -> dict[str, Any]:
-    """What is true about the files, as plain values; everything of a map is in the frame of its cloud.
+def describe_truth(building: Building, made: Pair | PointCloud, frame: Sim3) -> dict[str, Any]:
+    """Describe the truth of the files, as plain values; everything of a map is in the frame of its cloud.
 
     `T_ab` (4 x 4, row-major) maps points of b into the frame of a; null for maps of two buildings.
     """
-    from topomerge.io.listing import plain
+    from topomerge.io.listing import convert_to_plain
 
     listing: dict[str, Any] = {"format": TRUTH_FORMAT, "building": building.name, "seed": building.seed}
     if isinstance(made, PointCloud):
-        return plain({**listing, "maps": [_map(building, made, frame, "a.ply", ())]})
+        return convert_to_plain({**listing, "maps": [_describe_map(building, made, frame, "a.ply", ())]})
     pair, transform = made, made.truth
     assert pair.frames is not None
     listing |= {
@@ -119,13 +121,15 @@ def truth(building: Building, made: Pair | PointCloud, frame: Sim3) -> dict[str,
     }
     b = None if pair.kind == "other-building" else building  # the doors of another building are not at hand
     maps = [
-        _map(building, pair.a, pair.frames[0], "a.ply", pair.visited[0]),
-        _map(b, pair.b, pair.frames[1], "b.ply", pair.visited[1]),
+        _describe_map(building, pair.a, pair.frames[0], "a.ply", pair.visited[0]),
+        _describe_map(b, pair.b, pair.frames[1], "b.ply", pair.visited[1]),
     ]
-    return plain({**listing, "maps": maps})
+    return convert_to_plain({**listing, "maps": maps})
 
 
-def _map(building: Building | None, cloud: PointCloud, frame: Sim3, name: str, visited: tuple[int, ...]) -> dict[str, Any]:
+def _describe_map(
+    building: Building | None, cloud: PointCloud, frame: Sim3, name: str, visited: tuple[int, ...]
+) -> dict[str, Any]:
     place, _, sensor = cloud.source.rpartition(":")
     return {
         "file": name,
@@ -133,16 +137,115 @@ def _map(building: Building | None, cloud: PointCloud, frame: Sim3, name: str, v
         "sensor": sensor,
         "points": len(cloud),
         "visited": visited or None,
-        "rooms": [_room(i, room) for i, room in enumerate(cloud.rooms)],
-        "doors": [] if building is None else [_door(d, frame) for d in building.doors],
+        "rooms": [_describe_room(i, room) for i, room in enumerate(cloud.rooms)],
+        "doors": [] if building is None else [_describe_door(d, frame) for d in building.doors],
     }
 
 
-def _room(i: int, room: TrueRoom) -> dict[str, Any]:
+def _describe_room(i: int, room: TrueRoom) -> dict[str, Any]:
     entry = {"id": i, "name": room.name, "kind": room.kind, "storey": room.storey}
     return entry | {"floor": round(room.floor, 4), "ceiling": round(room.ceiling, 4), "polygon": room.polygon.round(4)}
 
 
-def _door(door: Array, frame: Sim3) -> dict[str, Any]:
+def _describe_door(door: Array, frame: Sim3) -> dict[str, Any]:
     size = {"width": round(float(door["width"] * frame.scale), 4), "height": round(float(door["height"] * frame.scale), 4)}
     return {"rooms": door["rooms"], "centre": frame.apply(door["centre"][None])[0].round(4), **size, "state": str(door["state"])}
+
+
+ONLY_A, ONLY_B, BOTH, NEITHER, OUTLINE_INK = "#aaccee", "#f3c0a5", "#b5dca9", "#f4f4f4", "#555555"
+COLOURS = ("#1f5fa8", "#c2410c")  # points and walk of a and of b
+DRAWN_POINTS = 60_000  # of a cloud, drawn
+SLICE = (0.3, 2.0)  # m above the floor: walls and furniture
+WIDEST = 1600  # pixels
+
+
+def save_figure(building: Building, made: Pair | PointCloud, frame: Sim3, path: Path, dpi: int = 100) -> None:
+    """Write `picture` as PNG; the same maps give the same file."""
+    plot_maps(building, made, frame).savefig(path, format="png", dpi=dpi, metadata={"Software": None})
+
+
+def plot_maps(building: Building, made: Pair | PointCloud, frame: Sim3) -> Figure:
+    """Draw each storey that a map visits in the frame of the building; maps of two buildings stand side by side."""
+    if isinstance(made, PointCloud):
+        every = tuple(i for i, r in enumerate(building.rooms) if r.kind != "lift")
+        panels = _list_panels(building.rooms, [(made, frame, every, 0)])
+        title = f"{made.source}: {len(building.rooms)} rooms"
+    else:
+        assert made.frames is not None
+        sides = [(made.a, made.frames[0], made.visited[0], 0), (made.b, made.frames[1], made.visited[1], 1)]
+        if made.kind == "overlap":
+            panels = _list_panels(building.rooms, sides)
+        else:
+            panels = [p for side in sides for p in _list_panels(_transform_rooms(side[0], side[1]), [side])]
+        title = f"{made.name}: {100 * made.overlap:.0f} % of rooms in common"
+    return _draw(panels, title, len({side[3] for p in panels for side in p[2]}))
+
+
+def _transform_rooms(cloud: PointCloud, frame: Sim3) -> tuple[TrueRoom, ...]:
+    """The rooms of a cloud in the frame of its building."""
+    from topomerge.datasets.simulation.scanner import transform_cloud
+
+    return transform_cloud(cloud, frame.inverse()).rooms
+
+
+def _list_panels(rooms: tuple[TrueRoom, ...], sides: list[Any]) -> list[Any]:
+    """(rooms, storey, sides) of each storey that is visited."""
+    storeys = sorted({rooms[i].storey for side in sides for i in side[2]})
+    return [(rooms, storey, sides) for storey in storeys]
+
+
+def _draw(panels: list[Any], title: str, maps: int) -> Figure:
+    spans = [np.ptp(np.concatenate([r.polygon for r in rooms if r.storey == k]), axis=0) for rooms, k, _ in panels]
+    width, height = np.max(spans, axis=0) + 2.0
+    columns = 1 if width > 2 * height else min(len(panels), 2 if width > 0.6 * height else 3)
+    rows = -(-len(panels) // columns)
+    inches = min(14.0 / (columns * width), 10.0 / (rows * height))
+    figure = Figure(figsize=(max(columns * width * inches, 5.0), rows * height * inches + 0.9), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax, (rooms, storey, sides) in zip(axes, panels, strict=False):
+        _draw_storey(ax, rooms, storey, sides)
+    for ax in axes[len(panels) :]:
+        ax.set_axis_off()
+    figure.suptitle(title, fontsize=11)
+    fills = [(ONLY_A, "visited by a"), (ONLY_B, "visited by b"), (BOTH, "visited by both"), (NEITHER, "not visited")]
+    fills = fills if maps == 2 else [fills[0], fills[3]]
+    lines = [(COLOURS[k], f"walls and walk of {'ab'[k]}") for k in range(maps)]
+    handles = [Patch(facecolor=c, edgecolor=OUTLINE_INK, label=t) for c, t in [*fills, *lines]]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=8, frameon=False)
+    return figure
+
+
+def _draw_storey(ax: Axes, rooms: tuple[TrueRoom, ...], storey: int, sides: list[Any]) -> None:
+    here = [i for i, room in enumerate(rooms) if room.storey == storey]
+    for i in here:
+        by = {side[3] for side in sides if i in side[2]}
+        colour = BOTH if len(by) == 2 else NEITHER if not by else (ONLY_A, ONLY_B)[by.pop()]
+        ax.add_patch(Polygon(rooms[i].polygon, facecolor=colour, edgecolor=OUTLINE_INK, linewidth=0.8))
+        x, y = rooms[i].polygon.mean(axis=0).tolist()
+        ax.annotate(str(i), (x, y), fontsize=7, ha="center", va="center", color=OUTLINE_INK)
+    floor = min(rooms[i].floor for i in here)
+    above = min((r.floor for r in rooms if r.floor > floor + 1.0), default=floor + 20.0)
+    for cloud, frame, _, which in sides:
+        back = frame.inverse()
+        step = max(len(cloud) // (4 * DRAWN_POINTS), 1)
+        points = back.apply(cloud.points[::step])
+        height = points[:, 2] - floor
+        walls = points[(height > SLICE[0]) & (height < SLICE[1])][:, :2]
+        ax.plot(*walls[:: max(len(walls) // DRAWN_POINTS, 1)].T, ",", color=COLOURS[which], alpha=0.35, zorder=3, rasterized=True)
+        if cloud.poses is not None:
+            _draw_walk(ax, back.apply(cloud.poses[:, :3, 3]), floor, above, COLOURS[which])
+    corners = np.concatenate([rooms[i].polygon for i in here])
+    (left, bottom), (right, top) = corners.min(axis=0) - 1, corners.max(axis=0) + 1
+    ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", title=f"storey {storey}")
+    ax.tick_params(labelsize=7)
+
+
+def _draw_walk(ax: Axes, at: Array, floor: float, above: float, colour: str) -> None:
+    """The positions of the sensor on this storey; a line joins those of one round."""
+    here = (at[:, 2] > floor) & (at[:, 2] < above + 0.2)
+    far = np.linalg.norm(np.diff(at, axis=0), axis=1) > 1.0  # a surveyor with a tripod leaves no line
+    pieces = np.split(np.where(here[:, None], at, np.nan), np.flatnonzero(far) + 1)
+    for piece in pieces:
+        ax.plot(piece[:, 0], piece[:, 1], "-", color=colour, linewidth=1.0, alpha=0.8, zorder=4)
+    ax.plot(at[here, 0], at[here, 1], ".", color=colour, markersize=3.0, zorder=5)

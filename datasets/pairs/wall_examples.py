@@ -1,14 +1,10 @@
-"""Walls unrolled as the extraction sees them, with what is truly in them: what the network of elevations learns from.
-
-Scans of procedural buildings and of real plans of the split, by every sensor that sees whole walls, at the spacing of its points
-or finer; doors have frames and handles or none, and stand anywhere in their walls. A file holds the walls of one scan. A set may
-be of slices and grid maps instead, which show no walls at heights: of these a file holds the map and its plans alone.
-"""
+"""Walls unrolled as the extraction sees them, with what is truly in them."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,36 +12,107 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
-from topomerge.datasets.buildings.erect import erect
+from topomerge.datasets.buildings.construction import build_building
+from topomerge.datasets.buildings.layouts import BUILDING_KINDS
+from topomerge.datasets.buildings.openings import list_windows
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.buildings.profiles import BUILDING_KINDS
-from topomerge.datasets.core.builder import Report, Row, Say, Sharing, make_item
-from topomerge.datasets.core.building import Building
-from topomerge.datasets.core.plan import Plan
-from topomerge.datasets.pairs.degrade import taken
-from topomerge.datasets.pairs.flat import keys, squares
-from topomerge.datasets.pairs.items import digest
-from topomerge.datasets.pairs.plan_examples import LONGEST_SCAN, PlanRecipe, build_scans
-from topomerge.datasets.pairs.plan_truth import drawn_map
-from topomerge.datasets.pairs.scan_items import PlanItem, Plans, draw_difficulty, scanned
-from topomerge.datasets.pairs.wall_truth import true_classes
-from topomerge.datasets.simulation.scanner import moved, scan
-from topomerge.datasets.simulation.sensors import get_sensor
-from topomerge.datasets.simulation.spoils import drift_between, exact_sensor
-from topomerge.datasets.simulation.walk import part
+from topomerge.datasets.core.builder import BuildReport, BuildRow, BuildSettings, LogFn, make_item
+from topomerge.datasets.core.building import Building, Plan
+from topomerge.datasets.pairs.flat_maps import compute_cells, encode_rows
+from topomerge.datasets.pairs.items import compute_plan_digest, select_points
+from topomerge.datasets.pairs.plan_examples import (
+    LONGEST_SCAN,
+    PlanItem,
+    PlanRecipe,
+    Plans,
+    build_scans,
+    draw_difficulty,
+    scan_with_drift,
+)
+from topomerge.datasets.pairs.plan_truth import simulate_grid_map
+from topomerge.datasets.simulation.scanner import scan_building, transform_cloud
+from topomerge.datasets.simulation.sensors import get_sensor, measure_drift, remove_sensor_drift
+from topomerge.datasets.simulation.walk import sample_part
 
 from topomerge.errors import InputError
-from topomerge.extraction.elevations.elevation import DEPTHS, FACE_DTYPE, STRIP_CHANNELS, Elevations
+from topomerge.extraction.elevations.elevation import ALONG, DEPTHS, FACE_DTYPE, STRIP_CHANNELS, WALL_CLASSES, Elevations
 from topomerge.extraction.extract import cut_rooms, read_navigable
 from topomerge.extraction.parameters import PRESETS, DefaultParameters
 from topomerge.extraction.plans.storey_plan import ClassifiedStorey
 from topomerge.extraction.scan import FINE_CELL
 from topomerge.extraction.stopwatch import Stopwatch
-from topomerge.extraction.topology import topometric_map
+from topomerge.extraction.topology import build_topometric_map
 from topomerge.extraction.voxels import voxelise
 from topomerge.io import archive
-from topomerge.io.listing import plain
+from topomerge.io.listing import convert_to_plain
 from topomerge.types import ROOM_DTYPE, Array, PointCloud, Sim3, TopometricMap, VoxelGrid
+
+CUPBOARDS = ("shelf", "cabinet", "wardrobe", "kitchen", "locker")  # kinds of furniture that stand before walls
+LEAST_CUPBOARD = 0.75  # m, height
+IN_ROOM = 0.1  # m behind a face, at most, is the front of what stands in its room
+DEEP = 0.3  # m beside a wall's middle: a strip there is of that wall
+ASKEW = 0.26  # sine of the angle between a wall and a strip along it
+SAME_FLOOR = 0.6  # m between floors of one storey
+DOOR_STATES = {"open": ("open", "none"), "half": ("half",), "shut": ("shut",)}  # of each class
+
+
+def compute_true_classes(building: Building, walls: Elevations, frame: Sim3, shift: tuple[Array, Array] | None) -> Array:
+    """Compute (n,) uint8 index into `WALL_CLASSES` of each place along the walls.
+
+    Args:
+        frame: of the map in which the walls are.
+        shift: places of the building that drift bent, and what undoes it there (None: none did).
+    """
+    truth = np.zeros(int(walls.first[-1]), np.uint8)
+    if not len(truth):
+        return truth
+    place = np.arange(len(truth)) - np.repeat(walls.first[:-1], np.diff(walls.first))
+    face = walls.faces[np.repeat(np.arange(len(walls.faces)), np.diff(walls.first))]
+    at = face["start"] + (place + 0.5)[:, None] * ALONG * face["along"]
+    beside = (at, at + 0.01 * face["along"], at + 0.01 * face["out"])
+    ends = [frame.inverse().apply(np.column_stack([p, face["floor"]])) for p in beside]
+    if shift is not None:
+        undone = shift[1][cKDTree(shift[0]).query(ends[0])[1]]
+        ends = [p + undone for p in ends]
+    at, along, out = ends[0], (ends[1] - ends[0])[:, :2] / 0.01, (ends[2] - ends[0])[:, :2] / 0.01
+    holes_of = {"cupboard": list_cupboards(building), "niche": list_niches(building), "window": list_windows(building)}
+    holes_of |= {name: _list_doors(building, states) for name, states in DOOR_STATES.items()}
+    for name, holes in holes_of.items():
+        for x, y, z, direction, width, thickness in holes:
+            normal = np.array([np.cos(direction), np.sin(direction)])
+            off = at[:, :2] - (x, y)
+            across, aside = np.abs(off @ normal), np.abs(off @ (-normal[1], normal[0]))
+            within = (across < thickness / 2 + DEEP) & (aside < width / 2) & (np.abs(along @ normal) < ASKEW)
+            if name == "niche":  # the wall's other face does not show it
+                within &= out @ normal > 0
+            elif name == "cupboard":  # nor what stands behind the wall
+                within &= -(off * out).sum(axis=1) < thickness / 2 + IN_ROOM
+            truth[within & (np.abs(at[:, 2] - z) < SAME_FLOOR)] = WALL_CLASSES.index(name)
+    return truth
+
+
+def list_cupboards(building: Building) -> Sequence[tuple[float, ...]]:
+    """List, as `_doors`, the furniture that stands before walls and is as high as a table or higher."""
+    things = building.things
+    tall = np.isin(things["kind"], CUPBOARDS) & (things["size"][:, 2] >= LEAST_CUPBOARD)
+    rows = []
+    for thing in things[tall]:
+        x, y, z = thing["centre"].tolist()
+        wide, deep, high = thing["size"].tolist()
+        rows.append((x, y, z - high / 2, float(thing["yaw"]) + np.pi / 2, wide, deep))
+    return rows
+
+
+def list_niches(building: Building) -> Sequence[tuple[float, ...]]:
+    """List, as `_doors`, the recesses of walls."""
+    return [(*n["centre"].tolist(), float(n["direction"]), float(n["width"]), float(n["depth"])) for n in building.niches]
+
+
+def _list_doors(building: Building, states: Sequence[str]) -> Sequence[tuple[float, ...]]:
+    """Middle on the floor (m), direction of the normal (rad), width and thickness (m) of the doors that stand so."""
+    doors = building.doors[np.isin(building.doors["state"], states)]
+    return [(*d["centre"].tolist(), *(float(d[k]) for k in ("direction", "width", "thickness"))) for d in doors]
+
 
 WALL_FORMAT = 8  # raise it when the same item gives other bytes: it is part of the files' names
 SOURCE_SHARES = {"procedural": 0.6, "r2v": 0.25, "campus": 0.15}
@@ -78,7 +145,9 @@ class WallItem(PlanItem):
     @property
     def name(self) -> str:
         """A hash of the inputs and of the version of what is made from them."""
-        return hashlib.sha256(json.dumps(["walls", WALL_FORMAT, plain(asdict(self))], sort_keys=True).encode()).hexdigest()[:24]
+        return hashlib.sha256(
+            json.dumps(["walls", WALL_FORMAT, convert_to_plain(asdict(self))], sort_keys=True).encode()
+        ).hexdigest()[:24]
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,13 +182,15 @@ class WallExample:
         return Elevations(self.faces, self.first, (self.strips / np.float32(255)).astype(np.float32))
 
 
-def build_walls(recipe: PlanRecipe, sharing: Sharing, say: Say = lambda text: None) -> tuple[list[Path], Report]:
-    """The files of a set, made where they are missing, in the order of the seeds."""
-    return build_scans(recipe, "walls", partial(draw_wall_item, recipe=recipe), make_wall_file, sharing, say)
+def build_walls(
+    recipe: PlanRecipe, sharing: BuildSettings, log_line: LogFn = lambda text: None
+) -> tuple[list[Path], BuildReport]:
+    """Build the files of a set, made where they are missing, in the order of the seeds."""
+    return build_scans(recipe, "walls", partial(draw_wall_item, recipe=recipe), make_wall_file, sharing, log_line)
 
 
 def draw_wall_item(seed: int, plans: Plans, recipe: PlanRecipe) -> WallItem:
-    """The item of a seed; `make_walls` draws the same numbers again."""
+    """Draw the item of a seed; `make_walls` draws the same numbers again."""
     rng = np.random.default_rng([seed, 7])
     sparse, frameless = (np.random.default_rng([seed, k]).random() for k in (9, 11))
     kind = recipe.flat, bool(sparse < recipe.sparse), bool(frameless < recipe.frameless)
@@ -128,16 +199,16 @@ def draw_wall_item(seed: int, plans: Plans, recipe: PlanRecipe) -> WallItem:
     if not entries:
         return WallItem(seed, "procedural", 0, "", "", *kind)
     name, plan = entries[int(rng.integers(len(entries)))]
-    return WallItem(seed, source, len(entries), name, digest((plan,)), *kind)
+    return WallItem(seed, source, len(entries), name, compute_plan_digest((plan,)), *kind)
 
 
-def make_wall_file(item: WallItem, plan: Plan | None, folder: str) -> Row:
+def make_wall_file(item: WallItem, plan: Plan | None, folder: str) -> BuildRow:
     """Make an item's file."""
-    return make_item(item.name, folder, lambda: wall_arrays(item, make_walls(item, plan)), LONGEST_SCAN)
+    return make_item(item.name, folder, lambda: build_wall_arrays(item, make_walls(item, plan)), LONGEST_SCAN)
 
 
-def wall_arrays(item: WallItem, example: WallExample) -> dict[str, Array]:
-    """The arrays of a file."""
+def build_wall_arrays(item: WallItem, example: WallExample) -> dict[str, Array]:
+    """Build the arrays of a file."""
     about = {"file": f"{item.name}.npz", **asdict(item), "sources": [example.source]}
     arrays: dict[str, Any] = {name: getattr(example, name) for name in WALL_ARRAYS}
     arrays |= {f"map.{name}": getattr(example.map, name) for name in MAP_ARRAYS}
@@ -151,14 +222,14 @@ def wall_arrays(item: WallItem, example: WallExample) -> dict[str, Array]:
 
 
 def load_walls(path: Path) -> WallExample:
-    """The walls of a file.
+    """Load the walls of a file.
 
     Raises:
         InputError: it is damaged.
     """
     arrays = archive.read(path, "cached walls")
     floor = VoxelGrid.from_cells(arrays["floor.cells"], arrays["floor.origin"], float(arrays["floor.edge"]))
-    grid, none = floor.with_cells(np.zeros((0, 3), np.int32)), np.zeros(0, np.int32)
+    grid, none = floor.replace_cells(np.zeros((0, 3), np.int32)), np.zeros(0, np.int32)
     edges, storeys, room = (arrays[f"map.{name}"] for name in MAP_ARRAYS)
     rooms = np.zeros(len(arrays["rooms.storey"]), ROOM_DTYPE)
     for name in ROOMS_HELD:
@@ -173,7 +244,7 @@ def load_walls(path: Path) -> WallExample:
 
 
 def make_walls(item: WallItem, plan: Plan | None) -> WallExample:
-    """The walls of one scan."""
+    """Make the walls of one scan."""
     seed = item.seed
     rng = np.random.default_rng([seed, 8])
     frames = FRAMELESS if item.frameless else FRAMES
@@ -181,13 +252,15 @@ def make_walls(item: WallItem, plan: Plan | None) -> WallExample:
     if not item.flat:  # what a slice shows of a recess is the same wall elsewhere
         difficulty = replace(difficulty, niches=float(np.random.default_rng([seed, 13]).uniform(0, NICHES)))
     if plan is not None:
-        building = erect([plan], difficulty, rng, f"{item.source}-{seed}")
+        building = build_building([plan], difficulty, rng, f"{item.source}-{seed}")
     else:
         building = make_building(str(rng.choice(BUILDING_KINDS)), seed, 1, difficulty)
-    visited = part(building, int(rng.integers(*ROOMS_VISITED)), rng)
-    name, cloud, shift = _flat(building, visited, seed, rng) if item.flat else _seen(building, visited, item, rng)
+    visited = sample_part(building, int(rng.integers(*ROOMS_VISITED)), rng)
+    name, cloud, shift = (
+        _simulate_flat(building, visited, seed, rng) if item.flat else _simulate_scan(building, visited, item, rng)
+    )
     frame = Sim3(float(rng.uniform(-np.pi, np.pi)))
-    cloud = replace(moved(thinned(cloud, seed) if item.sparse else cloud, frame), rooms=())
+    cloud = replace(transform_cloud(thin_cloud(cloud, seed) if item.sparse else cloud, frame), rooms=())
     p, watch = PRESETS["default"], Stopwatch()
     assert isinstance(p, DefaultParameters)
     scan, navigable = read_navigable(cloud, MAP_CELL, p, watch)
@@ -195,11 +268,11 @@ def make_walls(item: WallItem, plan: Plan | None) -> WallExample:
     if not item.flat:
         scan = replace(scan, fine=scan.grid if coarse else voxelise(cloud, FINE_CELL))
     floor, seen = cut_rooms(scan, navigable, p, watch)
-    map = topometric_map(scan.grid, floor, p.standing_height)
+    map = build_topometric_map(scan.grid, floor, p.standing_height)
     walls = NO_WALLS if seen is None or item.flat else seen.elevations
     if not item.flat and not len(walls.faces):
         raise InputError(f"{seed}: no wall was seen")
-    strips, truth = np.rint(255 * walls.strips).astype(np.uint8), true_classes(building, walls, frame, shift)
+    strips, truth = np.rint(255 * walls.strips).astype(np.uint8), compute_true_classes(building, walls, frame, shift)
     doors = building.doors["centre"]
     if shift is not None:
         doors = doors - shift[1][cKDTree(shift[0] + shift[1]).query(doors)[1]]
@@ -207,33 +280,33 @@ def make_walls(item: WallItem, plan: Plan | None) -> WallExample:
     return WallExample(walls.first, strips, truth, frame.apply(doors), map, floor.classified_storeys, walls.faces, source)
 
 
-def _flat(building: Building, visited: Array, seed: int, rng: np.random.Generator) -> tuple[str, PointCloud, Any]:
+def _simulate_flat(building: Building, visited: Array, seed: int, rng: np.random.Generator) -> tuple[str, PointCloud, Any]:
     """As `_seen`, by a 2D laser or as a grid map."""
     if rng.random() >= SLICE_SHARE:
-        return "drawn", drawn_map(building, visited, rng), None
-    cloud, shift = scanned(building, "laser2d", visited, rng, seed)
+        return "drawn", simulate_grid_map(building, visited, rng), None
+    cloud, shift = scan_with_drift(building, "laser2d", visited, rng, seed)
     return "laser2d", cloud if rng.random() < POSED_SHARE else replace(cloud, poses=None, pose_of=None), shift
 
 
-def _seen(building: Building, visited: Array, item: WallItem, rng: np.random.Generator) -> tuple[str, PointCloud, Any]:
+def _simulate_scan(building: Building, visited: Array, item: WallItem, rng: np.random.Generator) -> tuple[str, PointCloud, Any]:
     """How a building was seen, its cloud, and places of it with what undoes its drift there (None: it has none)."""
     sensor, seed = get_sensor(str(rng.choice(list(SENSOR_SHARES), p=list(SENSOR_SHARES.values())))), item.seed
     if seed % DRAWN_EVERY == DRAWN_EVERY - 1:
-        return "drawn", drawn_map(building, visited, rng), None
+        return "drawn", simulate_grid_map(building, visited, rng), None
     if rng.random() < EXACT_SHARE:
         sensor = replace(sensor, drift=0.0, tilt=0.0)
     spacing = sensor.spacing * float(rng.uniform(*FINER))
-    cloud = scan(building, sensor, visited, np.random.default_rng(seed), spacing)
+    cloud = scan_building(building, sensor, visited, np.random.default_rng(seed), spacing)
     if not sensor.drift:
         return sensor.name, cloud, None
-    straight = scan(building, exact_sensor(sensor), visited, np.random.default_rng(seed), budget=8)
-    return sensor.name, cloud, drift_between(cloud, straight)
+    straight = scan_building(building, remove_sensor_drift(sensor), visited, np.random.default_rng(seed), budget=8)
+    return sensor.name, cloud, measure_drift(cloud, straight)
 
 
-def thinned(cloud: PointCloud, seed: int) -> PointCloud:
-    """A cloud that lost most of its points: by chance, or one stays in a cell of a grid, as files are made smaller."""
+def thin_cloud(cloud: PointCloud, seed: int) -> PointCloud:
+    """Return a cloud that lost most of its points: by chance, or one stays in a cell of a grid, as files are made smaller."""
     rng = np.random.default_rng([seed, 10])
     if rng.random() < LOST_BY_CHANCE:
-        return taken(cloud, rng.random(len(cloud)) < np.exp(rng.uniform(*np.log(SHARE_LEFT))))
-    cells = keys(squares(cloud.points, float(rng.uniform(*SPACING_LEFT))))[0]
-    return taken(cloud, np.sort(np.unique(cells, return_index=True)[1]))
+        return select_points(cloud, rng.random(len(cloud)) < np.exp(rng.uniform(*np.log(SHARE_LEFT))))
+    cells = encode_rows(compute_cells(cloud.points, float(rng.uniform(*SPACING_LEFT))))[0]
+    return select_points(cloud, np.sort(np.unique(cells, return_index=True)[1]))

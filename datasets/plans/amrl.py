@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
-from topomerge.datasets.plans.raster import add_contacts, add_rooms, contacts, flood, guess_kinds
+from topomerge.datasets.plans.raster import add_contacts, add_rooms, find_contacts, flood, guess_kinds
 from topomerge.datasets.plans.sketch import Sketch, read_limited
 
 from topomerge.errors import InputError
@@ -29,29 +29,29 @@ LINE_MAP_REACH = 1e9  # m from the origin that a wall may be
 LINE_MAP_BYTES, LINE_MAP_CELLS = 50 << 20, 50_000_000
 
 
-def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
+def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     """Name and maker of the one storey."""
-    yield path.name.removesuffix(".vectormap.json"), partial(sketch, read_limited(path, LINE_MAP_BYTES))
+    yield path.name.removesuffix(".vectormap.json"), partial(parse_sketch, read_limited(path, LINE_MAP_BYTES))
 
 
-def sketch(text: bytes) -> Sketch:
+def parse_sketch(text: bytes) -> Sketch:
     """One storey.
 
     Raises:
         InputError: no JSON, or not a list of segments; larger than 350 m across; walls that enclose nothing.
     """
-    lines = _segments(text)
-    wall, origin = _drawn(lines)
+    lines = _parse_segments(text)
+    wall, origin = _rasterize_walls(lines)
     distance = ndimage.distance_transform_edt(~wall) * LINE_MAP_CELL
-    free = ~wall & _inside(distance)
+    free = ~wall & _find_inside(distance)
     seeds = ndimage.label(free & (distance > DOOR_GAP / 2))[0].astype(np.int32)
     labels = flood(seeds, free, np.round(distance / LINE_MAP_CELL))
-    labels[np.isin(labels, _outdoor(labels, free, wall))] = 0
+    labels[np.isin(labels, _find_outdoor_regions(labels, free, wall))] = 0
     result = Sketch(height=3.6, ceiling=2.8, inset=0.02)
     index = add_rooms(result, labels, {}, LINE_MAP_CELL, origin, SMALLEST_LINE_ROOM, LINE_MAP_CAVITY / 2)
     if not index:
         raise InputError("not closed: the walls enclose no room")
-    for a, b, ends in contacts(labels, LINE_MAP_CELL, origin):
+    for a, b, ends in find_contacts(labels, LINE_MAP_CELL, origin):
         along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
         add_contacts(
             result, [(a, b, ends + np.stack([-along, along]) * LINE_MAP_CELL)], index, "door"
@@ -60,7 +60,7 @@ def sketch(text: bytes) -> Sketch:
     return result
 
 
-def _segments(text: bytes) -> Array:
+def _parse_segments(text: bytes) -> Array:
     """(n, 2, 2), m."""
     try:
         loaded = json.loads(text)
@@ -75,21 +75,21 @@ def _segments(text: bytes) -> Array:
     return lines
 
 
-def _inside(distance: Array) -> Array:
+def _find_inside(distance: Array) -> Array:
     """(h, w) bool: the building, after closing gaps of up to `FRONT_GAP` in its outer walls (glass is often not in the map)."""
     closed = ndimage.binary_fill_holes(distance <= FRONT_GAP / 2)
     inside: Array = ndimage.distance_transform_edt(closed) * LINE_MAP_CELL > FRONT_GAP / 2
     return inside
 
 
-def _outdoor(labels: Array, free: Array, wall: Array) -> Array:
+def _find_outdoor_regions(labels: Array, free: Array, wall: Array) -> Array:
     """Labels of corners between two wings: regions that end without a wall for longer than they are wide."""
     edge = ndimage.binary_dilation(~free & ~wall) & (labels > 0)
     length, area = (np.bincount(labels[where], minlength=labels.max() + 1) for where in (edge, labels > 0))
     return np.flatnonzero(length > 1.2 * np.sqrt(area))
 
 
-def _drawn(lines: Array) -> tuple[Array, Array]:
+def _rasterize_walls(lines: Array) -> tuple[Array, Array]:
     """(h, w) bool raster of the walls, and its origin, m."""
     reach = float(np.abs(lines).max())
     if reach > LINE_MAP_REACH:

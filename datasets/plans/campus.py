@@ -16,8 +16,7 @@ from pathlib import Path
 import numpy as np
 import shapely
 import shapely.affinity
-from topomerge.datasets.plans.doors import place_door
-from topomerge.datasets.plans.sketch import Sketch, overlaps, read_limited
+from topomerge.datasets.plans.sketch import Sketch, find_overlaps, place_door, read_limited
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -69,12 +68,12 @@ class _NoDoctype(ElementTree.TreeBuilder):
         raise InputError("not read: XML with a DOCTYPE")
 
 
-def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
+def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     """Name and maker of the one storey of a file."""
-    yield path.stem.removesuffix("_updated"), partial(sketch, read_limited(path, CAMPUS_BYTES))
+    yield path.stem.removesuffix("_updated"), partial(parse_sketch, read_limited(path, CAMPUS_BYTES))
 
 
-def sketch(text: bytes) -> Sketch:
+def parse_sketch(text: bytes) -> Sketch:
     """One storey.
 
     Raises:
@@ -88,33 +87,33 @@ def sketch(text: bytes) -> Sketch:
     if root.tag != "building" or not spaces:
         raise InputError("not a campus plan: expected building/floor/spaces/space")
     result = Sketch(inset=CAMPUS_INSET, height=3.6, ceiling=3.0)
-    shapes = {space.get("id", ""): _shape(space, result) for space in spaces}
-    scale = _scale(root, spaces, shapes, result)
+    shapes = {space.get("id", ""): _parse_shape(space, result) for space in spaces}
+    scale = _estimate_scale(root, spaces, shapes, result)
     indices: dict[str, int] = {}
     for space in spaces:
         key = space.get("id", "")
         if (shape := shapes[key]) is not None:
-            kind, label = _kind(space)[0], (space.findtext("labels/label") or "room").lower()
+            kind, label = _parse_kind(space)[0], (space.findtext("labels/label") or "room").lower()
             larger = shapely.affinity.scale(shape, scale, scale, origin=(0, 0))
             indices[key] = result.add_room(f"{label} {len(indices)}", kind, larger)
     _tidy(result, indices, {s.get("id", ""): not s.findtext("labels/label") for s in spaces})
-    _doors(result, spaces, indices, scale)
+    _add_doors(result, spaces, indices, scale)
     return result
 
 
-def _kind(space: ElementTree.Element) -> tuple[str, float]:
+def _parse_kind(space: ElementTree.Element) -> tuple[str, float]:
     label = space.findtext("labels/label") or ""
     return next((entry for word, entry in CAMPUS_KINDS.items() if word in label), ("office" if label else "", 0))
 
 
-def _points(element: ElementTree.Element, path: str) -> Array:
+def _parse_points(element: ElementTree.Element, path: str) -> Array:
     corners = [(float(p.get("x", "nan")), -float(p.get("y", "nan"))) for p in element.findall(path)]  # y up
     return np.array(corners, float).reshape(-1, 2)
 
 
-def _shape(space: ElementTree.Element, result: Sketch) -> shapely.Polygon | None:
+def _parse_shape(space: ElementTree.Element, result: Sketch) -> shapely.Polygon | None:
     """Outline in pixels; None for helpers without one."""
-    points = _points(space, "bounding_polygon/point")
+    points = _parse_points(space, "bounding_polygon/point")
     label = space.findtext("labels/label")
     if len(np.unique(points, axis=0)) < 3 or not np.isfinite(points).all():
         if label:
@@ -133,7 +132,7 @@ def _shape(space: ElementTree.Element, result: Sketch) -> shapely.Polygon | None
     return best
 
 
-def _scale(
+def _estimate_scale(
     root: ElementTree.Element, spaces: list[ElementTree.Element], shapes: dict[str, shapely.Polygon | None], result: Sketch
 ) -> float:
     """m per pixel: that of the file, or that of usual rooms where they are more than `TRUSTED` apart."""
@@ -143,7 +142,7 @@ def _scale(
     stated = real / drawn / 100
     ratios = []
     for space in spaces:
-        shape, usual = shapes[space.get("id", "")], _kind(space)[1]
+        shape, usual = shapes[space.get("id", "")], _parse_kind(space)[1]
         if shape is not None and usual:
             ratios.append(usual / (shape.area * stated**2))
     factor = float(np.sqrt(np.median(ratios))) if ratios else 1.0
@@ -158,7 +157,7 @@ def _scale(
 def _tidy(result: Sketch, indices: dict[str, int], helper: dict[str, bool]) -> None:
     """Unlabelled helpers that overlap a labelled room go; of two rooms that overlap a little, the larger one gives way."""
     keys = {i: key for key, i in indices.items()}
-    for i, j, share in overlaps(result.shapes):
+    for i, j, share in find_overlaps(result.shapes):
         small, large = sorted((i, j), key=lambda k: result.shapes[k].area)
         if result.shapes[small].is_empty or result.shapes[large].is_empty:
             continue
@@ -180,20 +179,20 @@ def _tidy(result: Sketch, indices: dict[str, int], helper: dict[str, bool]) -> N
     indices.update({key: order[i] for key, i in indices.items()})
 
 
-def _doors(result: Sketch, spaces: list[ElementTree.Element], indices: dict[str, int], scale: float) -> None:
+def _add_doors(result: Sketch, spaces: list[ElementTree.Element], indices: dict[str, int], scale: float) -> None:
     """One door for each portal; marks of the same door from both sides count once."""
     marks: dict[tuple[int, int], list[tuple[Array, str, float]]] = {}
     for space in spaces:
-        lines = {line.get("id"): _points(line, "point") for line in space.findall("space_representation/linesegment")}
+        lines = {line.get("id"): _parse_points(line, "point") for line in space.findall("space_representation/linesegment")}
         for portal in space.findall("portals/portal"):
             ends = [indices.get(target.text or "", -1) for target in portal.findall("target/id")]
             line = lines.get(portal.findtext("linesegment"), np.empty((0, 2)))
             if len(ends) == 2 and min(ends) >= 0 and ends[0] != ends[1] and len(line):
                 pair = (min(ends), max(ends))
-                marks.setdefault(pair, []).append((line.mean(axis=0) * scale, *_door_type(portal)))
+                marks.setdefault(pair, []).append((line.mean(axis=0) * scale, *_parse_door_type(portal)))
     lost = 0
     for (a, b), portals in marks.items():
-        for point, kind, width in _once(portals):
+        for point, kind, width in _remove_duplicates(portals):
             opening = place_door(result.shapes[a], result.shapes[b], width, PORTAL_REACH, point, kind)
             if opening is None or np.hypot(*(np.add(opening.start, opening.end) / 2 - point)) > ASTRAY:
                 lost += 1
@@ -203,13 +202,13 @@ def _doors(result: Sketch, spaces: list[ElementTree.Element], indices: dict[str,
         result.notes.append(f"left out {lost} doors between rooms that do not face each other there")
 
 
-def _door_type(portal: ElementTree.Element) -> tuple[str, float]:
+def _parse_door_type(portal: ElementTree.Element) -> tuple[str, float]:
     if portal.findtext("type") == "IMPLICIT":
         return "opening", CAMPUS_PASSAGE
     return "door", DOUBLE_DOOR if portal.findtext("features") == "DOUBLE" else SINGLE_DOOR
 
 
-def _once(marks: list[tuple[Array, str, float]]) -> list[tuple[Array, str, float]]:
+def _remove_duplicates(marks: list[tuple[Array, str, float]]) -> list[tuple[Array, str, float]]:
     doors: list[tuple[Array, str, float]] = []
     for mark in marks:
         if all(np.hypot(*(mark[0] - other[0])) > SAME_PORTAL for other in doors):

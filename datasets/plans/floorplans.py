@@ -29,8 +29,7 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from topomerge.datasets.core.physical import STRANGERS, named_storey
-from topomerge.datasets.core.plan import Flight, Plan, PlanRoom
+from topomerge.datasets.core.building import STRANGERS, Flight, Plan, PlanRoom, parse_storey_name
 from topomerge.datasets.plans.robot_home import is_robot_home
 from topomerge.datasets.plans.sealed import refuse_file
 from topomerge.datasets.plans.sketch import Sketch, finish
@@ -65,7 +64,7 @@ class Refusal:
 
 
 def read_plans(path: str | Path) -> list[Plan]:
-    """The plans of one file, lowest storey first.
+    """Read the plans of one file, lowest storey first.
 
     Args:
         path: a file; for one plan of an archive, ``archive.tar.xz::name``.
@@ -81,20 +80,20 @@ def read_plans(path: str | Path) -> list[Plan]:
         plans.append(result)
     if not plans:
         raise InputError(f"{path}: no plan in it")
-    return landed(plans)
+    return remove_dead_flights(plans)
 
 
-def landed(plans: list[Plan]) -> list[Plan]:
-    """Storeys, lowest first, without the lifts and stairs that end in no room: rooms that no door reaches are left out."""
+def remove_dead_flights(plans: list[Plan]) -> list[Plan]:
+    """Return storeys, lowest first, without the lifts and stairs that end in no room: rooms that no door reaches are left out."""
     out = []
     for k, plan in enumerate(plans):
         above = plans[k + 1].rooms if k + 1 < len(plans) else ()
-        flights = [f for f in plan.flights if all(_in_room(f, rooms) for rooms in (plan.rooms, above))]
+        flights = [f for f in plan.flights if all(_is_in_room(f, rooms) for rooms in (plan.rooms, above))]
         out.append(replace(plan, flights=tuple(flights)))
     return out
 
 
-def _in_room(flight: Flight, rooms: tuple[PlanRoom, ...]) -> bool:
+def _is_in_room(flight: Flight, rooms: tuple[PlanRoom, ...]) -> bool:
     ahead = np.array([np.cos(flight.heading), np.sin(flight.heading)])
     middle = np.asarray(flight.corner) + ahead * flight.length / 2 + np.array([ahead[1], -ahead[0]]) * flight.width / 2
     return any(shapely.Polygon(room.polygon).contains(shapely.Point(middle)) for room in rooms)
@@ -112,32 +111,32 @@ def iter_plans(folder: str | Path, among: Collection[str] | None = None) -> Iter
     Raises:
         InputError: no such folder.
     """
-    for file, root in _files(Path(folder)):
-        above = partial(_full, file, root)
+    for file, root in _list_files(Path(folder)):
+        above = partial(_build_full_name, file, root)
         for name, result in _read(file, lambda name, above=above: among is None or above(name) in among):  # type: ignore[misc]
             name = above(name)
             yield name, Refusal(name, result.reason) if isinstance(result, Refusal) else result
 
 
-def plan_names(folder: str | Path) -> list[str]:
-    """Names (as of `iter_plans`) of all plans of a folder, also of those that would be refused; no plan is read.
+def list_plan_names(folder: str | Path) -> list[str]:
+    """List names (as of `iter_plans`) of all plans of a folder, also of those that would be refused; no plan is read.
 
     Raises:
         InputError: no such folder.
     """
-    return [_full(file, root, name) for file, root in _files(Path(folder)) for name in _names(file)]
+    return [_build_full_name(file, root, name) for file, root in _list_files(Path(folder)) for name in _list_names(file)]
 
 
-def _files(folder: Path) -> list[tuple[Path, Path]]:
+def _list_files(folder: Path) -> list[tuple[Path, Path]]:
     """Files with plans, and the folder that their names count from."""
     if not folder.exists():
         raise InputError(f"{folder}: no such file or folder")
     if folder.is_file():
         return [(folder, folder.parent)]
-    return [(p, folder) for p in sorted(folder.rglob("*")) if p.is_file() and _reader(p)]
+    return [(p, folder) for p in sorted(folder.rglob("*")) if p.is_file() and _find_reader(p)]
 
 
-def _full(file: Path, root: Path, name: str) -> str:
+def _build_full_name(file: Path, root: Path, name: str) -> str:
     """Path of the folder and name of the plan, without repeating the folder's own name."""
     above = file.parent.relative_to(root)
     if above.name and above.name == name.split("/")[0]:
@@ -145,32 +144,32 @@ def _full(file: Path, root: Path, name: str) -> str:
     return (above / name).as_posix()
 
 
-def siblings(folder: str | Path) -> list[list[str]]:
-    """Names (as of `iter_plans`) of the plans that are storeys of one building, lowest first; single ones are left out.
+def group_siblings(folder: str | Path) -> list[list[str]]:
+    """Return names (as of `iter_plans`) of the plans that are storeys of one building, lowest first; single ones are left out.
 
     Storeys of one file belong together; so do files whose names differ in a storey only: Sabadell1 and Sabadell2, P0 and P1,
     groundfloor and secondfloor, LOWER and MAIN, the folders B1, F1 and F2. Whether their frames and scales agree is up to the
     owner of the plans: those of the campus plans do not.
     """
     groups: dict[tuple[str, str], list[tuple[float, str]]] = {}
-    for file, root in _files(Path(folder)):
-        names = [_full(file, root, name) for name in _names(file)]
-        if len(names) > 1 and _reader(file) in FORMATS_WITH_LEVELS:
+    for file, root in _list_files(Path(folder)):
+        names = [_build_full_name(file, root, name) for name in _list_names(file)]
+        if len(names) > 1 and _find_reader(file) in FORMATS_WITH_LEVELS:
             groups[("", names[0])] = [(k, name) for k, name in enumerate(names)]
         elif len(names) == 1:
             above, _, last = names[0].rpartition("/")
-            base, level = named_storey(last)
+            base, level = parse_storey_name(last)
             if base not in STRANGERS:
                 groups.setdefault((above if base or level else names[0], base), []).append((level, names[0]))
     return sorted([name for _, name in sorted(group)] for group in groups.values() if len(group) > 1)
 
 
-def frame_of(folder: str | Path) -> dict[str, str]:
+def map_plans_to_frames(folder: str | Path) -> dict[str, str]:
     """Plan (named as of `iter_plans`) -> the frame it is in: that of its file or survey, otherwise one of its own."""
     out = {}
-    for file, root in _files(Path(folder)):
-        for name in (_full(file, root, name) for name in _names(file)):
-            reader = _reader(file)
+    for file, root in _list_files(Path(folder)):
+        for name in (_build_full_name(file, root, name) for name in _list_names(file)):
+            reader = _find_reader(file)
             out[name] = (
                 file.as_posix()
                 if reader in FORMATS_WITH_LEVELS
@@ -181,22 +180,22 @@ def frame_of(folder: str | Path) -> dict[str, str]:
     return out
 
 
-def _names(file: Path) -> list[str]:
+def _list_names(file: Path) -> list[str]:
     try:
         refuse_file(file)
-        return [name for name, _ in import_module(f"topomerge.datasets.plans.{_reader(file)}").sketches(file)]
+        return [name for name, _ in import_module(f"topomerge.datasets.plans.{_find_reader(file)}").iter_sketches(file)]
     except Exception:  # refused by `iter_plans`, with the reason
         return []
 
 
 def summarise(results: Iterable[tuple[str, Plan | Refusal] | Refusal]) -> dict[str, int]:
-    """How many plans were refused for which reason, the commonest first; plans among the results count as "taken"."""
+    """Count the refused plans by reason, the commonest first; plans among the results count as "taken"."""
     items = [item[1] if isinstance(item, tuple) else item for item in results]
     words = [item.reason.partition(":")[0] if isinstance(item, Refusal) else "taken" for item in items]
     return dict(Counter(words).most_common())
 
 
-def _reader(path: Path) -> str:
+def _find_reader(path: Path) -> str:
     """Name of the module that reads a file, or nothing."""
     name = path.as_posix()
     if NOT_PLANS.search(name):
@@ -205,9 +204,9 @@ def _reader(path: Path) -> str:
     return "robot_home" if not module and path.suffix == ".json" and is_robot_home(path) else module
 
 
-def _read(path: Path, wanted: Callable[[str], bool] = lambda name: True) -> Iterator[tuple[str, Plan | Refusal]]:
+def _read(path: Path, requested: Callable[[str], bool] = lambda name: True) -> Iterator[tuple[str, Plan | Refusal]]:
     """Name and plan or refusal of each storey of a file."""
-    module = _reader(path)
+    module = _find_reader(path)
     if not module:
         yield path.stem, Refusal(path.stem, f"not a known format: {path.name}")
         return
@@ -216,30 +215,30 @@ def _read(path: Path, wanted: Callable[[str], bool] = lambda name: True) -> Iter
     except InputError as error:
         yield path.stem, Refusal(path.stem, str(error))
         return
-    items: Iterator[tuple[str, Maker]] = import_module(f"topomerge.datasets.plans.{module}").sketches(path)
+    items: Iterator[tuple[str, Maker]] = import_module(f"topomerge.datasets.plans.{module}").iter_sketches(path)
     while True:
         try:
             name, make = next(items)
         except StopIteration:
             return
         except Exception as error:
-            yield path.stem, Refusal(path.stem, _reason(error))
+            yield path.stem, Refusal(path.stem, _format_reason(error))
             return
-        if wanted(name):
-            yield name, _made(name, make)
+        if requested(name):
+            yield name, _build_plan(name, make)
 
 
-def _made(name: str, make: Maker) -> Plan | Refusal:
+def _build_plan(name: str, make: Maker) -> Plan | Refusal:
     try:
         plan, notes = finish(make())
     except Exception as error:
-        return Refusal(name, _reason(error))
+        return Refusal(name, _format_reason(error))
     if notes:
         log.info("%s: %s", name, "; ".join(f"{note} ({n} times)" if n > 1 else note for note, n in Counter(notes).items()))
     return plan
 
 
-def _reason(error: Exception) -> str:
+def _format_reason(error: Exception) -> str:
     if isinstance(error, InputError):
         return " ".join(str(error).split())
     if isinstance(error, FileNotFoundError):

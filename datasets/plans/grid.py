@@ -17,9 +17,8 @@ import numpy as np
 import yaml
 from PIL import Image, ImageDraw
 from scipy import ndimage
-from topomerge.datasets.plans.doors import doorway, place_door
-from topomerge.datasets.plans.raster import DOORWAY_THICKNESS, add_contacts, add_rooms, contacts, flood, guess_kinds
-from topomerge.datasets.plans.sketch import Sketch
+from topomerge.datasets.plans.raster import DOORWAY_THICKNESS, add_contacts, add_rooms, find_contacts, flood, guess_kinds
+from topomerge.datasets.plans.sketch import Sketch, build_opening, place_door
 
 from topomerge.errors import InputError
 from topomerge.io.grid import IMAGE_FORMATS
@@ -36,78 +35,78 @@ DOORS_APART = 1.0  # m between an opening of the map and a door of the list
 MAX_PIXELS = 100_000_000
 
 
-def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
+def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     """Name and maker of the one storey."""
     if path.suffix == ".yaml":
-        yield path.parent.name, partial(bwi, path)
+        yield path.parent.name, partial(read_bwi, path)
     else:
-        yield path.stem.removesuffix("_gt_segmentation"), partial(ipa, path)
+        yield path.stem.removesuffix("_gt_segmentation"), partial(read_ipa, path)
 
 
-def ipa(path: Path) -> Sketch:
-    """Rooms of a segmentation image and doorways where its lines cross free space of the scan beside it.
+def read_ipa(path: Path) -> Sketch:
+    """Read rooms of a segmentation image and doorways where its lines cross free space of the scan beside it.
 
     Raises:
         InputError: no scan of the same name and size, or no rooms.
     """
-    truth = _image(path)
+    truth = _read_image(path)
     stem = path.stem.removesuffix("_gt_segmentation")
     scans = [path.with_name(f"{stem}{end}.png") for end in ("", "_scan")]
     scan = next((s for s in scans if s.is_file()), None)
     if scan is None:
         raise InputError(f"missing file: {stem}.png")
-    free = _image(scan) >= FREE_GREY
+    free = _read_image(scan) >= FREE_GREY
     if free.shape != truth.shape:
         raise InputError(f"wrong version: {scan.name} is {free.shape[::-1]} pixels, its rooms are {truth.shape[::-1]}")
     labels = ndimage.label(truth >= WHITE)[0].astype(np.int32)
     sizes = np.bincount(labels.ravel())
     labels[np.isin(labels, np.flatnonzero(sizes < SMALLEST_GRID_ROOM / IPA_CELL**2))] = 0
-    labels = _without_outside(labels, free)
+    labels = _remove_outside(labels, free)
     labels = flood(labels, free | (labels > 0))
     result = Sketch(height=3.2, ceiling=2.7, inset=0.02)
     origin = np.zeros(2)
     index = add_rooms(result, labels, {}, IPA_CELL, origin, SMALLEST_GRID_ROOM, GRID_CAVITY / 2)
-    add_contacts(result, contacts(labels, IPA_CELL, origin), index, "door")
+    add_contacts(result, find_contacts(labels, IPA_CELL, origin), index, "door")
     guess_kinds(result, "office")
     return result
 
 
-def bwi(path: Path) -> Sketch:
-    """Rooms of `locations.yaml`, doors of `doors.yaml`, and openings where the map is free between two rooms.
+def read_bwi(path: Path) -> Sketch:
+    """Read rooms of `locations.yaml`, doors of `doors.yaml`, and openings where the map is free between two rooms.
 
     The image `locations.png` is not read: on floor 3 its numbers are not those of the list.
 
     Raises:
         InputError: a polygon for each room, `doors.yaml` or the map with its resolution is missing.
     """
-    about = _yaml(path)
+    about = _read_yaml(path)
     names, polygons = (about.get(key) if isinstance(about, dict) else None for key in ("locations", "polygons"))
     if not isinstance(names, list) or not isinstance(polygons, list) or not names or len(names) != len(polygons):
         raise InputError("not a grid plan: expected as many 'polygons' as 'locations'")
     if not path.with_name("doors.yaml").is_file():
         raise InputError("missing file: doors.yaml")
-    grid, resolution, origin = _map(path.parent)
-    labels = _painted(polygons, grid.shape)
+    grid, resolution, origin = _read_map(path.parent)
+    labels = _rasterize_polygons(polygons, grid.shape)
     result = Sketch(height=3.6, ceiling=2.8, inset=0.05)
     index = add_rooms(
         result, labels, dict(enumerate(map(str, names), 1)), resolution, origin, SMALLEST_GRID_ROOM, GRID_CAVITY / 2
     )
     room_of_name = {str(name): index.get(k, -1) for k, name in enumerate(names, 1)}
-    _listed_doors(result, _yaml(path.with_name("doors.yaml")), room_of_name)
+    _add_listed_doors(result, _read_yaml(path.with_name("doors.yaml")), room_of_name)
     doors = [np.add(o.start, o.end) / 2 for o in result.openings]
     body = ndimage.distance_transform_edt(grid >= FREE_GREY) * resolution > ROBOT_BODY
     near = ndimage.distance_transform_edt(labels == 0) <= BRIDGE / 2
-    for a, b, ends in contacts(flood(np.where(body, labels, 0), body & near), resolution, origin):
+    for a, b, ends in find_contacts(flood(np.where(body, labels, 0), body & near), resolution, origin):
         along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
         if all(np.hypot(*(ends.mean(axis=0) - door)) > DOORS_APART for door in doors):
             add_contacts(result, [(a, b, ends + np.stack([-along, along]) * ROBOT_BODY)], index, "opening")
     if (path.with_name("connectivity.yaml")).is_file():
-        _connected(result, _yaml(path.with_name("connectivity.yaml")), room_of_name)
+        _add_connections(result, _read_yaml(path.with_name("connectivity.yaml")), room_of_name)
     guess_kinds(result, "office")
     return result
 
 
-def _painted(polygons: list[list[float]], shape: tuple[int, ...]) -> Array:
+def _rasterize_polygons(polygons: list[list[float]], shape: tuple[int, ...]) -> Array:
     """(h, w) int32: number of the polygon in each cell, from 1, lowest row first."""
     image = Image.new("I", (shape[1], shape[0]), 0)
     for k, polygon in enumerate(polygons, 1):
@@ -118,7 +117,7 @@ def _painted(polygons: list[list[float]], shape: tuple[int, ...]) -> Array:
     return np.flipud(np.asarray(image, np.int32)).copy()
 
 
-def _listed_doors(result: Sketch, doors: Any, room_of_name: dict[str, int]) -> None:
+def _add_listed_doors(result: Sketch, doors: Any, room_of_name: dict[str, int]) -> None:
     if not isinstance(doors, list):
         raise InputError("not a grid plan: doors.yaml holds no list")
     for door in doors:
@@ -129,11 +128,11 @@ def _listed_doors(result: Sketch, doors: Any, room_of_name: dict[str, int]) -> N
         width = float(np.hypot(*(end - start)))
         shapes = [result.shapes[i] for i in ends]
         placed = place_door(shapes[0], shapes[1], width, 1.0, (start + end) / 2) if width else None
-        placed = placed or doorway("door", start, end, DOORWAY_THICKNESS)
+        placed = placed or build_opening("door", start, end, DOORWAY_THICKNESS)
         result.add_opening(replace(placed, kind="door"), (ends[0], ends[1]))  # also double ones have leaves here
 
 
-def _connected(result: Sketch, neighbours: Any, room_of_name: dict[str, int]) -> None:
+def _add_connections(result: Sketch, neighbours: Any, room_of_name: dict[str, int]) -> None:
     """Openings for rooms that `connectivity.yaml` calls neighbours and that have none yet."""
     done = {frozenset(ends) for ends in result.ends}
     for name, others in sorted(neighbours.items()) if isinstance(neighbours, dict) else []:
@@ -147,7 +146,7 @@ def _connected(result: Sketch, neighbours: Any, room_of_name: dict[str, int]) ->
                 done.add(frozenset((a, b)))
 
 
-def _without_outside(labels: Array, free: Array) -> Array:
+def _remove_outside(labels: Array, free: Array) -> Array:
     """White regions that are not free in the scan, or touch the rim of the image, are no rooms."""
     counts = np.bincount(labels.ravel())
     share = np.bincount(labels.ravel(), free.ravel()) / np.maximum(counts, 1)
@@ -156,21 +155,21 @@ def _without_outside(labels: Array, free: Array) -> Array:
     return np.where(np.isin(labels, out), 0, labels)
 
 
-def _map(folder: Path) -> tuple[Array, float, Array]:
+def _read_map(folder: Path) -> tuple[Array, float, Array]:
     """The map of a folder: grey levels, m per cell, and origin, m."""
     listings = sorted(p for p in folder.glob("*.yaml") if p.stem not in ("locations", "doors", "objects", "connectivity"))
     for path in sorted(listings, key=lambda p: p.stem != folder.name):
-        about = _yaml(path)
+        about = _read_yaml(path)
         image = path.with_name(f"{Path(str(about.get('image', ''))).stem}.png")
         if "resolution" in about and image.is_file():
             cell = float(about["resolution"])
             if not 0.005 <= cell <= 1.0:
                 raise InputError(f"absurd scale: {cell} m per cell")
-            return _image(image), cell, np.array(about["origin"][:2], float)
+            return _read_image(image), cell, np.array(about["origin"][:2], float)
     raise InputError("missing file: a map with 'resolution', 'origin' and its image as PNG")
 
 
-def _yaml(path: Path) -> Any:
+def _read_yaml(path: Path) -> Any:
     try:
         return yaml.safe_load(path.read_bytes()) or {}
     except yaml.reader.ReaderError as error:
@@ -179,7 +178,7 @@ def _yaml(path: Path) -> Any:
         raise InputError(f"damaged YAML: {path.name}: {' '.join(str(error).split())[:100]}") from error
 
 
-def _image(path: Path) -> Array:
+def _read_image(path: Path) -> Array:
     """(h, w) uint8 grey levels, lowest row first; transparent is as dark as it is painted."""
     try:
         with Image.open(path, formats=IMAGE_FORMATS) as image:

@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 import shapely
-from topomerge.datasets.plans.doors import doorway, place_door, sides, window
-from topomerge.datasets.plans.sketch import Sketch
+from topomerge.datasets.plans.sketch import Sketch, build_opening, convert_to_window, find_side_rooms, place_door
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -50,7 +49,7 @@ IFC_PASSAGE = 4.0  # m, widest opening between spaces that touch
 HEIGHTS = (2.4, 8.0)  # m, of a storey
 
 
-def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
+def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     """Name and maker of every storey that has spaces, lowest first.
 
     Raises:
@@ -67,23 +66,23 @@ def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
         raise InputError(f"damaged IFC: {' '.join(str(error).split())[:120]}") from error
     if not isinstance(model, ifcopenshell.file) or not model.by_type("IfcSpace"):
         raise InputError("no rooms: the model has no IfcSpace")
-    solids = Solids(model)
-    rooms = [(space, solids.corners(space)) for space in model.by_type("IfcSpace")]
+    solids = ElementSolids(model)
+    rooms = [(space, solids.triangulate(space)) for space in model.by_type("IfcSpace")]
     storeys: dict[int, list[tuple[Any, Array]]] = {}
     for space, triangles in rooms:
         if triangles is not None:
-            storeys.setdefault(_storey(space), []).append((space, triangles))
+            storeys.setdefault(_find_storey_id(space), []).append((space, triangles))
     order = sorted(storeys, key=lambda s: float(np.median([t[..., 2].min() for _, t in storeys[s]])))
     floors = [float(np.median([t[..., 2].min() for _, t in storeys[s]])) for s in order]
-    holes = _holes(model, solids)
+    holes = _find_openings(model, solids)
     for k, storey in enumerate(order):
         element: Any = model.by_id(storey) if storey else None
         name = getattr(element, "Name", None) or f"storey {k}"
         above = floors[k + 1] if k + 1 < len(floors) else floors[k] + 3.2
-        yield f"{path.stem}/{name}", partial(sketch, storeys[storey], holes, floors[k], above)
+        yield f"{path.stem}/{name}", partial(build_sketch, storeys[storey], holes, floors[k], above)
 
 
-class Solids:
+class ElementSolids:
     """Triangles of a model's elements, in metres and the model's frame."""
 
     def __init__(self, model: Any) -> None:
@@ -94,8 +93,8 @@ class Solids:
         self.geom = ifcopenshell.geom
         self.model = model
 
-    def corners(self, element: Any) -> Array | None:
-        """(t, 3, 3) corners of an element's triangles, None where it has no shape."""
+    def triangulate(self, element: Any) -> Array | None:
+        """Return (t, 3, 3) corners of an element's triangles, None where it has no shape."""
         try:
             made: Any = self.geom.create_shape(self.settings, element)
         except Exception:  # an element without a solid; its errors have no common class
@@ -106,7 +105,7 @@ class Solids:
         return triangles if len(triangles) else None
 
 
-def sketch(rooms: list[tuple[Any, Array]], holes: list[tuple[str, Array, Array]], floor: float, above: float) -> Sketch:
+def build_sketch(rooms: list[tuple[Any, Array]], holes: list[tuple[str, Array, Array]], floor: float, above: float) -> Sketch:
     """One storey from its spaces and the model's holes."""
     height = float(np.clip(above - floor, *HEIGHTS))
     tops = [float(t[..., 2].max() - t[..., 2].min()) for _, t in rooms]
@@ -114,7 +113,7 @@ def sketch(rooms: list[tuple[Any, Array]], holes: list[tuple[str, Array, Array]]
     for space, triangles in rooms:
         name = " ".join(str(part) for part in (space.Name, space.LongName) if part)
         kind = next((kind for word, kind in IFC_KINDS.items() if word in name.lower()), "")
-        shape = _base(triangles)
+        shape = _compute_base_outline(triangles)
         if shape.area > 0.5 and kind != "outside":
             result.add_room(name or f"space {len(result.shapes)}", kind, shape)
     if not result.shapes:
@@ -124,16 +123,16 @@ def sketch(rooms: list[tuple[Any, Array]], holes: list[tuple[str, Array, Array]]
             continue
         if kind == "opening" and heights[0] > floor + SILL:
             continue
-        left, right = sides(ends[None, 0], ends[None, 1], result.shapes, 0.6)[0].tolist()
-        opening = doorway("opening" if kind == "window" else kind, ends[0], ends[1], 0.6)
+        left, right = find_side_rooms(ends[None, 0], ends[None, 1], result.shapes, 0.6)[0].tolist()
+        opening = build_opening("opening" if kind == "window" else kind, ends[0], ends[1], 0.6)
         if kind == "window":
-            opening = window(opening, max(float(heights[0]) - floor, 0.0), float(heights[1]) - floor)
+            opening = convert_to_window(opening, max(float(heights[0]) - floor, 0.0), float(heights[1]) - floor)
         result.add_opening(opening, (left, right))
-    _open_sides(result)
+    _add_open_sides(result)
     return result
 
 
-def _storey(element: Any) -> int:
+def _find_storey_id(element: Any) -> int:
     """Id of the storey that an element is part of, 0: none."""
     from ifcopenshell.util.element import get_aggregate, get_container
 
@@ -147,7 +146,7 @@ def _storey(element: Any) -> int:
     return 0
 
 
-def _base(triangles: Array) -> shapely.Polygon:
+def _compute_base_outline(triangles: Array) -> shapely.Polygon:
     """Outline of the lower side of a solid, seen from above."""
     z = triangles[..., 2]
     low = triangles[(z < z.min() + 0.3).all(axis=1)]
@@ -160,25 +159,25 @@ def _base(triangles: Array) -> shapely.Polygon:
     return shapely.Polygon()
 
 
-def _holes(model: Any, solids: Solids) -> list[tuple[str, Array, Array]]:
+def _find_openings(model: Any, solids: ElementSolids) -> list[tuple[str, Array, Array]]:
     """Kind, ends (2, 2) along the middle of the wall, and lower and upper height of every door, window and bare opening."""
     out = []
     for element in [*model.by_type("IfcDoor"), *model.by_type("IfcWindow")]:
         hole = next((rel.RelatingOpeningElement for rel in element.FillsVoids), None)
-        triangles = solids.corners(hole) if hole is not None else None
-        triangles = solids.corners(element) if triangles is None else triangles
+        triangles = solids.triangulate(hole) if hole is not None else None
+        triangles = solids.triangulate(element) if triangles is None else triangles
         if triangles is not None:
-            out.append(_hole("door" if element.is_a("IfcDoor") else "window", triangles))
+            out.append(_build_opening("door" if element.is_a("IfcDoor") else "window", triangles))
     for hole in model.by_type("IfcOpeningElement"):
         wall = hole.VoidsElements[0].RelatingBuildingElement if hole.VoidsElements else None
         if not hole.HasFillings and wall is not None and wall.is_a("IfcWall"):
-            triangles = solids.corners(hole)
+            triangles = solids.triangulate(hole)
             if triangles is not None and np.ptp(triangles[..., 2]) > 1.8:
-                out.append(_hole("opening", triangles))
+                out.append(_build_opening("opening", triangles))
     return out
 
 
-def _hole(kind: str, triangles: Array) -> tuple[str, Array, Array]:
+def _build_opening(kind: str, triangles: Array) -> tuple[str, Array, Array]:
     """The long axis of the smallest rectangle around a hole that is as wide as it is: walls are thinner than doors are wide."""
     around = shapely.oriented_envelope(shapely.multipoints(triangles.reshape(-1, 3)[:, :2]))
     corners = np.asarray(around.exterior.coords)[:4] if around.geom_type == "Polygon" else np.zeros((4, 2))
@@ -188,7 +187,7 @@ def _hole(kind: str, triangles: Array) -> tuple[str, Array, Array]:
     return kind, ends, np.array([triangles[..., 2].min(), triangles[..., 2].max()])
 
 
-def _open_sides(result: Sketch) -> None:
+def _add_open_sides(result: Sketch) -> None:
     """Openings where two spaces touch for at least 0.8 m."""
     shapes = np.array(result.shapes, object)
     first, second = shapely.STRtree(shapes).query(shapes, predicate="dwithin", distance=TOUCHING)

@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 import shapely
 import shapely.geometry
-from topomerge.datasets.plans.doors import place_door
-from topomerge.datasets.plans.sketch import Sketch, check_size, overlaps
+from topomerge.datasets.plans.sketch import Sketch, check_size, find_overlaps, place_door
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -41,13 +40,13 @@ DEGREE = 111_320.0  # m
 MALL_BYTES = 50 << 20
 
 
-def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
+def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     """Name (of the folder) and maker of the one storey."""
     check_size(path, MALL_BYTES)
-    yield path.parent.name, partial(sketch, path)
+    yield path.parent.name, partial(read_sketch, path)
 
 
-def sketch(path: Path) -> Sketch:
+def read_sketch(path: Path) -> Sketch:
     """One storey; its origin is the nearest tenth of a degree, so that the storeys of a mall lie over each other.
 
     Raises:
@@ -57,21 +56,21 @@ def sketch(path: Path) -> Sketch:
     if not isinstance(features, list) or len(features) < 2:
         raise InputError("not a mall plan: no 'features'")
     origin = np.round(shapely.get_coordinates(shapely.geometry.shape(features[0]["geometry"])).mean(axis=0), 1)
-    floor = _metric(features[0], origin)
+    floor = _convert_to_metres(features[0], origin)
     _check_size(floor, path.with_name("floor_info.json"))
     result = Sketch(inset=INSET, height=5.0, ceiling=3.6)
     closed = []
     for feature in features[1:]:
-        shape = _largest(_metric(feature, origin))
+        shape = _find_largest_part(_convert_to_metres(feature, origin))
         name = str(feature.get("properties", {}).get("name") or "")
         if shape.is_empty or any(word in name for word in STANDING) or PARKING.match(name):
             continue
         if not name or any(word in name for word in CLOSED):
             closed.append(shape)
         elif shape.area >= KIOSK:
-            result.add_room(f"{name} {len(result.shapes)}", _kind(name), shape)
-    _once(result)
-    _halls(result, floor, closed)
+            result.add_room(f"{name} {len(result.shapes)}", _classify_room(name), shape)
+    _remove_duplicates(result)
+    _add_halls(result, floor, closed)
     return result
 
 
@@ -85,14 +84,14 @@ def _load(path: Path) -> dict[str, Any]:
     return loaded
 
 
-def _metric(feature: dict[str, Any], origin: Array) -> shapely.Geometry:
+def _convert_to_metres(feature: dict[str, Any], origin: Array) -> shapely.Geometry:
     """Shape in metres, x east, y north."""
     shape = shapely.geometry.shape(feature["geometry"])
     factor = np.array([np.cos(np.radians(origin[1])), 1.0]) * DEGREE
     return shapely.make_valid(shapely.transform(shape, lambda points: (points - origin) * factor))
 
 
-def _largest(shape: shapely.Geometry) -> shapely.Polygon:
+def _find_largest_part(shape: shapely.Geometry) -> shapely.Polygon:
     parts = (p for p in shapely.get_parts(shape) if p.geom_type == "Polygon")
     return max(parts, key=lambda p: p.area, default=shapely.Polygon())
 
@@ -107,14 +106,14 @@ def _check_size(floor: shapely.Geometry, path: Path) -> None:
         raise InputError(f"absurd scale: floor of {high - low} m, stated as {stated}")
 
 
-def _kind(name: str) -> str:
+def _classify_room(name: str) -> str:
     return next((kind for word, kind in MALL_KINDS.items() if word in name), "shop")
 
 
-def _once(result: Sketch) -> None:
+def _remove_duplicates(result: Sketch) -> None:
     """Many rooms are in the file twice, and small ones lie within larger ones: the smaller one stays."""
     gone: set[int] = set()
-    for i, j, share in overlaps(result.shapes):
+    for i, j, share in find_overlaps(result.shapes):
         small, large = sorted((i, j), key=lambda k: (result.shapes[k].area, k))
         if gone & {small, large}:
             continue
@@ -127,7 +126,7 @@ def _once(result: Sketch) -> None:
         setattr(result, name, [v for k, v in enumerate(getattr(result, name)) if k not in gone])
 
 
-def _halls(result: Sketch, floor: shapely.Geometry, closed: list[shapely.Polygon]) -> None:
+def _add_halls(result: Sketch, floor: shapely.Geometry, closed: list[shapely.Polygon]) -> None:
     """Add what is left of the floor, and a door from each room to it."""
     rooms = list(result.shapes)
     rest = floor.difference(shapely.union_all([*rooms, *closed]))

@@ -16,9 +16,8 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from topomerge.datasets.core.plan import Wall
-from topomerge.datasets.plans.doors import doorway, sides, window
-from topomerge.datasets.plans.sketch import Sketch, read_limited
+from topomerge.datasets.core.building import Wall
+from topomerge.datasets.plans.sketch import Sketch, build_opening, convert_to_window, find_side_rooms, read_limited
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -49,14 +48,14 @@ ARCHIVE_MEMBERS, ARCHIVE_BYTES, PLAN_BYTES = 100_000, 1 << 30, 1 << 20  # of an 
 Rows = list[tuple[Array, str, str]]  # (2, 2) px, category, type
 
 
-def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
+def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     """Name and maker of every plan of a text file or a tar archive, whose members are read in memory only.
 
     Raises:
         InputError: truncated or absurdly large archive.
     """
     if path.suffix == ".txt":
-        yield path.stem, partial(sketch, read_limited(path, PLAN_BYTES))
+        yield path.stem, partial(parse_sketch, read_limited(path, PLAN_BYTES))
         return
     total = 0
     try:
@@ -72,7 +71,7 @@ def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
                     yield name, partial(_refuse, f"absurd size: {member.size} bytes for one plan")
                     continue
                 stream = archive.extractfile(member)
-                yield name, partial(sketch, stream.read() if stream else b"")
+                yield name, partial(parse_sketch, stream.read() if stream else b"")
     except (tarfile.TarError, EOFError, lzma.LZMAError, zlib.error) as error:
         raise InputError(f"damaged archive: {error}") from error
 
@@ -81,20 +80,20 @@ def _refuse(reason: str) -> Sketch:
     raise InputError(reason)
 
 
-def sketch(text: bytes) -> Sketch:
+def parse_sketch(text: bytes) -> Sketch:
     """One apartment.
 
     Raises:
         InputError: a line that can't be read; no walls; walls that enclose nothing; no scale.
     """
-    rows = _rows(text)
+    rows = _parse_rows(text)
     walls = np.array([ends for ends, category, _ in rows if category == "wall" and np.ptp(ends, axis=0).max() > 0])
     if not len(walls):
         raise InputError("no walls: not a Raster-to-Vector plan")
-    scale = _scale(rows)
+    scale = _estimate_scale(rows)
     walls = walls * scale
-    faces = _faces(walls, PIXEL_SNAP * scale)
-    kinds = _kinds(faces, rows, scale)
+    faces = _build_faces(walls, PIXEL_SNAP * scale)
+    kinds = _classify_faces(faces, rows, scale)
     _check_seeds(faces, rows, scale)
     result = Sketch(height=2.9, ceiling=2.4)
     rooms = np.full(len(faces) + 1, -1)  # the last one is the answer to index -1: outside
@@ -102,11 +101,11 @@ def sketch(text: bytes) -> Sketch:
         if kind not in OUTSIDE_LABELS:
             rooms[i] = result.add_room(f"{kind or 'room'} {len(result.shapes)}", kind, face)
     result.walls = [Wall((w[0][0], w[0][1]), (w[1][0], w[1][1]), APARTMENT_WALL) for w in walls.tolist()]
-    _openings(result, rows, scale, faces, rooms, walls)
+    _add_openings(result, rows, scale, faces, rooms, walls)
     return result
 
 
-def _rows(text: bytes) -> Rows:
+def _parse_rows(text: bytes) -> Rows:
     rows: Rows = []
     for number, line in enumerate(text.decode("utf-8", "replace").splitlines(), 1):
         words = line.split()
@@ -122,7 +121,7 @@ def _rows(text: bytes) -> Rows:
     return rows
 
 
-def _scale(rows: Rows) -> float:
+def _estimate_scale(rows: Rows) -> float:
     """m per pixel: the middle one of what doors, bathtubs and toilets say, kept where narrow doors are 0.7 to 0.9 m."""
 
     def lengths(category: str, types: tuple[str, ...] = ()) -> Array:
@@ -142,7 +141,7 @@ def _scale(rows: Rows) -> float:
     return float(np.clip(np.median(guesses), low, high))
 
 
-def _faces(walls: Array, snap: float) -> list[shapely.Polygon]:
+def _build_faces(walls: Array, snap: float) -> list[shapely.Polygon]:
     """Faces of the walls after making them longer by `snap` at both ends; slivers between double lines are left out."""
     along = walls[:, 1] - walls[:, 0]
     along = along / np.linalg.norm(along, axis=1, keepdims=True) * snap
@@ -155,7 +154,7 @@ def _faces(walls: Array, snap: float) -> list[shapely.Polygon]:
     return faces
 
 
-def _kinds(faces: list[shapely.Polygon], rows: Rows, scale: float) -> list[str]:
+def _classify_faces(faces: list[shapely.Polygon], rows: Rows, scale: float) -> list[str]:
     """Kind of each face: that of the seed in it, the most telling one where there are several."""
     tree, order = shapely.STRtree(faces), list(APARTMENT_KINDS)
     best = np.full(len(faces), len(order))
@@ -174,24 +173,24 @@ def _check_seeds(faces: list[shapely.Polygon], rows: Rows, scale: float) -> None
         raise InputError(f"not closed: no walls around {open_} of {len(seeds)} bedrooms, living rooms and kitchens")
 
 
-def _openings(result: Sketch, rows: Rows, scale: float, faces: list[shapely.Polygon], rooms: Array, walls: Array) -> None:
+def _add_openings(result: Sketch, rows: Rows, scale: float, faces: list[shapely.Polygon], rooms: Array, walls: Array) -> None:
     """Doors between rooms and at the entrance; other openings to outside are windows, wide ones down to the floor."""
     ends = np.array([ends * scale for ends, category, _ in rows if category == "door" and np.ptp(ends, axis=0).max() > 0])
     if not len(ends):
         return
     lines = shapely.linestrings(walls)
-    ends = np.array([_on_wall(pair, walls, lines) for pair in ends])
-    faced = sides(ends[:, 0], ends[:, 1], faces, APARTMENT_WALL / 2 + 0.3)
+    ends = np.array([_snap_to_wall(pair, walls, lines) for pair in ends])
+    faced = find_side_rooms(ends[:, 0], ends[:, 1], faces, APARTMENT_WALL / 2 + 0.3)
     for (start, end), (left, right) in zip(ends, rooms[faced].tolist(), strict=True):
-        opening = doorway("door", start, end, APARTMENT_WALL + 0.1)
+        opening = build_opening("door", start, end, APARTMENT_WALL + 0.1)
         inner = max(left, right)
         if min(left, right) < 0 <= inner and result.kinds[inner] != "entrance":
             wide = np.hypot(*(end - start)) > 1.5
-            opening = window(opening, 0.0 if wide else 0.9, 2.0)
+            opening = convert_to_window(opening, 0.0 if wide else 0.9, 2.0)
         result.add_opening(opening, (left, right))
 
 
-def _on_wall(ends: Array, walls: Array, lines: Array) -> Array:
+def _snap_to_wall(ends: Array, walls: Array, lines: Array) -> Array:
     """(2, 2) the opening moved onto the nearest wall that runs its way, if there is one within 0.2 m."""
     along = ends[1] - ends[0]
     if abs(along[0]) > 1e-9 and abs(along[1]) > 1e-9:  # a slanted opening stays where it is

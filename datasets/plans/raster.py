@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import shapely
 from scipy import ndimage
-from topomerge.datasets.plans.doors import doorway
-from topomerge.datasets.plans.sketch import Sketch
+from topomerge.datasets.plans.sketch import Sketch, build_opening
 
 from topomerge.types import Array
 
@@ -43,8 +42,8 @@ def flood(labels: Array, free: Array, height: Array | None = None) -> Array:
     return np.ascontiguousarray(wide[1:-1, 1:-1])
 
 
-def outline(mask: Array, resolution: float, origin: Array, thin: float = 0.0) -> shapely.Polygon:
-    """Outline of the largest part of a mask, m; smoothed, and without what is narrower than twice `thin` m."""
+def trace_outline(mask: Array, resolution: float, origin: Array, thin: float = 0.0) -> shapely.Polygon:
+    """Trace the outline of the largest part of a mask, m; smoothed, and without what is narrower than twice `thin` m."""
     rows, columns = np.nonzero(mask)
     if not len(rows):
         return shapely.Polygon()
@@ -62,8 +61,8 @@ def outline(mask: Array, resolution: float, origin: Array, thin: float = 0.0) ->
     return shapely.transform(best, lambda points: points * resolution + origin)
 
 
-def contacts(labels: Array, resolution: float, origin: Array) -> list[tuple[int, int, Array]]:
-    """Where regions touch: two labels and the ends (2, 2), m, of the line along the contact; bent contacts are no doorways."""
+def find_contacts(labels: Array, resolution: float, origin: Array) -> list[tuple[int, int, Array]]:
+    """Find where regions touch: two labels and the ends (2, 2), m, of the contact's line; bent contacts are no doorways."""
     touching = []
     pairs: dict[tuple[int, int], list[Array]] = {}
     for axis in (0, 1):
@@ -75,15 +74,15 @@ def contacts(labels: Array, resolution: float, origin: Array) -> list[tuple[int,
             pairs.setdefault((pair[0], pair[1]), []).append(middle[(low == pair[0]) & (high == pair[1])])
     for (first, second), parts in sorted(pairs.items()):
         points = np.concatenate(parts)
-        for cluster in _clusters(points):
-            line = _line(cluster)
+        for cluster in _cluster_points(points):
+            line = _fit_line(cluster)
             along = (line[1] - line[0]) / max(float(np.hypot(*(line[1] - line[0]))), 1e-9)
             if np.ptp(cluster @ np.array([-along[1], along[0]])) * resolution <= BENT:
                 touching.append((first, second, line * resolution + origin))
     return touching
 
 
-def _clusters(points: Array) -> list[Array]:
+def _cluster_points(points: Array) -> list[Array]:
     """Points that are at most two cells apart belong together."""
     low = np.floor(points.min(axis=0)).astype(int) - 2
     image = np.zeros(np.floor(points.max(axis=0)).astype(int) - low + 3, bool)
@@ -94,7 +93,7 @@ def _clusters(points: Array) -> list[Array]:
     return [points[which == k] for k in np.unique(which)]
 
 
-def _line(points: Array) -> Array:
+def _fit_line(points: Array) -> Array:
     """(2, 2) ends of the points along their main direction, which is an axis where that is nearly right."""
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     along = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][0] if len(points) > 1 else np.array([1.0, 0])
@@ -122,7 +121,7 @@ def add_rooms(
         if place is None:
             continue
         corner = origin + np.array([place[1].start, place[0].start]) * resolution
-        shape = outline(labels[place] == label, resolution, corner, thin)
+        shape = trace_outline(labels[place] == label, resolution, corner, thin)
         if shape.area >= smallest:
             index[label] = result.add_room(names.get(label, f"room {label}"), "", shape)
     return index
@@ -132,10 +131,10 @@ def add_contacts(result: Sketch, doorways: list[tuple[int, int, Array]], index: 
     """Add a doorway for each contact of two rooms."""
     for a, b, ends in doorways:
         if a in index and b in index and np.hypot(*(ends[1] - ends[0])) >= NARROW_CONTACT:
-            result.add_opening(doorway(kind, ends[0], ends[1], DOORWAY_THICKNESS), (index[a], index[b]))
+            result.add_opening(build_opening(kind, ends[0], ends[1], DOORWAY_THICKNESS), (index[a], index[b]))
 
 
 def guess_kinds(result: Sketch, usual: str) -> None:
-    """Rooms with many doors are corridors, the others `usual`."""
+    """Guess the kinds of rooms: those with many doors are corridors, the others `usual`."""
     doors = np.bincount(np.array([e for ends in result.ends for e in ends if e >= 0], int), minlength=len(result.shapes))
     result.kinds = ["corridor" if n >= BUSY else usual for n in doors]

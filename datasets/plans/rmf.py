@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 import shapely
 import yaml
-from topomerge.datasets.core.plan import Flight, Wall
-from topomerge.datasets.plans.doors import doorway, sides
-from topomerge.datasets.plans.sketch import Sketch, read_limited
+from topomerge.datasets.core.building import Flight, Wall
+from topomerge.datasets.plans.sketch import Sketch, build_opening, find_side_rooms, read_limited
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -51,7 +50,7 @@ DEEPEST = 50  # a plan has 6
 Level = dict[str, Any]
 
 
-def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
+def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     """Name and maker of every level, lowest first.
 
     Raises:
@@ -70,7 +69,7 @@ def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     stem = path.name.removesuffix(".building.yaml")
     order = sorted(site["levels"], key=lambda name: float(site["levels"][name].get("elevation", 0)))
     for k, name in enumerate(order):
-        yield f"{stem}/{name}", partial(sketch, site, order, k, stem)
+        yield f"{stem}/{name}", partial(build_sketch, site, order, k, stem)
 
 
 def _check_depth(text: bytes, loader: Any) -> None:
@@ -82,41 +81,41 @@ def _check_depth(text: bytes, loader: Any) -> None:
             raise InputError(f"damaged YAML: more than {DEEPEST} lists within each other")
 
 
-def sketch(site: dict[str, Any], order: list[str], k: int, stem: str = "") -> Sketch:
+def build_sketch(site: dict[str, Any], order: list[str], k: int, stem: str = "") -> Sketch:
     """Level k of a building, in the frame of its lowest level.
 
     Raises:
         InputError: no scale; no walls; walls that enclose nothing.
     """
     level = site["levels"][order[k]]
-    points = _points(level, site, order)
-    walls = _segments(level, "walls", points)
+    points = _compute_points(level, site, order)
+    walls = _list_segments(level, "walls", points)
     if not len(walls):
         raise InputError("no walls: not a building")
-    doors = _segments(level, "doors", points)
-    shafts = [corners for _, corners in _lifts(site, order, k)]
+    doors = _list_segments(level, "doors", points)
+    shafts = [corners for _, corners in _list_lifts(site, order, k)]
     walls = np.concatenate([walls, *(np.stack([c, np.roll(c, -1, axis=0)], axis=1) for c in shafts)])
-    gaps = _gaps(np.concatenate([walls, doors]), walls)
-    faces = _faces(np.concatenate([walls, doors, gaps]), level, points, shafts)
-    result = Sketch(inset=RMF_WALL / 2, height=_height(site, order, k), ceiling=CEILING)
+    gaps = _find_gaps(np.concatenate([walls, doors]), walls)
+    faces = _build_faces(np.concatenate([walls, doors, gaps]), level, points, shafts)
+    result = Sketch(inset=RMF_WALL / 2, height=_compute_height(site, order, k), ceiling=CEILING)
     for face in faces:
         result.add_room(f"room {len(result.shapes)}", "", face)
     result.walls = [Wall((a[0], a[1]), (b[0], b[1]), RMF_WALL) for a, b in walls.tolist()]
     for kind, segments, thickness in (
         ("door", doors, RMF_WALL + 0.1),
         ("opening", gaps, RMF_WALL + 0.1),
-        ("door", _lift_doors(site, order, k), SHAFT),
+        ("door", _list_lift_doors(site, order, k), SHAFT),
     ):
-        ends = sides(segments[:, 0], segments[:, 1], faces, thickness / 2 + 0.3)
+        ends = find_side_rooms(segments[:, 0], segments[:, 1], faces, thickness / 2 + 0.3)
         for (start, end), (left, right) in zip(segments, ends.tolist(), strict=True):
-            result.add_opening(doorway(kind, start, end, thickness), (left, right))
-    _name(result, level, points, shafts, stem)
-    upper = {name for name, _ in _lifts(site, order, k + 1)} if k + 1 < len(order) else set()
-    result.flights = [_flight(corners) for name, corners in _lifts(site, order, k) if name in upper]
+            result.add_opening(build_opening(kind, start, end, thickness), (left, right))
+    _assign_names(result, level, points, shafts, stem)
+    upper = {name for name, _ in _list_lifts(site, order, k + 1)} if k + 1 < len(order) else set()
+    result.flights = [_build_flight(corners) for name, corners in _list_lifts(site, order, k) if name in upper]
     return result
 
 
-def _scale(level: Level) -> float:
+def _estimate_scale(level: Level) -> float:
     pixels = np.array([v[:2] for v in level.get("vertices", [])], float).reshape(-1, 2)
     ratios = []
     for start, end, values in level.get("measurements", []):
@@ -127,26 +126,26 @@ def _scale(level: Level) -> float:
     return float(np.median(ratios))
 
 
-def _place(site: dict[str, Any], order: list[str], name: str) -> tuple[float, Array]:
+def _compute_placement(site: dict[str, Any], order: list[str], name: str) -> tuple[float, Array]:
     """m per pixel and shift, m, that bring a level's pixels into the frame of the lowest level, by the common fiducials."""
     level, first = site["levels"][name], site["levels"][order[0]]
-    scale = _scale(level)
+    scale = _estimate_scale(level)
     marks = [{f[2]: np.array(f[:2], float) * (1, -1) for f in each.get("fiducials", [])} for each in (level, first)]
     common = sorted(set(marks[0]) & set(marks[1]), key=str)
     if name == order[0] or not common:
         return scale, np.zeros(2)
-    return scale, np.mean([marks[1][c] * _scale(first) - marks[0][c] * scale for c in common], axis=0)
+    return scale, np.mean([marks[1][c] * _estimate_scale(first) - marks[0][c] * scale for c in common], axis=0)
 
 
-def _points(level: Level, site: dict[str, Any], order: list[str]) -> Array:
+def _compute_points(level: Level, site: dict[str, Any], order: list[str]) -> Array:
     """(n, 2) vertices, m, y up."""
     name = next(name for name in order if site["levels"][name] is level)
-    scale, shift = _place(site, order, name)
+    scale, shift = _compute_placement(site, order, name)
     pixels = np.array([v[:2] for v in level.get("vertices", [])], float).reshape(-1, 2)
     return np.asarray(pixels * (scale, -scale) + shift)
 
 
-def _segments(level: Level, key: str, points: Array) -> Array:
+def _list_segments(level: Level, key: str, points: Array) -> Array:
     pairs = np.array([entry[:2] for entry in level.get(key) or []], np.int64).reshape(-1, 2)
     if pairs.size and not 0 <= pairs.min() <= pairs.max() < len(points):
         raise InputError(f"bad line: {key} name a vertex that is not there")
@@ -154,24 +153,24 @@ def _segments(level: Level, key: str, points: Array) -> Array:
     return segments[np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1) > 0.01]
 
 
-def _lifts(site: dict[str, Any], order: list[str], k: int) -> list[tuple[str, Array]]:
+def _list_lifts(site: dict[str, Any], order: list[str], k: int) -> list[tuple[str, Array]]:
     """Name and cabin's corners (4, 2), m, of the lifts that stop at level k; the door is in front of the last two corners."""
     out = []
     for name, lift in sorted((site.get("lifts") or {}).items()):
         if order[k] in lift.get("level_doors", {}):
             half = np.array([lift["width"], lift["depth"]], float) / 2
             corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
-            out.append((name, _from_cabin(site, order, lift, corners)))
+            out.append((name, _transform_from_cabin(site, order, lift, corners)))
     return out
 
 
-def _from_cabin(site: dict[str, Any], order: list[str], lift: dict[str, Any], points: Array) -> Array:
-    scale, shift = _place(site, order, lift.get("reference_floor_name", order[0]))
+def _transform_from_cabin(site: dict[str, Any], order: list[str], lift: dict[str, Any], points: Array) -> Array:
+    scale, shift = _compute_placement(site, order, lift.get("reference_floor_name", order[0]))
     c, s = np.cos(lift["yaw"]), np.sin(lift["yaw"])
     return np.asarray(points @ np.array([[c, s], [-s, c]]) + np.array([lift["x"], -lift["y"]]) * scale + shift)
 
 
-def _lift_doors(site: dict[str, Any], order: list[str], k: int) -> Array:
+def _list_lift_doors(site: dict[str, Any], order: list[str], k: int) -> Array:
     """(n, 2, 2) doors of the lifts at level k."""
     out = []
     for _, lift in sorted((site.get("lifts") or {}).items()):
@@ -180,11 +179,11 @@ def _lift_doors(site: dict[str, Any], order: list[str], k: int) -> Array:
             turn, half = float(door.get("motion_axis_orientation", 0)), float(door["width"]) / 2
             along = np.array([np.cos(turn), np.sin(turn)]) * half
             at = np.array([door["x"], np.sign(door["y"]) * lift["depth"] / 2])  # on the cabin's side, not on the shaft's
-            out.append(_from_cabin(site, order, lift, np.stack([at - along, at + along])))
+            out.append(_transform_from_cabin(site, order, lift, np.stack([at - along, at + along])))
     return np.array(out).reshape(-1, 2, 2)
 
 
-def _gaps(lines: Array, walls: Array) -> Array:
+def _find_gaps(lines: Array, walls: Array) -> Array:
     """(n, 2, 2) openings without doors: where a wall's loose end looks along the wall at other lines, `OPENING_WIDTHS` away."""
     every = shapely.linestrings(lines)
     tree = shapely.STRtree(every)
@@ -206,7 +205,7 @@ def _gaps(lines: Array, walls: Array) -> Array:
     return np.array([gaps[i] for i in first]).reshape(-1, 2, 2)
 
 
-def _faces(lines: Array, level: Level, points: Array, shafts: list[Array]) -> list[shapely.Polygon]:
+def _build_faces(lines: Array, level: Level, points: Array, shafts: list[Array]) -> list[shapely.Polygon]:
     """Faces of the lines that lie on the level's floors or are cabins of lifts."""
     along = lines[:, 1] - lines[:, 0]
     along = along / np.linalg.norm(along, axis=1, keepdims=True) * LINE_SNAP
@@ -223,14 +222,14 @@ def _faces(lines: Array, level: Level, points: Array, shafts: list[Array]) -> li
     return faces
 
 
-def _height(site: dict[str, Any], order: list[str], k: int) -> float:
+def _compute_height(site: dict[str, Any], order: list[str], k: int) -> float:
     if k + 1 == len(order):
         return RMF_STOREY
     here, above = (float(site["levels"][order[i]].get("elevation", 0)) for i in (k, k + 1))
     return above - here if STOREYS[0] <= above - here <= STOREYS[1] else RMF_STOREY
 
 
-def _name(result: Sketch, level: Level, points: Array, shafts: list[Array], stem: str) -> None:
+def _assign_names(result: Sketch, level: Level, points: Array, shafts: list[Array], stem: str) -> None:
     """Names from the waypoints in each room; kinds from words in them, from the lifts, and from the number of doors."""
     tree = shapely.STRtree(result.shapes)
     for vertex, point in zip(level.get("vertices", []), points, strict=True):
@@ -245,7 +244,7 @@ def _name(result: Sketch, level: Level, points: Array, shafts: list[Array], stem
         result.kinds[i] = "lift" if lift else WAYPOINT_KINDS.get(word, usual)
 
 
-def _flight(corners: Array) -> Flight:
+def _build_flight(corners: Array) -> Flight:
     """A lift's cabin."""
     ahead = corners[3] - corners[0]
     size = np.linalg.norm(corners[1] - corners[0]), np.linalg.norm(ahead)

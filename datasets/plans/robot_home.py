@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from topomerge.datasets.plans.raster import add_contacts, add_rooms, contacts, flood, guess_kinds
+from topomerge.datasets.plans.raster import add_contacts, add_rooms, find_contacts, flood, guess_kinds
 from topomerge.datasets.plans.sketch import Sketch
 
 from topomerge.errors import InputError
-from topomerge.io.json_map import what_is_in
-from topomerge.io.valetudo import RobotMap, is_robot_map, robot_rooms
+from topomerge.io.json_map import load_json_map
+from topomerge.io.valetudo import RobotMap, is_robot_map, parse_robot_map
 from topomerge.types import Array
 
 SMALLEST_HOME_ROOM = 0.8  # m2
@@ -29,7 +29,7 @@ HEAD = 400  # bytes of a file that say what it is
 
 
 def is_robot_home(path: Path) -> bool:
-    """Does a JSON file begin as a map of Valetudo does?"""
+    """Return whether a JSON file begins as a map of Valetudo does."""
     try:
         with path.open("rb") as file:
             return b'"ValetudoMap"' in file.read(HEAD)
@@ -37,29 +37,29 @@ def is_robot_home(path: Path) -> bool:
         return False
 
 
-def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
+def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     """Name and maker of the one storey."""
-    yield path.stem, partial(robot_home, path)
+    yield path.stem, partial(read_robot_home, path)
 
 
-def robot_home(path: Path) -> Sketch:
-    """The robot's rooms, and a doorway wherever the floors of two of them touch.
+def read_robot_home(path: Path) -> Sketch:
+    """Read the robot's rooms, and a doorway wherever the floors of two of them touch.
 
     Raises:
         InputError: the file is no map of Valetudo, or the robot tells no rooms apart.
     """
-    about = what_is_in(path)
+    about = load_json_map(path)
     if not is_robot_map(about):
         raise InputError("not a robot's map: its class is not ValetudoMap")
-    drawn = robot_rooms(path, about)
+    drawn = parse_robot_map(path, about)
     labels, _ = spread_rooms(drawn)
     result = Sketch(height=2.8, ceiling=2.5, inset=HOME_INSET)
     names = {k: name for k, name in enumerate(drawn.names, 1) if name}
     index = add_rooms(result, labels, names, drawn.resolution, drawn.origin, SMALLEST_HOME_ROOM, HOME_CAVITY / 2)
     if not index:
         raise InputError("too few rooms: the robot tells none apart")
-    result.shapes = [_without_furniture(shape) for shape in result.shapes]
-    touching = contacts(labels, drawn.resolution, drawn.origin)
+    result.shapes = [_remove_islands(shape) for shape in result.shapes]
+    touching = find_contacts(labels, drawn.resolution, drawn.origin)
     for kind, wide in (("door", False), ("opening", True)):
         add_contacts(result, [c for c in touching if (np.hypot(*(c[2][1] - c[2][0])) > WIDEST_LEAF) == wide], index, kind)
     guess_kinds(result, "")
@@ -74,6 +74,6 @@ def spread_rooms(drawn: RobotMap) -> tuple[Array, Array]:
     return flood(np.where(np.isin(drawn.rooms, large), drawn.rooms, 0), drawn.free), large
 
 
-def _without_furniture(shape: shapely.Polygon) -> shapely.Polygon:
+def _remove_islands(shape: shapely.Polygon) -> shapely.Polygon:
     """A room without the islands that a robot drove around."""
     return shapely.Polygon(shape.exterior, [ring for ring in shape.interiors if shapely.Polygon(ring).area >= ISLAND])

@@ -3,7 +3,7 @@
 `splits/sealed.txt` lists seeds of procedural buildings, files of real data that nothing here was made or judged by, and buildings
 of published sets that nobody here has. A line seals a building and all that lies below its name. Whatever reads plans,
 grids, published sets or makes procedural buildings asks `refuse_building` or `refuse_file` first; both let pass what is asked
-within `sealed_run` only, which `topomerge/evaluation/sealed.py` alone enters (a test reads the sources), once a release.
+within `open_sealed_set` only, which `topomerge/evaluation/sealed.py` alone enters (a test reads the sources), once a release.
 
 What is outside cannot be held: a person who opens a sealed file with a program of their own (``topomerge extract`` among them)
 has looked at it.
@@ -30,8 +30,8 @@ _opened = 0  # runs of the sealed set that are under way in this process
 
 
 @contextmanager
-def sealed_run() -> Iterator[None]:
-    """The gate: within it nothing is refused. For the sealed run alone; each of its processes enters by itself."""
+def open_sealed_set() -> Iterator[None]:
+    """Open the sealed set: within, nothing is refused. For the sealed run alone; each of its processes enters by itself."""
     global _opened
     _opened += 1
     try:
@@ -42,7 +42,7 @@ def sealed_run() -> Iterator[None]:
 
 @cache
 def read_list(split: str) -> tuple[frozenset[str], frozenset[str], tuple[int, int]]:
-    """Buildings, whole sources and seeds of a split; an empty range where it has no seeds."""
+    """Read buildings, whole sources and seeds of a split; an empty range where it has no seeds."""
     text = resources.files("topomerge.datasets.plans").joinpath("splits", f"{split}.txt").read_text(encoding="utf-8")
     lines = {line.strip() for line in text.splitlines()} - {""}
     lines = {line for line in lines if not line.startswith("#")}
@@ -54,7 +54,7 @@ def read_list(split: str) -> tuple[frozenset[str], frozenset[str], tuple[int, in
 
 
 def is_sealed(source: str, name: str) -> bool:
-    """Is a building, or what its name lies below, in the sealed list?
+    """Return whether a building, or what its name lies below, is in the sealed list.
 
     Args:
         source: as of `splits`, or of `datasets.public`.
@@ -68,7 +68,7 @@ def is_sealed(source: str, name: str) -> bool:
 
 
 def is_sealed_file(path: str | Path) -> bool:
-    """Does a file, or a folder, hold what is sealed? By the folder of the real data that it lies in."""
+    """Return whether a file or a folder holds sealed data, by the folder of the real data that it lies in."""
     parts = Path(path).absolute().parts
     for source, folders in SEALED_FOLDERS.items():
         for k in (k for k, part in enumerate(parts) if part in folders):

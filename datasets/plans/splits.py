@@ -17,8 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from topomerge.datasets.core.physical import physical_building
-from topomerge.datasets.core.plan import Plan
+from topomerge.datasets.core.building import Plan, find_physical_building
 from topomerge.datasets.plans.sealed import SEALED, is_sealed, read_list, refuse_split
 
 from topomerge.errors import InputError
@@ -47,8 +46,8 @@ SPLIT_SEEDS = {"train": (0, 799_999), "validation": (800_000, 899_999), "test": 
 SHARES = {"validation": 0.1, "test": 0.1}  # of the plans of a source; the rest is for training
 
 
-def split_of(source: str, name: str) -> str | None:
-    """The split of a building, or None where no list names it. `name` is the seed of a procedural building."""
+def find_split(source: str, name: str) -> str | None:
+    """Find the split of a building, or None where no list names it. `name` is the seed of a procedural building."""
     if is_sealed(source, name):
         return SEALED
     for split in SPLITS:
@@ -60,8 +59,8 @@ def split_of(source: str, name: str) -> str | None:
     return None
 
 
-def members(split: str, source: str) -> list[str]:
-    """Names of the buildings of a source in a split, ascending.
+def list_members(split: str, source: str) -> list[str]:
+    """List names of the buildings of a source in a split, ascending.
 
     Raises:
         InputError: unknown split, or the sealed one.
@@ -70,8 +69,8 @@ def members(split: str, source: str) -> list[str]:
     return sorted(n.removeprefix(f"{source}/") for n in names if n.startswith(f"{source}/"))
 
 
-def seeds(split: str) -> tuple[int, int]:
-    """First and last seed of the procedural buildings of a split.
+def get_seed_range(split: str) -> tuple[int, int]:
+    """Return first and last seed of the procedural buildings of a split.
 
     Raises:
         InputError: unknown split, or the sealed one.
@@ -87,8 +86,8 @@ def _read(split: str) -> tuple[frozenset[str], frozenset[str], tuple[int, int]]:
     return read_list(split)
 
 
-def groups(names: Iterable[str], together: Iterable[Iterable[str]]) -> list[list[str]]:
-    """Groups of names that must not be parted, as `together` says; each ascending, and the groups, too."""
+def group_names(names: Iterable[str], together: Iterable[Iterable[str]]) -> list[list[str]]:
+    """Return groups of names that must not be parted, as `together` says; each ascending, and the groups, too."""
     of = {name: {name} for name in names}
     for some in together:
         joined: set[str] = set().union(*(of.get(name, {name}) for name in some))
@@ -97,8 +96,8 @@ def groups(names: Iterable[str], together: Iterable[Iterable[str]]) -> list[list
     return sorted({id(group): sorted(group) for group in of.values()}.values())
 
 
-def relatives(source: str, plans: Mapping[str, Plan]) -> Iterator[list[str]]:
-    """Plans of one property, and plans whose rooms have the same sizes: the same apartment is on offer more than once."""
+def iter_relatives(source: str, plans: Mapping[str, Plan]) -> Iterator[list[str]]:
+    """Yield plans of one property, and plans whose rooms have the same sizes: the same apartment is on offer more than once."""
     by: dict[object, list[str]] = {}
     for name, plan in plans.items():
         areas = np.sort([shapely.Polygon(room.polygon).area for room in plan.rooms])
@@ -106,11 +105,11 @@ def relatives(source: str, plans: Mapping[str, Plan]) -> Iterator[list[str]]:
         if source == "r2v":
             by.setdefault(name.rpartition("/")[0], []).append(name)
         if source == "home":
-            by.setdefault(physical_building(source, name), []).append(name)
+            by.setdefault(find_physical_building(source, name), []).append(name)
     yield from by.values()
 
 
-def deal(source: str, drawn: list[list[str]]) -> dict[str, list[str]]:
+def assign_splits(source: str, drawn: list[list[str]]) -> dict[str, list[str]]:
     """Groups dealt to the splits in the order of a hash of their names: the test takes its share first, one group at least."""
     order = sorted(drawn, key=lambda group: hashlib.sha256(f"{source}/{group[0]}".encode()).digest())
     total, out = sum(map(len, drawn)), {split: list[str]() for split in SPLITS}
@@ -126,20 +125,20 @@ def deal(source: str, drawn: list[list[str]]) -> dict[str, list[str]]:
 
 def write_lists(data: Path, folder: Path) -> None:
     """Write the lists from the real data that is in `data`."""
-    from topomerge.datasets.plans.floorplans import Refusal, iter_plans, siblings
+    from topomerge.datasets.plans.floorplans import Refusal, group_siblings, iter_plans
 
-    from topomerge.io.atomic import replacing
+    from topomerge.io.archive import replace_on_success
 
     lines: dict[str, list[str]] = {split: [f"procedural/{a}..{b}"] for split, (a, b) in SPLIT_SEEDS.items()}
     lines["test"] += [f"{source}/*" for source in TEST_ONLY]
     for source, name in FOLDERS.items():
         taken = {n: plan for n, plan in iter_plans(data / name) if not isinstance(plan, Refusal)}
-        dealt = deal(source, groups(taken, [*siblings(data / name), *relatives(source, taken)]))
+        dealt = assign_splits(source, group_names(taken, [*group_siblings(data / name), *iter_relatives(source, taken)]))
         for split in SPLITS:
             lines[split] += sorted(f"{source}/{n}" for n in dealt[split] if n in taken)
     for split in SPLITS:
         head = f"# Buildings for {split}: written by python -m topomerge.datasets.plans.splits; see datasets/plans/splits.py\n"
-        with replacing(folder / f"{split}.txt") as beside:
+        with replace_on_success(folder / f"{split}.txt") as beside:
             beside.write_text(head + "\n".join(lines[split]) + "\n", encoding="utf-8")
 
 

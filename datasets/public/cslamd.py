@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 from topomerge.datasets.pairs.pairs import Pair
-from topomerge.datasets.public.sources import POINT_SPACING, framed_pair
+from topomerge.datasets.public.sources import POINT_SPACING, build_framed_pair
 
 from topomerge.errors import InputError
 from topomerge.io.points import read_points
@@ -34,7 +34,7 @@ NUMBER = r"[-+]?[\d.]+(?:[eE][-+]?\d+)?"
 POSE = re.compile(r"(\S+)\s+\[" + r"\s*,\s*".join([rf"\(({NUMBER})\s*,\s*({NUMBER})\)"] * 4) + r"\]\s*")
 
 
-def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
+def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
     """Name and maker of every two sequences of a building.
 
     Raises:
@@ -50,20 +50,20 @@ def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
             yield path.parent.name, partial(_refuse, error)
             continue
         for a, b in combinations(sorted(poses), 2):
-            yield f"{path.parent.name}/{a}-{b}", partial(_pair, path.parent, a, b)
+            yield f"{path.parent.name}/{a}-{b}", partial(_load_pair, path.parent, a, b)
 
 
 def _refuse(error: InputError) -> Pair:
     raise error
 
 
-def _pair(building: Path, a: str, b: str) -> Pair:
-    one, other = (read_points(_mesh(building, name), up=MAP_UP, spacing=POINT_SPACING) for name in (a, b))
+def _load_pair(building: Path, a: str, b: str) -> Pair:
+    one, other = (read_points(_find_mesh(building, name), up=MAP_UP, spacing=POINT_SPACING) for name in (a, b))
     name = f"{building.name}/{a}-{b}"
-    return framed_pair(one, other, Sim3(), name, "cslamd", building.name, "phone", zlib.crc32(name.encode()))
+    return build_framed_pair(one, other, Sim3(), name, "cslamd", building.name, "phone", zlib.crc32(name.encode()))
 
 
-def _mesh(building: Path, name: str) -> Path:
+def _find_mesh(building: Path, name: str) -> Path:
     meshes = sorted(p for p in building.glob(f"meshes/**/{name}*") if p.suffix.lower() in SUFFIXES)
     if not meshes:
         raise InputError(f"{building / 'meshes'}: has no mesh of {name}; fetch {building.name}-meshes.zip")
@@ -71,7 +71,7 @@ def _mesh(building: Path, name: str) -> Path:
 
 
 def read_poses(path: Path) -> dict[str, Array]:
-    """Sequence -> (4, 4) float64 global pose, m.
+    """Read sequence -> (4, 4) float64 global pose, m.
 
     Raises:
         InputError: too large, a damaged line, or no rotation.
@@ -89,12 +89,12 @@ def read_poses(path: Path) -> dict[str, Array]:
             values = np.zeros(8)
         if pose is None or abs(float(np.linalg.norm(values[::2])) - 1) > 0.01:
             raise InputError(f"{path}: line {number} is no name with a pose [(w,w'),(x,x'),(y,y'),(z,z')]; copy it again")
-        out[pose[1]] = dual_quaternion(values[::2], values[1::2])
+        out[pose[1]] = convert_dual_quaternion(values[::2], values[1::2])
     return out
 
 
-def dual_quaternion(real: Array, dual: Array) -> Array:
-    """(4, 4) rigid transform of a unit dual quaternion, w first: the translation is 2 dual * conj(real)."""
+def convert_dual_quaternion(real: Array, dual: Array) -> Array:
+    """Return (4, 4) rigid transform of a unit dual quaternion, w first: the translation is 2 dual * conj(real)."""
     from scipy.spatial.transform import Rotation
 
     w, v = real[0], real[1:]

@@ -13,9 +13,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from topomerge.datasets.pairs.flat import rooms_at
+from topomerge.datasets.pairs.flat_maps import find_rooms
 from topomerge.datasets.pairs.pairs import Pair
-from topomerge.datasets.public.sources import POINT_SPACING, join_rooms, part_pairs
+from topomerge.datasets.public.sources import POINT_SPACING, iter_part_pairs, join_rooms
 
 from topomerge.errors import InputError
 from topomerge.io.points import read_points
@@ -31,7 +31,7 @@ JUNK = ("Z",)  # reflections and stray points
 LARGEST_HOUSE = 100 << 20  # bytes of a .house file
 
 
-def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
+def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
     """Name and maker of a pair of parts of each house.
 
     Raises:
@@ -40,11 +40,11 @@ def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
     houses = sorted(p.parent.parent for p in folder.glob("*/house_segmentations/*.house"))
     if not houses:
         raise InputError(f"{folder}: has no */house_segmentations/*.house; give the folder of the houses (scans)")
-    yield from part_pairs(houses, read_house, "matterport")
+    yield from iter_part_pairs(houses, read_house, "matterport")
 
 
 def read_house(folder: Path) -> PointCloud:
-    """The points of a house, labelled with their rooms; junk and what is outside of every region are left out.
+    """Read the points of a house, labelled with their rooms; junk and what is outside of every region are left out.
 
     Raises:
         InputError: a file is missing, damaged or cut short.
@@ -53,10 +53,10 @@ def read_house(folder: Path) -> PointCloud:
     rooms = read_regions(files / f"{folder.name}.house")
     meshes = {i: folder / "region_segmentations" / f"region{i}.ply" for i in rooms}
     if any(path.is_file() for path in meshes.values()):
-        parts = [(room, _points(meshes[i])) for i, room in rooms.items()]
+        parts = [(room, _read_points(meshes[i])) for i, room in rooms.items()]
     else:
-        points = _points(files / f"{folder.name}.ply")
-        labels = _within(points, list(rooms.values()))
+        points = _read_points(files / f"{folder.name}.ply")
+        labels = _find_rooms(points, list(rooms.values()))
         parts = [(room, points[labels == k]) for k, room in enumerate(rooms.values())]
     parts = [(room, points) for room, points in parts if len(points)]
     if not parts:
@@ -65,7 +65,7 @@ def read_house(folder: Path) -> PointCloud:
 
 
 def read_regions(path: Path) -> dict[int, TrueRoom]:
-    """Region -> room, from a .house file; the outline is that of the region's first surface, or else its box.
+    """Read region -> room, from a .house file; the outline is that of the region's first surface, or else its box.
 
     Raises:
         InputError: missing, damaged, or with fewer regions than its first line says.
@@ -84,33 +84,33 @@ def read_regions(path: Path) -> dict[int, TrueRoom]:
         if len(regions) != int(head[10]):
             raise InputError(f"{path}: has {len(regions)} regions and promises {head[10]}; it is cut short, copy it again")
         outlines = {region: corners[s] for s, region in sorted(surfaces.items(), reverse=True) if len(corners.get(s, ())) > 2}
-        return {i: _room(w, outlines.get(i)) for i, w in sorted(regions.items()) if w[5] not in JUNK}
+        return {i: _build_room(w, outlines.get(i)) for i, w in sorted(regions.items()) if w[5] not in JUNK}
     except (StopIteration, IndexError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: is no .house file, or damaged ({error}); copy it again") from error
 
 
-def _room(words: list[str], outline: list[list[float]] | None) -> TrueRoom:
+def _build_room(words: list[str], outline: list[list[float]] | None) -> TrueRoom:
     x0, y0, z0, x1, y1, z1 = (float(v) for v in words[9:15])
     polygon = np.array(outline or [[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
     return TrueRoom(f"region{words[1]}", polygon, z0, z1, int(words[2]), REGION_KINDS.get(words[5], ""))
 
 
-def _points(path: Path) -> Array:
+def _read_points(path: Path) -> Array:
     if not path.is_file():
         raise InputError(f"{path}: no such file; copy the house again")
     cloud = read_points(path, spacing=POINT_SPACING)
     return cloud.points.astype(np.float64) + cloud.shift
 
 
-def _within(points: Array, rooms: list[TrueRoom]) -> Array:
+def _find_rooms(points: Array, rooms: list[TrueRoom]) -> Array:
     """(n,) room whose prism holds a point, -1: none."""
     out = np.full(len(points), -1)
     for storey in sorted({room.storey for room in rooms}):
         here = [k for k, room in enumerate(rooms) if room.storey == storey]
         low, high = min(rooms[k].floor for k in here) - 0.1, max(rooms[k].ceiling for k in here) + 0.1
         rows = np.flatnonzero((points[:, 2] >= low) & (points[:, 2] <= high) & (out < 0))
-        nearest = rooms_at(points[rows, :2], [rooms[k] for k in here])
+        nearest = find_rooms(points[rows, :2], [rooms[k] for k in here])
         out[rows] = np.where(nearest >= 0, np.array(here)[nearest], -1)
     return out

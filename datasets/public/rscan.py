@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from topomerge.datasets.pairs.pairs import Pair
-from topomerge.datasets.public.sources import POINT_SPACING, framed_pair, read_json
+from topomerge.datasets.public.sources import POINT_SPACING, build_framed_pair, read_json
 
 from topomerge.errors import InputError
 from topomerge.io.points import read_points
@@ -31,7 +31,7 @@ FARTHEST_LEAN = 50.0  # m between the frames of two scans of a room; numbers bey
 TILT = 10.0  # degrees; a transform that leans more is wrong
 
 
-def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
+def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
     """Name and maker of a pair of each reference and each of its later scans that is there.
 
     Raises:
@@ -44,22 +44,22 @@ def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
         for scan in scene.get("scans", []):
             a, b = str(scene["reference"]), str(scan.get("reference", ""))
             if (folder / a).is_dir() or (folder / b).is_dir():  # most people fetch some of the scans
-                yield f"{a[:8]}-{b[:8]}", partial(_pair, folder, a, b, scan.get("transform"))
+                yield f"{a[:8]}-{b[:8]}", partial(_load_pair, folder, a, b, scan.get("transform"))
 
 
-def _pair(folder: Path, a: str, b: str, transform: Any) -> Pair:
+def _load_pair(folder: Path, a: str, b: str, transform: Any) -> Pair:
     if transform is None:
         raise InputError(f"{b}: no transform is published (hidden test set)")
-    published, lean = upright(read_transform(transform, b))
+    published, lean = split_yaw_and_tilt(read_transform(transform, b))
     first, second = _read(folder / a), _read(folder / b)
     points = (second.points.astype(np.float64) + second.shift) @ lean.T
     second = PointCloud(points.astype(np.float32), source=second.source)
     name = f"{a[:8]}-{b[:8]}"
-    return framed_pair(first, second, published, name, "rscan", a, "depth", zlib.crc32(name.encode()))
+    return build_framed_pair(first, second, published, name, "rscan", a, "depth", zlib.crc32(name.encode()))
 
 
 def read_transform(numbers: Any, name: str) -> Array:
-    """(4, 4) float64, m, of 16 numbers.
+    """Read (4, 4) float64, m, of 16 numbers.
 
     Raises:
         InputError: not a rigid transform.
@@ -76,8 +76,8 @@ def read_transform(numbers: Any, name: str) -> Array:
     return matrix
 
 
-def upright(matrix: Array) -> tuple[Sim3, Array]:
-    """A rigid transform as one about the vertical after a lean: matrix = Sim3 · (3, 3) lean.
+def split_yaw_and_tilt(matrix: Array) -> tuple[Sim3, Array]:
+    """Return a rigid transform as one about the vertical after a lean: matrix = Sim3 · (3, 3) lean.
 
     Raises:
         InputError: it leans by more than `TILT`.

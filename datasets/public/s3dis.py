@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from topomerge.datasets.pairs.pairs import Pair
 from topomerge.datasets.plans.sealed import refuse_building
-from topomerge.datasets.public.sources import hull, join_rooms, part_pairs
+from topomerge.datasets.public.sources import compute_hull, iter_part_pairs, join_rooms
 
 from topomerge.errors import InputError
 from topomerge.types import Array, PointCloud, TrueRoom
@@ -35,7 +35,7 @@ LARGEST_TABLE = 1 << 30  # bytes of a table
 CONTROL = bytes(set(range(32)) - set(b"\t\n\r"))
 
 
-def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
+def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
     """Name and maker of a pair of parts of each area.
 
     Raises:
@@ -44,7 +44,7 @@ def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
     areas = sorted(p for p in folder.iterdir() if p.is_dir() and re.fullmatch(r"Area_\d\w*", p.name))
     if not areas:
         raise InputError(f"{folder}: has no folder Area_1 ...; give the one of Stanford3dDataset_v1.2")
-    yield from part_pairs(areas, read_area, "s3dis")
+    yield from iter_part_pairs(areas, read_area, "s3dis")
 
 
 def read_area(area: Path) -> PointCloud:
@@ -61,7 +61,7 @@ def read_area(area: Path) -> PointCloud:
             name = folder.name
             kind = S3DIS_KINDS.get(name.rpartition("_")[0], name.rpartition("_")[0])
             floor, ceiling = np.percentile(points[:, 2], [1, 99]).tolist()
-            parts.append((TrueRoom(name, hull(points), floor, ceiling, 0, kind), points))
+            parts.append((TrueRoom(name, compute_hull(points), floor, ceiling, 0, kind), points))
         except InputError as error:
             lost.append(str(error))
     if not parts:
@@ -70,7 +70,7 @@ def read_area(area: Path) -> PointCloud:
 
 
 def read_room(folder: Path) -> Array:
-    """(n, 3) float64 points of a room.
+    """Read (n, 3) float64 points of a room.
 
     Raises:
         InputError: no table, or a damaged one.
@@ -79,10 +79,10 @@ def read_room(folder: Path) -> Array:
     tables = [table] if table.is_file() else sorted((folder / "Annotations").glob("*.txt"))
     if not tables:
         raise InputError(f"{folder}: has neither {folder.name}.txt nor Annotations; copy it again")
-    return np.concatenate([_table(path) for path in tables])
+    return np.concatenate([_read_table(path) for path in tables])
 
 
-def _table(path: Path) -> Array:
+def _read_table(path: Path) -> Array:
     if not 0 < path.stat().st_size <= LARGEST_TABLE:
         raise InputError(f"{path}: has {path.stat().st_size} bytes; a table of points has 1 to {LARGEST_TABLE}")
     text = path.read_bytes().translate(None, delete=CONTROL)

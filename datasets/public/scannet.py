@@ -1,12 +1,4 @@
-"""ScanNet (Dai et al. 2017): rooms scanned with a tablet, many of them several times.
-
-    scans/scene0000_00/scene0000_00_vh_clean_2.ply                    mesh, m, z up
-    scans/scene0000_00/scene0000_00_vh_clean_2.0.010000.segs.json     segment of each vertex
-    scans/scene0000_00/scene0000_00.aggregation.json                  objects: label and segments
-    scans/scene0000_00/scene0000_00.txt                               name = value; axisAlignment, sceneType
-
-How two scans of one place lie to each other is not published, so there are no pairs: `places` groups the scans.
-"""
+"""ScanNet (Dai et al. 2017): rooms scanned with a tablet."""
 
 from __future__ import annotations
 
@@ -17,14 +9,39 @@ from pathlib import Path
 
 import numpy as np
 from topomerge.datasets.plans.floorplans import Refusal
-from topomerge.datasets.public.annotation import read_objects
-from topomerge.datasets.public.sources import hull
-from topomerge.datasets.real.sources import reason
+from topomerge.datasets.public.sources import compute_hull, read_json
+from topomerge.datasets.real.sources import format_reason
 
 from topomerge.errors import InputError
 from topomerge.io.ply import read_header
 from topomerge.io.points import read_points
 from topomerge.types import Array, PointCloud, TrueRoom
+
+
+def read_objects(segments: Path, groups: Path, vertices: int) -> tuple[tuple[str, ...], Array]:
+    """Read labels of the objects, and (n,) int32 object of each vertex, -1: none.
+
+    Args:
+        segments: ``*.segs.json`` with `segIndices`, the segment of each vertex.
+        groups: ``*aggregation.json`` or ``semseg*.json`` with `segGroups`, the label and the segments of each object.
+        vertices: of the mesh.
+
+    Raises:
+        InputError: missing or damaged file, or one of another mesh.
+    """
+    held, listed = read_json(segments), read_json(groups)
+    try:
+        segment = np.array(held["segIndices"], np.int64)
+        objects = [(str(g["label"]), np.array(g["segments"], np.int64)) for g in listed["segGroups"]]
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{groups}: it or {segments.name} lacks what a segmentation holds ({error}); copy both again") from error
+    if len(segment) != vertices:
+        raise InputError(f"{segments}: segments {len(segment)} vertices and the mesh has {vertices}; are both of one version?")
+    out = np.full(len(segment), -1, np.int32)
+    for number, (_, members) in enumerate(objects):
+        out[np.isin(segment, members)] = number
+    return tuple(label for label, _ in objects), out
+
 
 NAME = re.compile(r"scene\d{4}_\d\d")
 LARGEST_VALUES = 1 << 20  # bytes of the table of values
@@ -48,27 +65,27 @@ class Scene:
 
 
 def iter_scenes(folder: str | Path) -> Iterator[tuple[str, Scene | Refusal]]:
-    """Every scan of a folder, in the order of their names; a bad one is a `Refusal` and the rest goes on.
+    """Yield every scan of a folder, in the order of their names; a bad one is a `Refusal` and the rest goes on.
 
     Raises:
         InputError: the folder has no scan.
     """
-    for name in _names(Path(folder)):
+    for name in _list_names(Path(folder)):
         try:
             yield name, read_scene(Path(folder) / name)
         except Exception as error:  # one bad item never ends a run
-            yield name, Refusal(name, reason(error))
+            yield name, Refusal(name, format_reason(error))
 
 
-def places(folder: str | Path) -> dict[str, list[str]]:
+def group_scans_by_place(folder: str | Path) -> dict[str, list[str]]:
     """Place -> names of its scans, for places that were scanned more than once."""
     out: dict[str, list[str]] = {}
-    for name in _names(Path(folder)):
+    for name in _list_names(Path(folder)):
         out.setdefault(name.partition("_")[0], []).append(name)
     return {place: names for place, names in out.items() if len(names) > 1}
 
 
-def _names(folder: Path) -> list[str]:
+def _list_names(folder: Path) -> list[str]:
     names = sorted(p.name for p in folder.iterdir() if NAME.fullmatch(p.name)) if folder.is_dir() else []
     if not names:
         raise InputError(f"{folder}: has no folder scene0000_00 ...; give the folder of the scans")
@@ -76,7 +93,7 @@ def _names(folder: Path) -> list[str]:
 
 
 def read_scene(folder: Path) -> Scene:
-    """One scan.
+    """Read one scan.
 
     Raises:
         InputError: the mesh is missing or damaged, or the annotation is of another mesh.
@@ -88,7 +105,7 @@ def read_scene(folder: Path) -> Scene:
     vertex = read_header(mesh).find("vertex")
     cloud = read_points(mesh, spacing=1.0)  # the vertices come first, then points on the faces
     count = vertex.count if vertex else 0
-    values = _values(folder / f"{name}.txt")
+    values = _read_values(folder / f"{name}.txt")
     points = (cloud.points[:count].astype(np.float64) + cloud.shift) @ values[0][:3, :3].T + values[0][:3, 3]
     if not len(points):
         raise InputError(f"{mesh}: holds no vertices; copy it again")
@@ -97,14 +114,14 @@ def read_scene(folder: Path) -> Scene:
     if groups.is_file():
         objects, object_of = read_objects(folder / f"{name}_vh_clean_2.0.010000.segs.json", groups, count)
     floor, ceiling = np.percentile(points[:, 2], [1, 99]).tolist()
-    room = TrueRoom(name, hull(points), floor, ceiling, 0, values[1])
+    room = TrueRoom(name, compute_hull(points), floor, ceiling, 0, values[1])
     labels = np.zeros(len(points), np.int32)
     colors = None if cloud.colors is None else cloud.colors[:count]
     placed = PointCloud(points.astype(np.float32), colors=colors, labels=labels, rooms=(room,), source=name)
     return Scene(placed, objects, object_of, name.partition("_")[0])
 
 
-def _values(path: Path) -> tuple[Array, str]:
+def _read_values(path: Path) -> tuple[Array, str]:
     """Alignment (4, 4) and kind of a scan; the identity and nothing where they are not published."""
     if not path.is_file() or path.stat().st_size > LARGEST_VALUES:
         return np.eye(4), ""

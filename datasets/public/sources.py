@@ -5,8 +5,8 @@
 | `s3dis` | `Area_1` ... with a folder a room | two connected parts of an area |
 | `matterport` | a folder a house | two connected parts of a house |
 | `rscan` | `3RScan.json` and a folder a scan | a scan of a room and one of a later day |
-| `cslamd` | `Flat`, `House`, `Lab`, `Priory` | two sequences of a building |
-| `scannet` | a folder a scan | none: no truth is published; `scannet.places` groups the scans of a place |
+| `cslamd` | `FlatMap`, `House`, `Lab`, `Priory` | two sequences of a building |
+| `scannet` | a folder a scan | none: no truth is published; `scannet.group_scans_by_place` groups the scans of a place |
 
 Each is a module `topomerge.datasets.public.<source>` with a function ``pairs(folder)``, which gives the name and the maker of
 each pair, as the sources of `datasets.real` do. `cslamd` maps an assumption or two; see there.
@@ -26,13 +26,13 @@ from typing import Any
 import numpy as np
 import shapely
 from scipy.spatial import cKDTree
-from topomerge.datasets.pairs.flat import floor_overlap, thin
-from topomerge.datasets.pairs.pairs import Pair, draw_frames, seen_by_both
-from topomerge.datasets.pairs.parts import share
+from topomerge.datasets.pairs.flat_maps import measure_floor_overlap, thin
+from topomerge.datasets.pairs.pairs import Pair, draw_frames, find_common_rooms
+from topomerge.datasets.pairs.parts import compute_dice
 from topomerge.datasets.plans.floorplans import Refusal
 from topomerge.datasets.plans.sealed import refuse_building
 from topomerge.datasets.real.sources import collect
-from topomerge.datasets.simulation.scanner import moved
+from topomerge.datasets.simulation.scanner import transform_cloud
 
 from topomerge.errors import InputError
 from topomerge.types import Array, PointCloud, Sim3, TrueRoom
@@ -47,7 +47,7 @@ LEAST_ROOMS_TO_CUT = 4  # rooms that can be cut into two parts
 
 
 def iter_public_pairs(folder: str | Path, source: str) -> Iterator[tuple[str, Pair | Refusal]]:
-    """Every pair of a set; what is missing, damaged or sealed is a `Refusal`, and the rest goes on.
+    """Yield every pair of a set; what is missing, damaged or sealed is a `Refusal`, and the rest goes on.
 
     Raises:
         InputError: no such folder or source.
@@ -56,22 +56,22 @@ def iter_public_pairs(folder: str | Path, source: str) -> Iterator[tuple[str, Pa
         raise InputError(f"source {source!r}: {', '.join(PUBLIC_SOURCES)} are possible")
     if not Path(folder).is_dir():
         raise InputError(f"{folder}: no such folder; give the one that holds the data set")
-    return collect(source, _unsealed(source, import_module(f"topomerge.datasets.public.{source}").pairs(Path(folder))))
+    return collect(source, _guard_sealed(source, import_module(f"topomerge.datasets.public.{source}").iter_pairs(Path(folder))))
 
 
-def _unsealed(source: str, makers: Iterator[tuple[str, Callable[[], Pair]]]) -> Iterator[tuple[str, Callable[[], Pair]]]:
+def _guard_sealed(source: str, makers: Iterator[tuple[str, Callable[[], Pair]]]) -> Iterator[tuple[str, Callable[[], Pair]]]:
     """The makers, of which those of sealed buildings refuse."""
     for name, make in makers:
-        yield name, partial(_made_unsealed, source, name, make)
+        yield name, partial(_make_if_unsealed, source, name, make)
 
 
-def _made_unsealed(source: str, name: str, make: Callable[[], Pair]) -> Pair:
+def _make_if_unsealed(source: str, name: str, make: Callable[[], Pair]) -> Pair:
     refuse_building(source, name)
     return make()
 
 
 def read_json(path: Path) -> Any:
-    """What a JSON file holds.
+    """Read a JSON file.
 
     Raises:
         InputError: missing, far too large, or damaged.
@@ -87,7 +87,7 @@ def read_json(path: Path) -> Any:
 
 
 def join_rooms(parts: Sequence[tuple[TrueRoom, Array]], source: str) -> PointCloud:
-    """One cloud of rooms and their points (n, 3), thinned to `POINT_SPACING`."""
+    """Join rooms and their points (n, 3) into one cloud, thinned to `POINT_SPACING`."""
     thinned = [thin(points, POINT_SPACING) for _, points in parts]
     points = np.concatenate(thinned)
     shift = np.round(points.mean(axis=0), 0) if np.abs(points).max() > 1000 else np.zeros(3)
@@ -96,23 +96,23 @@ def join_rooms(parts: Sequence[tuple[TrueRoom, Array]], source: str) -> PointClo
     return PointCloud((points - shift).astype(np.float32), shift, labels=labels, rooms=rooms, source=source)
 
 
-def hull(points: Array) -> Array:
-    """(k, 2) convex outline of points, counter-clockwise: where no outline is published."""
+def compute_hull(points: Array) -> Array:
+    """Compute (k, 2) convex outline of points, counter-clockwise: where no outline is published."""
     shape = shapely.convex_hull(shapely.multipoints(points[:, :2]))
     if shape.geom_type != "Polygon":
         raise InputError("its points lie on one line; no room has this shape")
     return np.asarray(shapely.normalize(shape).exterior.coords)[-2::-1].copy()
 
 
-def part_pairs(
+def iter_part_pairs(
     folders: Sequence[Path], read: Callable[[Path], PointCloud], source: str
 ) -> Iterator[tuple[str, Callable[[], Pair]]]:
     """Name and maker of a pair of parts of each building, which `read` gives as a labelled cloud."""
     for folder in folders:
-        yield folder.name, partial(_part_pair, folder, read, source)
+        yield folder.name, partial(_make_part_pair, folder, read, source)
 
 
-def _part_pair(folder: Path, read: Callable[[Path], PointCloud], source: str) -> Pair:
+def _make_part_pair(folder: Path, read: Callable[[Path], PointCloud], source: str) -> Pair:
     return cut_pair(read(folder), folder.name, source, "matterport", zlib.crc32(folder.name.encode()))
 
 
@@ -123,23 +123,23 @@ def cut_pair(cloud: PointCloud, name: str, source: str, sensor: str, seed: int) 
         InputError: too few rooms that hang together.
     """
     rng = np.random.default_rng(seed)
-    a, b = two_parts(room_neighbours(cloud), rng)
+    a, b = sample_two_parts(find_room_neighbours(cloud), rng)
     frames = draw_frames(2, False, rng)
-    maps = [moved(_only(cloud, part), frame) for part, frame in zip((a, b), frames, strict=True)]
+    maps = [transform_cloud(_select_rooms(cloud, part), frame) for part, frame in zip((a, b), frames, strict=True)]
     truth = frames[0] @ frames[1].inverse()
     one, other = maps
-    shared, visited, both = seen_by_both(one, other), (tuple(a), tuple(b)), (frames[0], frames[1])
-    return Pair(name, one, other, truth, shared, share(a, b), (sensor, sensor), source, name, visited=visited, frames=both)
+    shared, visited, both = find_common_rooms(one, other), (tuple(a), tuple(b)), (frames[0], frames[1])
+    return Pair(name, one, other, truth, shared, compute_dice(a, b), (sensor, sensor), source, name, visited=visited, frames=both)
 
 
-def _only(cloud: PointCloud, rooms: Sequence[int]) -> PointCloud:
+def _select_rooms(cloud: PointCloud, rooms: Sequence[int]) -> PointCloud:
     assert cloud.labels is not None
     in_rooms = np.isin(cloud.labels, rooms)
     return replace(cloud, points=cloud.points[in_rooms], labels=cloud.labels[in_rooms])
 
 
-def room_neighbours(cloud: PointCloud) -> dict[int, set[int]]:
-    """Room -> rooms that lie side by side with it, through a thin wall or a door; rooms without points are left out."""
+def find_room_neighbours(cloud: PointCloud) -> dict[int, set[int]]:
+    """Find room -> rooms that lie side by side with it, through a thin wall or a door; rooms without points are left out."""
     assert cloud.labels is not None
     trees = {int(i): cKDTree(thin(cloud.points[cloud.labels == i], 0.1)) for i in np.unique(cloud.labels[cloud.labels >= 0])}
     out: dict[int, set[int]] = {i: set() for i in trees}
@@ -157,8 +157,8 @@ def room_neighbours(cloud: PointCloud) -> dict[int, set[int]]:
     return out
 
 
-def two_parts(neighbours: dict[int, set[int]], rng: np.random.Generator) -> tuple[list[int], list[int]]:
-    """Two connected sets of rooms that share a connected core.
+def sample_two_parts(neighbours: dict[int, set[int]], rng: np.random.Generator) -> tuple[list[int], list[int]]:
+    """Sample two connected sets of rooms that share a connected core.
 
     Raises:
         InputError: fewer than `LEAST_ROOMS_TO_CUT` rooms hang together.
@@ -180,7 +180,7 @@ def two_parts(neighbours: dict[int, set[int]], rng: np.random.Generator) -> tupl
 
 
 def grow(neighbours: dict[int, set[int]], start: list[int], count: int, rng: np.random.Generator) -> list[int]:
-    """Up to `count` rooms that hang together, with those to start from."""
+    """Grow connected rooms from those given, up to `count` of them."""
     out = list(start)
     while len(out) < count:
         edge = sorted(set().union(*(neighbours[i] for i in out)) - set(out))
@@ -190,13 +190,13 @@ def grow(neighbours: dict[int, set[int]], start: list[int], count: int, rng: np.
     return out
 
 
-def framed_pair(
+def build_framed_pair(
     a: PointCloud, b: PointCloud, published: Sim3, name: str, source: str, building: str, sensor: str, seed: int
 ) -> Pair:
-    """Two clouds whose relation (b into a) is `published`, moved into random frames."""
+    """Build two clouds whose relation (b into a) is `published`, moved into random frames."""
     frames = draw_frames(2, False, np.random.default_rng(seed))
     truth = frames[0] @ published @ frames[1].inverse()
     flat = [c.points[:, :2].astype(np.float64) + c.shift[:2] for c in (a, b)]
     there = published.apply(np.column_stack([flat[1], np.zeros(len(flat[1]))]))[:, :2]
-    clouds = moved(a, frames[0]), moved(b, frames[1])
-    return Pair(name, *clouds, truth, (), floor_overlap(flat[0], there), (sensor, sensor), source, building)
+    clouds = transform_cloud(a, frames[0]), transform_cloud(b, frames[1])
+    return Pair(name, *clouds, truth, (), measure_floor_overlap(flat[0], there), (sensor, sensor), source, building)

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from topomerge.datasets.pairs.flat import Flat, flat_pair
+from topomerge.datasets.pairs.flat_maps import FlatMap, build_flat_pair
 from topomerge.datasets.pairs.pairs import Pair, draw_frames
 
 from topomerge.errors import InputError
@@ -32,7 +32,7 @@ FEWEST_SCANS = 20  # scans of a part
 LOG_CELLS = 200_000_000  # of a raster
 
 
-def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
+def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
     """Name and maker of three pairs a log.
 
     Raises:
@@ -43,25 +43,27 @@ def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
         raise InputError(f"{folder}: has no *.log.gz; check the folder")
     for path in logs:
         for a, b in PAIRS:
-            yield f"{_site(path)}-{a}-{b}", partial(_pair, path, a, b)
+            yield f"{_parse_site(path)}-{a}-{b}", partial(_load_pair, path, a, b)
 
 
-def _site(path: Path) -> str:
+def _parse_site(path: Path) -> str:
     return path.name.removesuffix(".log.gz").removesuffix("-corrected")
 
 
-def _pair(path: Path, a: str, b: str) -> Pair:
-    name = f"{_site(path)}-{a}-{b}"
+def _load_pair(path: Path, a: str, b: str) -> Pair:
+    name = f"{_parse_site(path)}-{a}-{b}"
     poses, ranges = read_log(path)
     seed = zlib.crc32(name.encode())
     frames = [Sim3(f.yaw, (*f.translation[:2], 0.0)) for f in draw_frames(2, False, np.random.default_rng(seed))]
-    maps = [draw(poses[rows], ranges[rows], frame, name) for rows, frame in zip(split(len(poses), a, b), frames, strict=True)]
+    maps = [
+        draw_map(poses[rows], ranges[rows], frame, name) for rows, frame in zip(split_log(len(poses), a, b), frames, strict=True)
+    ]
     truth = frames[0] @ frames[1].inverse()
-    return flat_pair(name, maps[0], maps[1], truth, ("laser2d", "laser2d"), "carmen", _site(path))
+    return build_flat_pair(name, maps[0], maps[1], truth, ("laser2d", "laser2d"), "carmen", _parse_site(path))
 
 
-def split(count: int, a: str, b: str) -> tuple[Array, Array]:
-    """Scans of two parts of a log; of the span that is in both, they take every other scan.
+def split_log(count: int, a: str, b: str) -> tuple[Array, Array]:
+    """Return scans of two parts of a log; of the span that is in both, they take every other scan.
 
     Raises:
         InputError: the log is too short.
@@ -75,7 +77,7 @@ def split(count: int, a: str, b: str) -> tuple[Array, Array]:
 
 
 def read_log(path: Path) -> tuple[Array, Array]:
-    """Poses (n, 3) of the laser in m and rad, and ranges (n, k) in m, of the FLASER lines of a packed CARMEN log.
+    """Read poses (n, 3) of the laser in m and rad, and ranges (n, k) in m, of the FLASER lines of a packed CARMEN log.
 
     Raises:
         InputError: no gzip, cut short, far too large, a damaged line, or no scans.
@@ -111,8 +113,8 @@ def read_log(path: Path) -> tuple[Array, Array]:
     return np.array(poses), np.array(ranges)
 
 
-def draw(poses: Array, ranges: Array, frame: Sim3, source: str = "") -> Flat:
-    """The map that scans give: what rays ended at is wall, what they crossed is free.
+def draw_map(poses: Array, ranges: Array, frame: Sim3, source: str = "") -> FlatMap:
+    """Draw the map that scans give: what rays ended at is wall, what they crossed is free.
 
     Args:
         poses: (n, 3) of the laser, m and rad.
@@ -136,16 +138,16 @@ def draw(poses: Array, ranges: Array, frame: Sim3, source: str = "") -> Flat:
     for start in range(0, len(poses), SCAN_BLOCK):
         block = slice(start, start + SCAN_BLOCK)
         origins = np.stack([x[block], y[block]], axis=1) - low
-        for counts, points in zip((ended, crossed), _rays(origins, yaw[block, None] + angles, ranges[block]), strict=True):
+        for counts, points in zip((ended, crossed), _cast_rays(origins, yaw[block, None] + angles, ranges[block]), strict=True):
             cells = np.floor(points / LOG_CELL).astype(np.int64)
             counts += np.bincount(cells[:, 1] * wide + cells[:, 0], minlength=wide * high).astype(np.int32)
     wall = (ended > 0) & (ended >= SOLID * (ended + crossed))
     at = [np.stack(np.divmod(np.flatnonzero(m), wide)[::-1], axis=1) for m in (wall, (crossed > 0) & ~wall)]
     walls, free = ((cells + 0.5) * LOG_CELL + low for cells in at)
-    return Flat(walls, free, LOG_CELL, poses=np.column_stack([x, y, yaw]), source=source)
+    return FlatMap(walls, free, LOG_CELL, poses=np.column_stack([x, y, yaw]), source=source)
 
 
-def _rays(origins: Array, headings: Array, ranges: Array) -> tuple[Array, Array]:
+def _cast_rays(origins: Array, headings: Array, ranges: Array) -> tuple[Array, Array]:
     """Where the rays (n, k) of n scans ended within `LASER_REACH`, and points on the way there, one a cell: (m, 2) each."""
     good = (ranges > NEAREST) & (ranges < FAILED)
     scan = np.nonzero(good)[0]

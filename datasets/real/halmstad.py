@@ -13,7 +13,7 @@ from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
-from topomerge.datasets.pairs.flat import Flat, flat_pair, read_flat
+from topomerge.datasets.pairs.flat_maps import FlatMap, build_flat_pair, read_flat
 from topomerge.datasets.pairs.pairs import Pair
 
 from topomerge.errors import InputError
@@ -23,7 +23,7 @@ PIXEL = 0.02  # m
 LARGEST_LISTING = 10 << 20  # bytes of the list of pairs
 
 
-def pairs(folder: Path, pixel: float = PIXEL) -> Iterator[tuple[str, Callable[[], Pair]]]:
+def iter_pairs(folder: Path, pixel: float = PIXEL) -> Iterator[tuple[str, Callable[[], Pair]]]:
     """Name and maker of every pair of maps of one place; of the two orders in which a pair is listed, the first.
 
     Args:
@@ -45,10 +45,10 @@ def pairs(folder: Path, pixel: float = PIXEL) -> Iterator[tuple[str, Callable[[]
     for a, b, same in truths:
         if frozenset((a, b)) not in done:
             done.add(frozenset((a, b)))
-            yield f"{a}-{b}", partial(_pair, read, {n: p * pixel for n, p in points.items()}, a, b, same)
+            yield f"{a}-{b}", partial(_load_pair, read, {n: p * pixel for n, p in points.items()}, a, b, same)
 
 
-def _pair(read: Callable[[str], Flat], points: dict[str, Array], a: str, b: str, same: Array) -> Pair:
+def _load_pair(read: Callable[[str], FlatMap], points: dict[str, Array], a: str, b: str, same: Array) -> Pair:
     """One pair, in the owner's frames: they differ."""
     maps = read(a), read(b)
     try:
@@ -56,17 +56,17 @@ def _pair(read: Callable[[str], Flat], points: dict[str, Array], a: str, b: str,
     except (KeyError, IndexError) as error:
         raise InputError(f"{a}-{b}: a key point is missing ({error}); copy the list of pairs again") from error
     sensors = tuple("drawing" if n.endswith("layout") else "phone" for n in (a, b))
-    return flat_pair(f"{a}-{b}", *maps, truth, (sensors[0], sensors[1]), "halmstad", a.split("_")[0])
+    return build_flat_pair(f"{a}-{b}", *maps, truth, (sensors[0], sensors[1]), "halmstad", a.split("_")[0])
 
 
-def _read(folder: Path, pixel: float, name: str) -> Flat:
+def _read(folder: Path, pixel: float, name: str) -> FlatMap:
     drawn = name.endswith("layout")
     path = folder / "maps" / name.split("_")[0] / ("layout" if drawn else "pseudo_occupancy") / f"{name}.png"
     return read_flat(path, pixel, rays=not drawn)
 
 
 def fit_points(a: Array, b: Array) -> Sim3:
-    """The similarity that maps points b (n, 2) onto a (n, 2) with the least squares.
+    """Fit the similarity that maps points b (n, 2) onto a (n, 2) with the least squares.
 
     Raises:
         InputError: fewer than two points, or all in one place.

@@ -14,14 +14,14 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
-from topomerge.datasets.buildings.erect import erect
+from topomerge.datasets.buildings.construction import build_building
 from topomerge.datasets.core.building import SURFACES, THING_DTYPE, Building
-from topomerge.datasets.pairs.flat import rooms_at
-from topomerge.datasets.pairs.pairs import Pair, draw_frames, seen_by_both
-from topomerge.datasets.pairs.parts import share
-from topomerge.datasets.plans.floorplans import Refusal, iter_plans, landed
-from topomerge.datasets.simulation.scanner import moved, scan
-from topomerge.datasets.simulation.walk import part
+from topomerge.datasets.pairs.flat_maps import find_rooms
+from topomerge.datasets.pairs.pairs import Pair, draw_frames, find_common_rooms
+from topomerge.datasets.pairs.parts import compute_dice
+from topomerge.datasets.plans.floorplans import Refusal, iter_plans, remove_dead_flights
+from topomerge.datasets.simulation.scanner import scan_building, transform_cloud
+from topomerge.datasets.simulation.walk import sample_part
 
 from topomerge.errors import InputError
 from topomerge.io.points import read_points
@@ -34,28 +34,28 @@ IFC_SPACING = 0.08  # m between the points sampled on the model
 UNDER_CEILING = 0.15  # m under its floor that a point may lie
 
 
-def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
+def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
     """Name and maker of a pair for each of `MODELS`."""
     for name in MODELS:
-        yield f"{name}-scan", partial(_pair, folder / f"{name}.ifc")
+        yield f"{name}-scan", partial(_load_pair, folder / f"{name}.ifc")
 
 
-def _pair(path: Path) -> Pair:
+def _load_pair(path: Path) -> Pair:
     sensor, visits = MODELS[path.stem]
     rng = np.random.default_rng(zlib.crc32(path.stem.encode()))
-    building = model_building(path)
+    building = load_model_building(path)
     inside = [i for i, r in enumerate(building.rooms) if r.kind != "lift"]
-    visited = part(building, max(round(visits * len(inside)), 1), rng)
+    visited = sample_part(building, max(round(visits * len(inside)), 1), rng)
     frames = draw_frames(2, False, rng)
-    a = moved(_model_points(path, building), frames[0])
-    b = scan(building, sensor, visited, rng, frame=frames[1])
+    a = transform_cloud(_sample_model(path, building), frames[0])
+    b = scan_building(building, sensor, visited, rng, frame=frames[1])
     return Pair(
         name=f"{path.stem}-scan",
         a=a,
         b=b,
         truth=frames[0] @ frames[1].inverse(),
-        shared=seen_by_both(a, b),
-        overlap=share(visited.tolist(), inside),
+        shared=find_common_rooms(a, b),
+        overlap=compute_dice(visited.tolist(), inside),
         sensors=("model", sensor),
         source="ifc",
         building=path.stem,
@@ -64,7 +64,7 @@ def _pair(path: Path) -> Pair:
     )
 
 
-def model_building(path: Path) -> Building:
+def load_model_building(path: Path) -> Building:
     """The model's own triangles, with the rooms, doors and stairs of its plans, in the model's frame but for the height: the
     lowest floor is at 0.
 
@@ -74,9 +74,9 @@ def model_building(path: Path) -> Building:
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the folder")
     plans = [plan for _, plan in iter_plans(path) if not isinstance(plan, Refusal)]  # a roof has no rooms
-    drawn = erect(landed(plans), name=path.stem, kind="model")
-    corners, labels = _triangles(path)
-    corners = corners - [0.0, 0.0, _ground(path, drawn)]
+    drawn = build_building(remove_dead_flights(plans), name=path.stem, kind="model")
+    corners, labels = _load_triangles(path)
+    corners = corners - [0.0, 0.0, _find_ground(path, drawn)]
     floor = drawn.labels == SURFACES.index("floor")  # some models hold walls and ceilings only; elsewhere it lies on the slab
     corners = np.concatenate([corners, drawn.vertices[drawn.triangles[floor]]])
     labels = np.concatenate([labels, drawn.labels[floor]])
@@ -90,15 +90,15 @@ def model_building(path: Path) -> Building:
     )
 
 
-def _triangles(path: Path) -> tuple[Array, Array]:
+def _load_triangles(path: Path) -> tuple[Array, Array]:
     """(t, 3, 3) corners in metres of all that is built, and (t,) uint8 index into `SURFACES`."""
     import ifcopenshell
-    from topomerge.datasets.plans.ifc import Solids
+    from topomerge.datasets.plans.ifc import ElementSolids
 
     model = ifcopenshell.open(str(path))
-    solids, corners, labels = Solids(model), [], []
+    solids, corners, labels = ElementSolids(model), [], []
     for element in model.by_type("IfcElement"):
-        triangles = None if any(element.is_a(kind) for kind in LEFT_OUT) else solids.corners(element)
+        triangles = None if any(element.is_a(kind) for kind in LEFT_OUT) else solids.triangulate(element)
         if triangles is not None:
             kind = next((label for name, label in IFC_LABELS.items() if element.is_a(name)), "wall")
             corners.append(triangles)
@@ -108,9 +108,9 @@ def _triangles(path: Path) -> tuple[Array, Array]:
     return np.concatenate(corners), np.concatenate(labels)
 
 
-def _ground(path: Path, building: Building) -> float:
+def _find_ground(path: Path, building: Building) -> float:
     """Height of the building's lowest floor in the model, m."""
-    floors = {room.name: room.floor for room in _model(path).rooms}
+    floors = {room.name: room.floor for room in _read_model(path).rooms}
     shifts = [floors[r.name.split()[0]] - r.floor for r in building.rooms if r.name.split()[0] in floors]
     if not shifts or np.ptp(shifts) > 0.3:
         raise InputError(f"{path}: its spaces lie at other heights than its storeys; no walk can be planned in it")
@@ -118,19 +118,19 @@ def _ground(path: Path, building: Building) -> float:
 
 
 @lru_cache(maxsize=1)  # asked for thrice a pair
-def _model(path: Path) -> PointCloud:
+def _read_model(path: Path) -> PointCloud:
     return read_points(path, spacing=IFC_SPACING)
 
 
-def _model_points(path: Path, building: Building) -> PointCloud:
+def _sample_model(path: Path, building: Building) -> PointCloud:
     """Points sampled on the model, in the building's frame and with its rooms."""
-    cloud = _model(path)
-    points = cloud.points.astype(np.float64) + cloud.shift - [0.0, 0.0, _ground(path, building)]
+    cloud = _read_model(path)
+    points = cloud.points.astype(np.float64) + cloud.shift - [0.0, 0.0, _find_ground(path, building)]
     labels = np.full(len(points), -1, np.int32)
     bounds = np.append(building.storeys["floor"] - UNDER_CEILING, np.inf)
     for k in range(len(building.storeys)):
         here = np.array([i for i, r in enumerate(building.rooms) if r.storey == k])
         rows = np.flatnonzero((points[:, 2] >= bounds[k]) & (points[:, 2] < bounds[k + 1]))
-        nearest = rooms_at(points[rows, :2], [building.rooms[i] for i in here])
+        nearest = find_rooms(points[rows, :2], [building.rooms[i] for i in here])
         labels[rows] = np.where(nearest >= 0, here[nearest], -1)
     return PointCloud(points.astype(np.float32), labels=labels, rooms=building.rooms, source=path.name)

@@ -16,10 +16,10 @@ from topomerge.datasets.real import halmstad
 OFFICE_PIXEL = 0.03  # m; not published: offices and doors are of a plausible size with it
 
 
-def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
+def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
     """Name and maker of every pair of maps of the floor; their source is halmstad, their building F5.
 
     Raises:
         InputError: the list of pairs is missing or damaged.
     """
-    return halmstad.pairs(folder, OFFICE_PIXEL)
+    return halmstad.iter_pairs(folder, OFFICE_PIXEL)

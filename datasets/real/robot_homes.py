@@ -9,13 +9,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from topomerge.datasets.plans.raster import NARROW_CONTACT, contacts, outline
+from topomerge.datasets.plans.raster import NARROW_CONTACT, find_contacts, trace_outline
 from topomerge.datasets.plans.robot_home import spread_rooms
-from topomerge.datasets.simulation.floor_truth import OUTSIDE_ROOMS, TRUTH_CELL, TRUTH_MARGIN, Truth, judged
+from topomerge.datasets.simulation.floor_truth import OUTSIDE_ROOMS, TRUTH_CELL, TRUTH_MARGIN, FloorTruth, mask_unseen
 
 from topomerge.errors import InputError
-from topomerge.io.json_map import what_is_in
-from topomerge.io.valetudo import is_robot_map, robot_rooms
+from topomerge.io.json_map import load_json_map
+from topomerge.io.valetudo import is_robot_map, parse_robot_map
 from topomerge.types import Array, TrueRoom
 
 FEWEST_HOME_ROOMS = 2
@@ -23,7 +23,7 @@ HOME_HEIGHT = 2.5  # m
 INSIDE = 0.01  # m, from a corner of a column into it
 
 
-def home_truth(path: Path, points: Array) -> tuple[Truth, tuple[TrueRoom, ...]]:
+def compute_home_truth(path: Path, points: Array) -> tuple[FloorTruth, tuple[TrueRoom, ...]]:
     """The robot's rooms as what is true, and a door wherever two of them touch, in the frame in which the map is read; and what
     its owner calls them.
 
@@ -33,19 +33,21 @@ def home_truth(path: Path, points: Array) -> tuple[Truth, tuple[TrueRoom, ...]]:
     Raises:
         InputError: the robot tells fewer than two rooms apart.
     """
-    about = what_is_in(path)
+    about = load_json_map(path)
     if not is_robot_map(about):
         raise InputError(f"{path}: is no map of Valetudo; give one that a robot drew")
-    drawn = robot_rooms(path, about)
+    drawn = parse_robot_map(path, about)
     labels, large = spread_rooms(drawn)
     if len(large) < FEWEST_HOME_ROOMS:
         raise InputError(f"{path}: the robot tells {len(large)} rooms apart, so nothing is true about it; take another map")
     number = np.full(int(drawn.rooms.max()) + 1, -1)
     number[large] = np.arange(len(large))
-    touching = [c for c in contacts(labels, drawn.resolution, drawn.origin) if np.hypot(*(c[2][1] - c[2][0])) >= NARROW_CONTACT]
+    touching = [
+        c for c in find_contacts(labels, drawn.resolution, drawn.origin) if np.hypot(*(c[2][1] - c[2][0])) >= NARROW_CONTACT
+    ]
     doors = [[number[a], number[b], *ends.mean(axis=0), 0.0] for a, b, ends in touching]
-    truth = Truth(
-        raster=_columns(number[labels], drawn.resolution)[None],
+    truth = FloorTruth(
+        raster=_compute_columns(number[labels], drawn.resolution)[None],
         origin=drawn.origin - TRUTH_MARGIN,
         visited=np.ones(len(large), bool),
         floors=np.zeros(1),
@@ -58,12 +60,12 @@ def home_truth(path: Path, points: Array) -> tuple[Truth, tuple[TrueRoom, ...]]:
         complete=np.array(True),
     )
     level, names = (0.0, HOME_HEIGHT), [drawn.names[k - 1] or f"room {k}" for k in large]
-    shapes = [outline(labels == k, drawn.resolution, drawn.origin) for k in large]
+    shapes = [trace_outline(labels == k, drawn.resolution, drawn.origin) for k in large]
     rooms = [TrueRoom(n, np.array(s.exterior.coords)[:-1], *level) for n, s in zip(names, shapes, strict=True)]
-    return judged(truth, points), tuple(rooms)
+    return mask_unseen(truth, points), tuple(rooms)
 
 
-def _columns(rooms: Array, resolution: float) -> Array:
+def _compute_columns(rooms: Array, resolution: float) -> Array:
     """(rows, columns) int32 of the truth's columns: the room at the middle of each, or at one of its corners."""
     extent = np.array(rooms.shape[::-1]) * resolution
     columns, rows = np.ceil((extent + 2 * TRUTH_MARGIN) / TRUTH_CELL).astype(int)

@@ -13,7 +13,7 @@ from functools import cache, partial
 from itertools import combinations
 from pathlib import Path
 
-from topomerge.datasets.pairs.flat import Flat, flat_pair, read_flat
+from topomerge.datasets.pairs.flat_maps import FlatMap, build_flat_pair, read_flat
 from topomerge.datasets.pairs.pairs import Pair
 
 from topomerge.types import Sim3
@@ -23,7 +23,7 @@ YEARS = ("eng2-7f_2015", "eng2-7f_2016", "eng2-7f_2019", "eng2-7f")  # maps of o
 COPIED = {"7f", "8f"}
 
 
-def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
+def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
     """Name and maker of each pair: two storeys of one building, then one storey in two years."""
     read = cache(lambda name: read_flat(folder / f"{name}.yaml"))
     number = 0
@@ -37,7 +37,7 @@ def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
         number += 1
 
 
-def make_pair(read: Callable[[str], Flat], a: str, b: str, seed: int, one_storey: bool) -> Pair:
+def make_pair(read: Callable[[str], FlatMap], a: str, b: str, seed: int, one_storey: bool) -> Pair:
     """Make the pair of two maps, each in a frame of its own drawn from the seed."""
-    pair = flat_pair(f"{a}-{b}", read(a), read(b), Sim3(), ("laser2d", "laser2d"), "storeys", a.partition("-")[0], seed)
+    pair = build_flat_pair(f"{a}-{b}", read(a), read(b), Sim3(), ("laser2d", "laser2d"), "storeys", a.partition("-")[0], seed)
     return pair if one_storey else replace(pair, truth=None, kind="other-storey", shared=(), overlap=0.0)

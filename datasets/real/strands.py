@@ -13,7 +13,7 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-from topomerge.datasets.pairs.flat import Flat, flat_pair, read_flat
+from topomerge.datasets.pairs.flat_maps import FlatMap, build_flat_pair, read_flat
 from topomerge.datasets.pairs.pairs import Pair
 
 from topomerge.types import Sim3
@@ -30,13 +30,13 @@ INTO_2016 = {  # session -> 2016; the fit of 2015 to 2017 differs from that to 2
 }
 
 
-def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
+def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
     """Name and maker of the three pairs."""
     read = cache(lambda session: read_flat(folder / SESSIONS[session]))
     for number, (a, b) in enumerate(combinations(SESSIONS, 2)):
-        yield f"tsc-{a}-{b}", partial(_pair, read, a, b, number)
+        yield f"tsc-{a}-{b}", partial(_load_pair, read, a, b, number)
 
 
-def _pair(read: Callable[[str], Flat], a: str, b: str, seed: int) -> Pair:
+def _load_pair(read: Callable[[str], FlatMap], a: str, b: str, seed: int) -> Pair:
     truth = INTO_2016[a].inverse() @ INTO_2016[b]
-    return flat_pair(f"tsc-{a}-{b}", read(a), read(b), truth, ("laser2d", "laser2d"), "strands", "tsc", seed)
+    return build_flat_pair(f"tsc-{a}-{b}", read(a), read(b), truth, ("laser2d", "laser2d"), "strands", "tsc", seed)

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 from scipy import ndimage
-from topomerge.datasets.pairs.flat import WALL_HEIGHT, Flat, flat_pair, from_masks, moved_room, read_flat
+from topomerge.datasets.pairs.flat_maps import WALL_HEIGHT, FlatMap, build_flat_pair, build_from_masks, read_flat, transform_room
 from topomerge.datasets.pairs.pairs import Pair
 
 from topomerge.errors import InputError
@@ -45,39 +45,39 @@ WALL_CAVITY = 0.2  # m; what is narrower lies within a wall
 LARGEST_LINE_MAP, UTEXAS_CELLS = 50 << 20, 50_000_000
 
 
-def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
+def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
     """Name and maker of four pairs of a grid and a line map, and three of a grid and a part of it."""
-    read = cache(partial(_grid, folder))
+    read = cache(partial(_read_grid, folder))
     for seed, floor in enumerate(INTO_LINES):
-        yield f"gdc{floor}-lines", partial(_with_lines, read, folder.parent / LINES_FOLDER, floor, seed)
+        yield f"gdc{floor}-lines", partial(_load_lines_pair, read, folder.parent / LINES_FOLDER, floor, seed)
     for seed, part in enumerate(INTO_WHOLE, len(INTO_LINES)):
-        yield f"gdc{INTO_WHOLE[part][0]}-{part}", partial(_with_part, read, part, seed)
+        yield f"gdc{INTO_WHOLE[part][0]}-{part}", partial(_load_part_pair, read, part, seed)
 
 
-def _with_lines(read: Callable[[str], Flat], lines: Path, floor: str, seed: int) -> Pair:
+def _load_lines_pair(read: Callable[[str], FlatMap], lines: Path, floor: str, seed: int) -> Pair:
     b = read_lines(lines / f"GDC{floor}" / f"GDC{floor}.vectormap.json")
-    return _pair(f"gdc{floor}-lines", read(floor), b, INTO_LINES[floor].inverse(), "drawing", seed)
+    return _build_pair(f"gdc{floor}-lines", read(floor), b, INTO_LINES[floor].inverse(), "drawing", seed)
 
 
-def _with_part(read: Callable[[str], Flat], part: str, seed: int) -> Pair:
+def _load_part_pair(read: Callable[[str], FlatMap], part: str, seed: int) -> Pair:
     floor, truth = INTO_WHOLE[part]
-    return _pair(f"gdc{floor}-{part}", read(floor), read(part), truth, "laser2d", seed)
+    return _build_pair(f"gdc{floor}-{part}", read(floor), read(part), truth, "laser2d", seed)
 
 
-def _pair(name: str, a: Flat, b: Flat, truth: Sim3, sensor: str, seed: int) -> Pair:
+def _build_pair(name: str, a: FlatMap, b: FlatMap, truth: Sim3, sensor: str, seed: int) -> Pair:
     """A pair whose second map has the rooms of the first."""
-    b = replace(b, rooms=tuple(moved_room(room, truth.inverse()) for room in a.rooms))
-    return flat_pair(name, a, b, truth, ("laser2d", sensor), "utexas", "gdc", seed)
+    b = replace(b, rooms=tuple(transform_room(room, truth.inverse()) for room in a.rooms))
+    return build_flat_pair(name, a, b, truth, ("laser2d", sensor), "utexas", "gdc", seed)
 
 
-def _grid(folder: Path, name: str) -> Flat:
+def _read_grid(folder: Path, name: str) -> FlatMap:
     """The grid of a floor, with the rooms of BWI where it has them."""
     path = folder / "maps" / "real" / name
     flat = read_flat(path / f"{name}.yaml")
-    return replace(flat, rooms=_rooms(path / "locations.yaml", path / f"{name}.yaml")) if name in INTO_LINES else flat
+    return replace(flat, rooms=_read_rooms(path / "locations.yaml", path / f"{name}.yaml")) if name in INTO_LINES else flat
 
 
-def _rooms(path: Path, plan: Path) -> tuple[TrueRoom, ...]:
+def _read_rooms(path: Path, plan: Path) -> tuple[TrueRoom, ...]:
     """Rooms of a floor: their outlines are given in pixels from the map's upper left corner.
 
     Raises:
@@ -96,8 +96,8 @@ def _rooms(path: Path, plan: Path) -> tuple[TrueRoom, ...]:
     return tuple(TrueRoom(str(name), polygon[::-1], 0.0, WALL_HEIGHT) for name, polygon in metres)
 
 
-def read_lines(path: Path) -> Flat:
-    """A line map of UT-AMRL: walls as drawn, and the floor that they enclose.
+def read_lines(path: Path) -> FlatMap:
+    """Read a line map of UT-AMRL: walls as drawn, and the floor that they enclose.
 
     Raises:
         InputError: missing, damaged, or of an absurd size.
@@ -112,11 +112,13 @@ def read_lines(path: Path) -> Flat:
     low, high = lines.min(axis=(0, 1), initial=np.inf) - LINES_MARGIN, lines.max(axis=(0, 1), initial=-np.inf) + LINES_MARGIN
     if not len(lines) or not np.prod((high - low) / UTEXAS_CELL) < UTEXAS_CELLS:
         raise InputError(f"{path}: has no lines, or spans more than a building; copy it again")
-    walls = _drawn(lines, low, high)
-    return from_masks(walls[::-1], _floor(walls)[::-1], UTEXAS_CELL, (*low.tolist(), 0.0), rays=False, source=path.name)
+    walls = _rasterize_lines(lines, low, high)
+    return build_from_masks(
+        walls[::-1], _find_floor(walls)[::-1], UTEXAS_CELL, (*low.tolist(), 0.0), rays=False, source=path.name
+    )
 
 
-def _drawn(lines: Array, low: Array, high: Array) -> Array:
+def _rasterize_lines(lines: Array, low: Array, high: Array) -> Array:
     """(h, w) bool, lowest row first: cells on a line."""
     columns, rows = np.ceil((high - low) / UTEXAS_CELL).astype(int) + 1
     count = (np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1) / UTEXAS_CELL * 2).astype(int) + 2
@@ -128,7 +130,7 @@ def _drawn(lines: Array, low: Array, high: Array) -> Array:
     return walls
 
 
-def _floor(walls: Array) -> Array:
+def _find_floor(walls: Array) -> Array:
     """(h, w) bool: what lies between walls, without the cavities in them."""
     far = ndimage.distance_transform_edt(~walls) * UTEXAS_CELL
     closed = ndimage.binary_fill_holes(far <= FRONT_GAP / 2)

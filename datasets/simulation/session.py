@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 import shapely
-from topomerge.datasets.buildings.fittings import SWING, keep_clear, leaf_yaw
-from topomerge.datasets.buildings.furniture import footprints, make_item
-from topomerge.datasets.buildings.openings import draw_state
-from topomerge.datasets.core.building import SURFACES, Building
-from topomerge.datasets.core.difficulty import Difficulty
-from topomerge.datasets.core.solids import boxes, rotation
+from topomerge.datasets.buildings.fittings import SWING, compute_leaf_yaw, keep_clear
+from topomerge.datasets.buildings.furniture import compute_footprints, make_item
+from topomerge.datasets.buildings.openings import sample_door_state
+from topomerge.datasets.core.building import SURFACES, Building, Difficulty
+from topomerge.datasets.core.solids import build_rotation, triangulate_boxes
 
 from topomerge.types import Array
 
@@ -20,7 +19,7 @@ MOVES_TRIED = 6
 SMALL_MOVE = 0.15  # m, standard deviation of a small move
 
 
-def session(building: Building, difficulty: Difficulty | None = None, rng: np.random.Generator | int = 0) -> Building:
+def simulate_session(building: Building, difficulty: Difficulty | None = None, rng: np.random.Generator | int = 0) -> Building:
     """The building as another session finds it; rooms, stairs and storeys are the same.
 
     Args:
@@ -34,7 +33,7 @@ def session(building: Building, difficulty: Difficulty | None = None, rng: np.ra
     order = np.argsort(owner, kind="stable")
     starts = np.searchsorted(owner[order], np.arange(len(things) + 1))
     gone = np.zeros(len(things), bool)
-    outlines = np.array([_outline(t) for t in things], object)
+    outlines = np.array([_compute_outline(t) for t in things], object)
     for i, thing in enumerate(building.things):
         if not thing["movable"] or thing["kind"] == "leaf":
             continue
@@ -43,12 +42,12 @@ def session(building: Building, difficulty: Difficulty | None = None, rng: np.ra
         if difficulty.gone <= fate < difficulty.gone + 2 * difficulty.moved:
             near = fate >= difficulty.gone + difficulty.moved
             _move(building, things, outlines, gone, i, near, rng)
-    _swing(things, doors, difficulty, rng)
+    _move_doors(things, doors, difficulty, rng)
     for i in np.flatnonzero(things["movable"] & ~gone).tolist():
         _carry(vertices, order[starts[i] : starts[i + 1]], building.things[i], things[i])
     stays = (building.thing_of < 0) | ~gone[building.thing_of]
     mesh = [vertices, building.triangles[stays], building.labels[stays], building.thing_of[stays]]
-    things = _people(building, mesh, things, outlines[~gone], difficulty, rng)
+    things = _add_people(building, mesh, things, outlines[~gone], difficulty, rng)
     vertices, triangles, labels, thing_of = mesh
     return replace(
         building,
@@ -61,8 +60,8 @@ def session(building: Building, difficulty: Difficulty | None = None, rng: np.ra
     )
 
 
-def _outline(thing: Array) -> shapely.Polygon:
-    return shapely.Polygon(footprints(thing["centre"][None, :2], thing["yaw"][None], thing["size"].tolist())[0])
+def _compute_outline(thing: Array) -> shapely.Polygon:
+    return shapely.Polygon(compute_footprints(thing["centre"][None, :2], thing["yaw"][None], thing["size"].tolist())[0])
 
 
 def _move(building: Building, things: Array, outlines: Array, gone: Array, i: int, near: bool, rng: np.random.Generator) -> None:
@@ -75,32 +74,32 @@ def _move(building: Building, things: Array, outlines: Array, gone: Array, i: in
         new = things[i : i + 1].copy()[0]
         new["centre"][:2] = new["centre"][:2] + rng.normal(0, SMALL_MOVE, 2) if near else rng.uniform(low, high)
         new["yaw"] += rng.normal(0, 0.1) if near else rng.integers(4) * np.pi / 2
-        outline = _outline(new)
+        outline = _compute_outline(new)
         if room.contains(outline) and not shapely.intersects([*others, *clear], outline).any():
             new["pivot"] = new["centre"][:2]
             things[i], outlines[i] = new, outline
             return
 
 
-def _swing(things: Array, doors: Array, difficulty: Difficulty, rng: np.random.Generator) -> None:
+def _move_doors(things: Array, doors: Array, difficulty: Difficulty, rng: np.random.Generator) -> None:
     """Open and shut some of the doors."""
     moved = (rng.random(len(doors)) < difficulty.doors_moved) & (doors["state"] != "none")
     for d in np.flatnonzero(moved):
         outer = doors["rooms"][d].min() < 0
-        doors["state"][d] = "shut" if outer else draw_state(difficulty, rng)
+        doors["state"][d] = "shut" if outer else sample_door_state(difficulty, rng)
         angle = float(rng.uniform(*SWING[str(doors["state"][d])]))
         for i in np.flatnonzero((things["door"] == d) & (things["kind"] == "leaf")):
-            yaw = leaf_yaw(doors[d], things["pivot"][i], angle)
+            yaw = compute_leaf_yaw(doors[d], things["pivot"][i], angle)
             reach = things["size"][i, 0] / 2 * np.array([np.cos(yaw), np.sin(yaw)])
             things["yaw"][i], things["centre"][i, :2] = yaw, things["pivot"][i] + reach
 
 
 def _carry(vertices: Array, rows: Array, old: Array, new: Array) -> None:
-    turn = rotation(float(new["yaw"] - old["yaw"]))
+    turn = build_rotation(float(new["yaw"] - old["yaw"]))
     vertices[rows, :2] = (vertices[rows, :2] - old["centre"][:2]) @ turn + new["centre"][:2]
 
 
-def _people(
+def _add_people(
     building: Building, mesh: list[Array], things: Array, outlines: Array, difficulty: Difficulty, rng: np.random.Generator
 ) -> Array:
     """Put persons on free spots of the rooms; returns the things with them."""
@@ -118,7 +117,7 @@ def _people(
             if not bodies:
                 continue
             at = shapely.get_coordinates(bodies[0])[0]
-            vertices, triangles = boxes(item.parts, np.array([*at, room.floor]), yaw)
+            vertices, triangles = triangulate_boxes(item.parts, np.array([*at, room.floor]), yaw)
             mesh[1] = np.concatenate([mesh[1], (triangles + len(mesh[0])).astype(np.int32)])
             mesh[0] = np.concatenate([mesh[0], vertices])
             mesh[2] = np.append(mesh[2], np.full(len(triangles), SURFACES.index("person"), np.uint8))

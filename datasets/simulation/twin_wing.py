@@ -17,8 +17,8 @@ SLOPE_STEP = 1e-3  # m, step of the slope of the map
 Place = Callable[[Array], Array]
 
 
-def twin_wing(building: Building, rng: np.random.Generator | int = 0) -> Building:
-    """A wing that is hard to tell from the building: the same rooms, in the same order, in nearly the same places.
+def make_twin_wing(building: Building, rng: np.random.Generator | int = 0) -> Building:
+    """Make a wing that is hard to tell from the building: the same rooms, in the same order, in nearly the same places.
 
     Along its longer side, one of its ends or both are stretched or shrunk by `END_STRETCH`, with all that stands in them: end
     walls move by metres, doors with them. Half of the twins are mirrored, too.
@@ -37,10 +37,10 @@ def twin_wing(building: Building, rng: np.random.Generator | int = 0) -> Buildin
     if rng.random() < 0.5:
         factors[int(rng.integers(2))] = 1.0
     mirrored = bool(rng.random() < 0.5)
-    return bent(building, axis, _piecewise(knots, (float(factors[0]), 1.0, float(factors[1]))), mirrored)
+    return stretch_building(building, axis, _build_piecewise_map(knots, (float(factors[0]), 1.0, float(factors[1]))), mirrored)
 
 
-def _piecewise(knots: Array, slopes: tuple[float, float, float]) -> Place:
+def _build_piecewise_map(knots: Array, slopes: tuple[float, float, float]) -> Place:
     """Continuous map of a coordinate with a slope before, between and after the two inner knots."""
 
     def place(x: Array) -> Array:
@@ -50,8 +50,8 @@ def _piecewise(knots: Array, slopes: tuple[float, float, float]) -> Place:
     return place
 
 
-def bent(building: Building, axis: int, place: Place, mirrored: bool = False) -> Building:
-    """The building with one horizontal coordinate mapped by an increasing function, then perhaps mirrored (x -> -x)."""
+def stretch_building(building: Building, axis: int, place: Place, mirrored: bool = False) -> Building:
+    """Return the building with one horizontal coordinate mapped by an increasing function, then perhaps mirrored (x -> -x)."""
 
     def move(points: Array) -> Array:
         out = np.array(points, np.float64)

@@ -12,8 +12,8 @@ from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 from topomerge.datasets.core.building import Building
-from topomerge.datasets.core.solids import rotation
-from topomerge.datasets.simulation.floors import Floors, draw_floors, fill
+from topomerge.datasets.core.solids import build_rotation
+from topomerge.datasets.simulation.floor_truth import FloorRasters, fill, rasterize_floors
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -51,7 +51,7 @@ class Walk:
 
 
 def plan_walk(building: Building, rooms: Sequence[int], rng: np.random.Generator, unfinished: float = 0.35) -> Walk:
-    """A walk into all the given rooms, from one of them.
+    """Return a walk into all the given rooms, from one of them.
 
     The way follows one shortest-path tree, so the surveyor returns through the corridors as people do. Shut doors are opened in
     passing; rooms that were not asked for are crossed only where there is no other way.
@@ -63,17 +63,17 @@ def plan_walk(building: Building, rooms: Sequence[int], rng: np.random.Generator
     Raises:
         InputError: no rooms, a room that does not exist, or one that cannot be reached.
     """
-    wanted = sorted({int(r) for r in rooms})
-    if not wanted or wanted[0] < 0 or wanted[-1] >= len(building.rooms):
+    requested = sorted({int(r) for r in rooms})
+    if not requested or requested[0] < 0 or requested[-1] >= len(building.rooms):
         raise InputError(f"rooms to visit must be among 0..{len(building.rooms) - 1}, not {list(rooms)[:5]}")
-    floors = draw_floors(building, WALK_CELL)
-    cost, clear = _costs(building, floors, wanted)
-    graph, places = _graph(building, floors, cost)
+    floors = rasterize_floors(building, WALK_CELL)
+    cost, clear = _compute_costs(building, floors, requested)
+    graph, places = _build_graph(building, floors, cost)
     sight = float(rng.uniform(*SIGHT))
     stops = []
-    for r in wanted:
-        made = _stops(floors, clear, building.rooms[r].storey, r, sight)
-        stops += _half_way(made, floors, rng) if rng.random() < unfinished else made
+    for r in requested:
+        made = _choose_stops(floors, clear, building.rooms[r].storey, r, sight)
+        stops += _sample_unfinished_stops(made, floors, rng) if rng.random() < unfinished else made
     if not stops:
         raise InputError(f"{building.name}: none of the rooms has a free floor to stand on")
     start = stops[int(rng.integers(len(stops)))]
@@ -82,7 +82,7 @@ def plan_walk(building: Building, rooms: Sequence[int], rng: np.random.Generator
     if lost:
         names = sorted({int(floors.room.ravel()[s]) for s in lost})
         raise InputError(f"{building.name}: rooms {names} cannot be reached from room {int(floors.room.ravel()[start])}")
-    way, halts = _tour(start, stops, before, reach)
+    way, halts = _build_tour(start, stops, before, reach)
     room = np.append(floors.room.ravel(), np.full(len(places) - floors.room.size, -1))[way]
     price = np.append(cost.ravel(), np.ones(len(places) - cost.size))[way]
     step = np.linalg.norm(np.diff(places[way], axis=0), axis=1)
@@ -94,21 +94,21 @@ def plan_walk(building: Building, rooms: Sequence[int], rng: np.random.Generator
     return Walk(_smooth(points), room[nearest].astype(np.int32), stand, price[nearest] < BLOCKED)
 
 
-def _costs(building: Building, floors: Floors, wanted: list[int]) -> tuple[Array, Array]:
+def _compute_costs(building: Building, floors: FloorRasters, requested: list[int]) -> tuple[Array, Array]:
     """Price of each cell (inf: wall) and its distance to what stands around, m."""
     passable = floors.room >= 0
-    _doorways(building, floors, passable)
+    _open_doorways(building, floors, passable)
     things = building.things[building.things["kind"] != "leaf"]
     bottom = things["centre"][:, 2] - things["size"][:, 2] / 2
     cost = np.ones(floors.room.shape)
     clear = np.zeros(floors.room.shape)
-    foreign = passable & (floors.room >= 0) & ~np.isin(floors.room, wanted)
+    foreign = passable & (floors.room >= 0) & ~np.isin(floors.room, requested)
     for k, floor in enumerate(building.storeys["floor"]):
         stand = things[(bottom >= floor - 0.1) & (bottom < floor + 1.7)]
-        filled = _filled(stand, floors)
+        filled = _rasterize_things(stand, floors)
         upper = [r.polygon for r in building.rooms if r.storey != k and r.floor < floor < r.ceiling - 1.5]
         blocked = [s["footprint"] for s in building.stairs if k in s["storeys"] and s["kind"] != "lift"]
-        passable[k] &= ~_outlines([*blocked, *upper], floors)
+        passable[k] &= ~_rasterize_polygons([*blocked, *upper], floors)
         walls = ndimage.distance_transform_edt(passable[k]) * WALK_CELL
         clear[k] = np.minimum(walls, ndimage.distance_transform_edt(~filled) * WALK_CELL)
         cost[k] = 1 + 2 * np.exp(-np.minimum(clear[k], 5) / 0.3)
@@ -118,27 +118,27 @@ def _costs(building: Building, floors: Floors, wanted: list[int]) -> tuple[Array
     return cost, clear
 
 
-def _doorways(building: Building, floors: Floors, passable: Array) -> None:
+def _open_doorways(building: Building, floors: FloorRasters, passable: Array) -> None:
     for door in building.doors[(building.doors["rooms"] >= 0).all(axis=1)]:
         half = np.array([door["thickness"] / 2 + 0.15, door["width"] / 2 - 0.02])
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
         k = building.rooms[door["rooms"][0]].storey
-        passable[k] |= _outlines([corners @ rotation(door["direction"]) + door["centre"][:2]], floors)
+        passable[k] |= _rasterize_polygons([corners @ build_rotation(door["direction"]) + door["centre"][:2]], floors)
 
 
-def _filled(things: Array, floors: Floors) -> Array:
+def _rasterize_things(things: Array, floors: FloorRasters) -> Array:
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
-    return _outlines([corners * t["size"][:2] @ rotation(t["yaw"]) + t["centre"][:2] for t in things], floors)
+    return _rasterize_polygons([corners * t["size"][:2] @ build_rotation(t["yaw"]) + t["centre"][:2] for t in things], floors)
 
 
-def _outlines(polygons: Sequence[Array], floors: Floors) -> Array:
+def _rasterize_polygons(polygons: Sequence[Array], floors: FloorRasters) -> Array:
     out = np.zeros(floors.room.shape[1:], bool)
     for polygon in polygons:
         fill(out, (polygon - floors.origin) / floors.cell, 1)
     return out
 
 
-def _graph(building: Building, floors: Floors, cost: Array) -> tuple[coo_array, Array]:
+def _build_graph(building: Building, floors: FloorRasters, cost: Array) -> tuple[coo_array, Array]:
     """Steps between cells, and along stairs; and where each node lies."""
     nodes = np.arange(cost.size).reshape(cost.shape)
     rows, columns, prices = [], [], []
@@ -157,7 +157,7 @@ def _graph(building: Building, floors: Floors, cost: Array) -> tuple[coo_array, 
     count = cost.size
     for stair in building.stairs[building.stairs["kind"] != "lift"]:
         path = stair["path"]
-        ends = [_nearest(path[e], int(stair["storeys"][s]), floors, cost) for e, s in ((0, 0), (-1, 1))]
+        ends = [_find_nearest_node(path[e], int(stair["storeys"][s]), floors, cost) for e, s in ((0, 0), (-1, 1))]
         chain = np.array([ends[0], *range(count, count + len(path)), ends[1]])
         rows.append(chain[:-1])
         columns.append(chain[1:])
@@ -168,15 +168,15 @@ def _graph(building: Building, floors: Floors, cost: Array) -> tuple[coo_array, 
     return graph.tocsr(), np.concatenate(places)
 
 
-def _nearest(point: Array, storey: int, floors: Floors, cost: Array) -> int:
+def _find_nearest_node(point: Array, storey: int, floors: FloorRasters, cost: Array) -> int:
     """Node of the passable cell nearest to a point."""
     i, j = np.nonzero(np.isfinite(cost[storey]))
-    at = floors.cells(point[None])[0]
+    at = floors.compute_cells(point[None])[0]
     best = int(np.argmin((i - at[0]) ** 2 + (j - at[1]) ** 2))
     return int(storey * cost[0].size + i[best] * cost.shape[2] + j[best])
 
 
-def _stops(floors: Floors, clear: Array, storey: int, room: int, sight: float) -> list[int]:
+def _choose_stops(floors: FloorRasters, clear: Array, storey: int, room: int, sight: float) -> list[int]:
     """Nodes from which a room is seen: its freest spot, then whatever lies far from the stops so far."""
     inside = floors.room[storey] == room
     i, j = np.nonzero(inside & (clear[storey] >= min(0.35, clear[storey][inside].max(initial=0.0))))
@@ -190,7 +190,7 @@ def _stops(floors: Floors, clear: Array, storey: int, room: int, sight: float) -
     return [int(storey * clear[0].size + i[k] * clear.shape[2] + j[k]) for k in out]
 
 
-def _half_way(stops: list[int], floors: Floors, rng: np.random.Generator) -> list[int]:
+def _sample_unfinished_stops(stops: list[int], floors: FloorRasters, rng: np.random.Generator) -> list[int]:
     """Of the stops in a long room those next to one of them."""
     i, j = np.unravel_index(stops, floors.room.shape)[1:] if stops else (np.empty(0), np.empty(0))
     if not len(i) or np.hypot(i - i[0], j - j[0]).max() * floors.cell < LONG:
@@ -201,7 +201,7 @@ def _half_way(stops: list[int], floors: Floors, rng: np.random.Generator) -> lis
     return [stops[k] for k in sorted(order[:number].tolist())]
 
 
-def _tour(start: int, stops: list[int], before: Array, reach: Array) -> tuple[Array, list[int]]:
+def _build_tour(start: int, stops: list[int], before: Array, reach: Array) -> tuple[Array, list[int]]:
     """Nodes of a walk over all stops along the tree of shortest ways, and where on it the stops are."""
     trunks = {}
     for stop in stops:
@@ -209,7 +209,7 @@ def _tour(start: int, stops: list[int], before: Array, reach: Array) -> tuple[Ar
         while trunk[-1] != start:
             trunk.append(int(before[trunk[-1]]))
         trunks[stop] = trunk[::-1]
-    order = _order(stops, trunks, reach)
+    order = _order_stops(stops, trunks, reach)
     way, halts, at = [start], [], [start]
     for stop in order:
         trunk = trunks[stop]
@@ -220,7 +220,7 @@ def _tour(start: int, stops: list[int], before: Array, reach: Array) -> tuple[Ar
     return np.array(way), halts
 
 
-def _order(stops: list[int], trunks: dict[int, list[int]], reach: Array) -> list[int]:
+def _order_stops(stops: list[int], trunks: dict[int, list[int]], reach: Array) -> list[int]:
     """Stops in the order of a depth-first walk over the tree, near branches first."""
     edges = np.array([(a, b) for t in trunks.values() for a, b in pairwise(t)]).reshape(-1, 2)
     nodes, inverse = np.unique(np.append(edges.ravel(), stops), return_inverse=True)
@@ -231,11 +231,11 @@ def _order(stops: list[int], trunks: dict[int, list[int]], reach: Array) -> list
     deepest: dict[int, float] = {}
     for node in sorted(children, key=lambda n: -reach[n]):
         deepest[node] = max([float(reach[node]), *(deepest.get(c, 0.0) for c in children[node])])
-    wanted, out = set(stops), []
+    requested, out = set(stops), []
     stack = [next(iter(trunks.values()))[0]]
     while stack:
         node = stack.pop()
-        if node in wanted:
+        if node in requested:
             out.append(node)
         stack += sorted(children[node], key=lambda c: -deepest[c])
     return out
@@ -248,15 +248,17 @@ def _smooth(points: Array) -> Array:
     return ndimage.uniform_filter1d(points, 7, axis=0, mode="nearest")
 
 
-def part(building: Building, count: int, rng: np.random.Generator, storey: int | None = None, start: int | None = None) -> Array:
-    """(n,) int64 rooms that hang together, up to `count` of them, grown from a room through doors and stairs.
+def sample_part(
+    building: Building, count: int, rng: np.random.Generator, storey: int | None = None, start: int | None = None
+) -> Array:
+    """Sample (n,) int64 rooms that hang together, up to `count` of them, grown from a room through doors and stairs.
 
     Args:
         storey: stay on this storey.
         start: room to grow from; none: drawn.
     """
     fits = np.array([r.kind != "lift" and (storey is None or r.storey == storey) for r in building.rooms])
-    edges = building.edges()
+    edges = building.list_edges()
     edges = edges[fits[edges].all(axis=1)]
     neighbours: dict[int, set[int]] = {int(i): set() for i in np.flatnonzero(fits)}
     for a, b in edges.tolist():

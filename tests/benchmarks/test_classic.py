@@ -81,16 +81,16 @@ def test_waves_meet_halfway_and_go_round_walls(classic) -> None:
     free = np.ones((5, 21), bool)
     seeds = np.zeros(free.shape, int)
     seeds[2, 0], seeds[2, 20] = 1, 2
-    labels = classic.flood(seeds, free)
+    labels = classic.flood_seeds(seeds, free)
     assert (labels[:, :10] == 0).all() and (labels[:, 11:] == 1).all()
     free[:, 4] = False  # the first seed is shut in
-    labels = classic.flood(seeds, free)
+    labels = classic.flood_seeds(seeds, free)
     assert (labels[:, :4] == 0).all() and (labels[:, 5:] == 1).all() and (labels[:, 4] == -1).all()
 
 
 def test_sides_that_pieces_share(classic) -> None:
     labels = np.array([[0, 0, 1], [0, 0, -1]])
-    touch = classic.contacts(labels, 2)
+    touch = classic.count_contacts(labels, 2)
     assert touch[0, 1] == touch[1, 0] == 1
     assert touch[0, 2] == 7 and touch[1, 2] == 3, "what is not free, the border of the map among it"
 
@@ -99,7 +99,7 @@ def test_wide_openings_are_no_doors_for_the_graph(classic) -> None:
     """An opening as wide as the rooms: their pieces are joined again."""
     free = plan(0)
     free[2:122, 102:106] = True
-    assert classic.voronoi(free, CELL).max() == 0
+    assert classic.segment_by_voronoi(free, CELL).max() == 0
 
 
 def truth_of_two():
@@ -108,7 +108,7 @@ def truth_of_two():
     raster = np.zeros((1, 20, 40), np.int32)
     raster[:, :, 20:] = 1
     none = np.zeros((0, 3))
-    return floor_truth.Truth(
+    return floor_truth.FloorTruth(
         raster=raster, origin=np.zeros(2), visited=np.ones(2, bool), floors=np.zeros(1), height=np.full(1, 2.5),
         doors=np.zeros((0, 5)), edges=np.zeros((0, 2), int), matrix=np.eye(4), anchors=none, drift=none, complete=np.array(True),
     )  # fmt: skip
@@ -117,24 +117,24 @@ def truth_of_two():
 def test_scores_of_the_survey(occupancy) -> None:
     truth = truth_of_two()
     one = np.zeros_like(truth.raster)
-    assert occupancy.survey_scores(truth, one) == (0.5, 1.0), "united: half of it lies in one true room"
+    assert occupancy.compute_survey_scores(truth, one) == (0.5, 1.0), "united: half of it lies in one true room"
     cut = truth.raster.copy()
     cut[:, :10, 20:] = 2
-    assert occupancy.survey_scores(truth, cut) == (1.0, 0.75), "cut: one whole, of the other half"
-    assert occupancy.survey_scores(truth, truth.raster) == (1.0, 1.0)
-    assert occupancy.survey_scores(truth, np.full_like(one, -1))[1] == 0.0
+    assert occupancy.compute_survey_scores(truth, cut) == (1.0, 0.75), "cut: one whole, of the other half"
+    assert occupancy.compute_survey_scores(truth, truth.raster) == (1.0, 1.0)
+    assert occupancy.compute_survey_scores(truth, np.full_like(one, -1))[1] == 0.0
 
 
 def test_rooms_that_nobody_visited_are_not_held_against_a_method(occupancy) -> None:
     truth = truth_of_two()
-    assert occupancy.judged(truth, truth.raster, 2).rooms.precision == 1.0
+    assert occupancy.score_map(truth, truth.raster, 2).rooms.precision == 1.0
     unvisited = replace(truth, visited=np.array([True, False]))
-    rooms = occupancy.judged(unvisited, truth.raster, 2).rooms
+    rooms = occupancy.score_map(unvisited, truth.raster, 2).rooms
     assert rooms.precision == rooms.recall == 1.0 and rooms.iou == 1.0
     outside = truth.raster.copy()
     outside[:, :5] = 2
     walled = replace(truth, raster=np.where(outside == 2, -1, truth.raster))
-    assert occupancy.judged(walled, outside, 3).rooms.precision == pytest.approx(2 / 3), "what is no room at all is wrong"
+    assert occupancy.score_map(walled, outside, 3).rooms.precision == pytest.approx(2 / 3), "what is no room at all is wrong"
 
 
 def test_a_grid_from_above(occupancy) -> None:
@@ -149,8 +149,8 @@ def test_a_grid_from_above(occupancy) -> None:
     lamp, sill = floor[:50] + (0, 0, 2.2), floor[-50:] + (0, 0, 0.15)
     truth = replace(truth_of_two(), raster=np.zeros((1, 30, 40), np.int32))
     cloud = PointCloud(np.concatenate([floor, wall, lamp, sill]).astype(np.float32))
-    (grid,) = occupancy.floor_grids(scans.Scan(cloud, truth, ()))
+    (grid,) = occupancy.build_floor_grids(scans.Scan(cloud, truth, ()))
     assert grid.free.sum() == 80 * 60 - 60 and grid.seen.sum() == 80 * 60
     assert grid.centres(grid.free)[:, :2].min(axis=0) == pytest.approx([0.025, 0.025], abs=1e-6)
-    columns, count = occupancy.segmented(scans.Scan(cloud, truth, ()), "morphological", [grid])
+    columns, count = occupancy.segment_scan(scans.Scan(cloud, truth, ()), "morphological", [grid])
     assert count == 2 and len(np.unique(columns[0, :, :18])) == len(np.unique(columns[0, :, 24:])) == 1

@@ -17,7 +17,7 @@ from topomerge.registration.bend.graph import settle
 
 @cache
 def of_six_rooms():
-    return gtsam_solver.problem(6)
+    return gtsam_solver.build_problem(6)
 
 
 @pytest.mark.longer
@@ -34,7 +34,7 @@ def test_both_get_the_factors_of_the_last_round_by_plan():
 def test_a_motion_at_a_place_is_shift_there_and_turn():
     turn, place = 1e-4, np.array([3.0, -2.0])
     shifted = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ place - place
-    assert np.allclose(gtsam_solver.about(place) @ (0.0, 0.0, turn), [*shifted, turn], atol=1e-7)
+    assert np.allclose(gtsam_solver.compute_effect(place) @ (0.0, 0.0, turn), [*shifted, turn], atol=1e-7)
 
 
 def test_without_gtsam_it_says_what_to_install(monkeypatch):
@@ -47,7 +47,7 @@ def test_gtsam_moves_the_pieces_to_where_ours_does():
     gtsam = pytest.importorskip("gtsam")
     given = of_six_rooms()
     ours = settle(*given).moves
-    assert np.abs(gtsam_solver.gtsam_moves(gtsam, given)[:, :2] - ours[:, :2]).max() < 0.003
+    assert np.abs(gtsam_solver.solve_with_gtsam(gtsam, given)[:, :2] - ours[:, :2]).max() < 0.003
 
 
 def test_a_storey_has_as_many_rooms_and_walls_as_asked_for() -> None:
@@ -55,4 +55,4 @@ def test_a_storey_has_as_many_rooms_and_walls_as_asked_for() -> None:
     walls = [len(np.unique(np.floor(growth.storey(n)[0][:, :2] / 0.1), axis=0)) for n in (10, 20, 40)]
     assert 1.7 < walls[1] / walls[0] < 2.3 and 1.7 < walls[2] / walls[1] < 2.3
     points = growth.storey(10)[0]
-    assert 0.05 < np.abs(growth.waved(points) - points).max() <= growth.BEND_SIZE
+    assert 0.05 < np.abs(growth.wave_points(points) - points).max() <= growth.BEND_SIZE

@@ -104,7 +104,7 @@ def test_peers_bring_a_cloud_back_to_itself(module, method) -> None:
 
 
 def test_the_threshold_is_the_lowest_at_which_nearly_nothing_is_wrong(module) -> None:
-    least = module("thresholds").least_score
+    least = module("thresholds").find_least_score
     assert least(np.array([1.0, 4, 3, 5, 2]), np.array([0, 1, 0, 1, 1]), 4) == (3.5, 1.0, 0.5)
     assert least(np.array([3.0, 2]), np.array([0, 1]), 1)[0] is None  # what is wrong scores best
     assert least(np.array([-np.inf, 2.0]), np.array([1, 1]), 2) == (1.0, 1.0, 0.5)  # no answer is never believed
@@ -172,7 +172,7 @@ def invented(module):
     ]
     for r in lines[2:]:
         r["methods"] = {m: {**o, "err": None, "err_icp": None} for m, o in r["methods"].items()}
-    return module("tables").answers(lines, {"fgr": verdict})
+    return module("tables").build_answers(lines, {"fgr": verdict})
 
 
 def test_every_cell_of_a_crossed_table_stands_and_empty_ones_are_dashes(module) -> None:
@@ -186,7 +186,7 @@ def test_every_cell_of_a_crossed_table_stands_and_empty_ones_are_dashes(module) 
 
 
 def test_pairs_that_must_not_merge_are_counted_by_kind(module) -> None:
-    lines = module("tables").negatives_by_kind(invented(module)).splitlines()
+    lines = module("tables").tabulate_negatives_by_kind(invented(module)).splitlines()
     assert lines[2:] == ["| stranger | 3D–3D | 1 | 0 | 1 |", "| **all** |  | 1 | 0 | 1 |"]
 
 
@@ -223,7 +223,7 @@ def test_cells_come_in_turn_and_some_more_often(module) -> None:
 
 
 def test_pairs_that_must_not_merge_are_cells_of_their_kind(module) -> None:
-    cell = module("pairs").cell_of
+    cell = module("pairs").find_cell
     assert cell({"kind": "twin-wing", "common": 0.0, "sensors": ["tls", "laser2d"]}) == ("with a slice", "twin-wing")
     assert cell({"kind": "overlap", "common": 0.5, "sensors": ["tls", "drawing"]}) == ("with a floor plan", "nothing in common")
     assert cell({"kind": "overlap", "common": 80.0, "sensors": ["tls", "tls"]}) == ("3D–3D", "≥80 m²")
@@ -233,13 +233,13 @@ def test_peers_get_the_second_map_at_the_scale_of_the_first(module) -> None:
     pairs = module("pairs")
     cells = np.array([[0, 0, 0], [3, 1, 2]], np.int32)
     grid = VoxelGrid(cells, np.zeros(3), 0.1, (4, 4, 4))
-    a, b = (grid.with_properties(mean=grid.centroids().astype(np.float32)) for _ in range(2))
+    a, b = (grid.assign_properties(mean=grid.compute_centroids().astype(np.float32)) for _ in range(2))
     truth = Sim3(0.3, (1.0, 2.0, 0.0), 2.0)
     pair = module("pairs").GridPair("p", a, b, (None, None), truth, 1.0, {"kind": "overlap", "sensors": ["phone", "phone"]})
     given = pairs.thinned(pair)
     judged = pairs.scaled(pair)
-    assert judged.truth.scale == 1 and np.allclose(judged.truth.apply(given.b), truth.apply(grid.centroids()), atol=1e-6)
-    assert np.allclose(given.a, grid.centroids(), atol=1e-6)
+    assert judged.truth.scale == 1 and np.allclose(judged.truth.apply(given.b), truth.apply(grid.compute_centroids()), atol=1e-6)
+    assert np.allclose(given.a, grid.compute_centroids(), atol=1e-6)
 
 
 def about_file(path, **about):
@@ -255,7 +255,7 @@ def test_thirty_ordinary_pairs_come_first_and_unknown_scales_not_at_all(module, 
     grids += [about_file(tmp_path / f"s{k}.npz", sensors=["tls", "laser2d"], **alike) for k in range(2)]
     grids += [about_file(tmp_path / "x.npz", sensors=["tls", "tls"], kind="twin-wing", common=0.0)]
     drawn = [about_file(tmp_path / f"d{k}.npz", sensors=["tls", "drawing"], scaled=k == 1, **alike) for k in range(2)]
-    monkeypatch.setattr(pairs, "pair_files", lambda split: drawn if split.endswith("_drawings") else grids)
+    monkeypatch.setattr(pairs, "list_pair_files", lambda split: drawn if split.endswith("_drawings") else grids)
     test, train, raw = ([path.stem for path in pairs.cached_order(what)] for what in ("test", "train", "raw"))
     assert test[:30] == [f"a{k:02d}" for k in range(30)] and len(test) == 44 == len(set(test)) and "d1" not in test
     assert sorted(test[30:37]) == ["a30", "a31", "a32", "a33", "d0", "s0", "x"]
@@ -274,7 +274,9 @@ def test_poses_are_judged_upright_and_misses_are_told(module, monkeypatch) -> No
     said = {"kiss02": answer(off, exact, {"inliers": 5.0}, 2.0, 1.0), "kiss02q": answer(over, over, {"inliers": 0.0}, 2.0, 1.0)}
     calls = ((lambda b, a: (said, "", 6.0), ("kiss02", "kiss02q")), (lambda b, a: ({}, "over the cap", 60.0), ("fpfh", "fgr")))
     monkeypatch.setattr(peers, "PEER_CALLS", calls)
-    monkeypatch.setattr(peers, "ours", lambda given: {"status": "", "err": None, "scores": {"probability": 0.0}, "seconds": 1.0})
+    monkeypatch.setattr(
+        peers, "run_ours", lambda given: {"status": "", "err": None, "scores": {"probability": 0.0}, "seconds": 1.0}
+    )
     tried = [set(peers.measured(given, "real", number)[0]["methods"]) for number in (3, 4)]
     assert tried == [{"ours", "kiss02", "kiss02q", "fpfh", "fgr"}, {"ours", "kiss02", "kiss02q"}]  # every third pair, all
     outcomes, used = peers.peers(given, calls)
@@ -293,8 +295,8 @@ def test_ours_is_measured_anew_and_what_peers_answered_stays(module, monkeypatch
     target = tmp_path / "peers_test.jsonl"
     target.write_text("".join(json.dumps(line) + "\n" for line in lines))
     given = [SimpleNamespace(pair=SimpleNamespace(name=name)) for name in ("p", "other")]
-    monkeypatch.setattr(peers, "peer_pairs", lambda what, done: iter(given))
-    monkeypatch.setattr(peers, "ours", lambda given: {"err": [0.1, 0.0, 0.0]})
+    monkeypatch.setattr(peers, "iter_peer_pairs", lambda what, done: iter(given))
+    monkeypatch.setattr(peers, "run_ours", lambda given: {"err": [0.1, 0.0, 0.0]})
     peers.again("test")
     after = [json.loads(line) for line in target.read_text().splitlines()]
     assert after[0]["methods"] == {"ours": {"err": [0.1, 0.0, 0.0]}, "kiss02": {"err": [9.0, 0.0, 1.0]}}
@@ -311,7 +313,7 @@ def test_without_a_peer_nothing_is_measured(module, monkeypatch) -> None:
 
 def test_points_of_pairs_of_another_version_are_not_simulated(module, monkeypatch, tmp_path) -> None:
     pairs = module("pairs")
-    monkeypatch.setattr(pairs, "cached_order", lambda what: [tmp_path / "old.npz"])
-    monkeypatch.setattr(pairs, "raw_items", lambda names: {})
+    monkeypatch.setattr(pairs, "list_cached_order", lambda what: [tmp_path / "old.npz"])
+    monkeypatch.setattr(pairs, "load_raw_items", lambda names: {})
     with pytest.raises(InputError, match="old.npz: was made by another version.*task=merges data=test"):
         next(pairs.peer_pairs("raw", set()))

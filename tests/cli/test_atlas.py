@@ -13,8 +13,7 @@ import topomerge
 from tests.fusion.atlas.atlas_scenes import NAMES, office_map, stranger
 from topomerge.cli.main import main as cli
 from topomerge.fusion.atlas.folder import read_atlas
-from topomerge.fusion.atlas.registration_cache import Journal
-from topomerge.fusion.atlas.solve import solve
+from topomerge.fusion.atlas.solve import Journal, solve
 
 Run = Callable[..., tuple[int, str, str]]
 

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from topomerge.cli.completion import SHELLS, script
+from topomerge.cli.completion import SHELLS, build_script
 from topomerge.cli.main import COMMANDS
 
 
-def typed(words: list[str], folder: Path, keys: str, wanted: str, setup: str) -> str:
+def typed(words: list[str], folder: Path, keys: str, requested: str, setup: str) -> str:
     """What a shell shows after keys were typed into it; waits until it shows what is wanted."""
     pid, terminal = pty.fork()
     if pid == 0:
@@ -25,7 +25,7 @@ def typed(words: list[str], folder: Path, keys: str, wanted: str, setup: str) ->
         os.execvpe(words[0], words, {"PATH": os.environ["PATH"], "TERM": "dumb", "PS1": "> ", "HOME": str(folder)})
     shown = ""
     try:
-        for text, until in ((setup + "; echo set''up\n", "setup"), (keys, wanted.strip())):
+        for text, until in ((setup + "; echo set''up\n", "setup"), (keys, requested.strip())):
             os.write(terminal, text.encode())
             end, start = time.monotonic() + 30, len(shown)
             while until not in shown[start:] and time.monotonic() < end:
@@ -42,7 +42,7 @@ def typed(words: list[str], folder: Path, keys: str, wanted: str, setup: str) ->
 def folder(tmp_path: Path) -> Path:
     """A folder with the scripts, scans, maps and folders."""
     for shell in SHELLS:
-        (tmp_path / f"complete.{shell}").write_text(script(shell, COMMANDS))
+        (tmp_path / f"complete.{shell}").write_text(build_script(shell, COMMANDS))
     for name in ("a scan.ply", "b.tmap", "pairs/c.tmap", "two words/d.tmap"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
@@ -69,36 +69,36 @@ CASES = [
 
 
 @pytest.mark.parametrize(("keys", "wanted"), CASES)
-def test_bash_completes(folder: Path, keys: str, wanted: str) -> None:
+def test_bash_completes(folder: Path, keys: str, requested: str) -> None:
     if shutil.which("bash") is None:
         pytest.skip("no bash")
-    shown = typed(["bash", "--norc", "--noprofile", "-i"], folder, keys, wanted, "source ./complete.bash")
-    assert wanted in shown
+    shown = typed(["bash", "--norc", "--noprofile", "-i"], folder, keys, requested, "source ./complete.bash")
+    assert requested in shown
 
 
 @pytest.mark.parametrize(("keys", "wanted"), CASES)
-def test_zsh_completes(folder: Path, keys: str, wanted: str) -> None:
+def test_zsh_completes(folder: Path, keys: str, requested: str) -> None:
     if shutil.which("zsh") is None:
         pytest.skip("no zsh")
-    shown = typed(["zsh", "-f", "-i"], folder, keys, wanted.strip(), "unsetopt prompt_sp; source ./complete.zsh")
-    assert " ".join(wanted.split()) in " ".join(shown.split())
+    shown = typed(["zsh", "-f", "-i"], folder, keys, requested.strip(), "unsetopt prompt_sp; source ./complete.zsh")
+    assert " ".join(requested.split()) in " ".join(shown.split())
 
 
 @pytest.mark.parametrize(("keys", "wanted"), CASES)
-def test_fish_completes(folder: Path, keys: str, wanted: str) -> None:
+def test_fish_completes(folder: Path, keys: str, requested: str) -> None:
     if shutil.which("fish") is None:
         pytest.skip("no fish")
     line = keys.split("\t")[0]
     words = ["fish", "--no-config", "-c", "source complete.fish; complete -C $argv[1]", line]
     done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=60, check=True)
     offered = [text.split("\t")[0] for text in done.stdout.splitlines()]
-    completed = wanted.replace("\\", "").strip().rstrip("/")
+    completed = requested.replace("\\", "").strip().rstrip("/")
     assert any(completed.endswith(word.replace("\\", "").rstrip("/")) for word in offered if word.strip("/"))
 
 
 @pytest.mark.parametrize("shell", SHELLS)
 def test_every_command_and_option_is_in_the_script(shell: str) -> None:
-    text = script(shell, COMMANDS)
+    text = build_script(shell, COMMANDS)
     for command in COMMANDS:
         assert command.name in text
         for flags, _ in command.arguments:

@@ -30,25 +30,25 @@ class Terminal:
 
 def test_bars_only_when_it_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stderr", Terminal())
-    with console.Bars() as bars:
-        report = bars.task("read")
+    with console.ProgressBars() as bars:
+        report = bars.start_task("read")
         assert report is not None
         report(0.5, "scan.ply")
     assert sys.stderr.text == ""  # type: ignore[attr-defined]
-    with console.Bars(delay=0.0) as bars:
-        report = bars.task("read")
+    with console.ProgressBars(delay=0.0) as bars:
+        report = bars.start_task("read")
         assert report is not None
         report(0.2, "[odd] name")
         bars._timer.join()
         report(2.0, "[odd] name")
     report(1.0)  # a late word after the end does no harm
     assert "[odd] name" in sys.stderr.text  # type: ignore[attr-defined]
-    assert console.Bars(enabled=False).task("read") is None
+    assert console.ProgressBars(enabled=False).start_task("read") is None
 
 
 def test_no_bars_without_a_terminal() -> None:
-    with console.Bars(delay=0.0) as bars:
-        assert bars.task("read") is None
+    with console.ProgressBars(delay=0.0) as bars:
+        assert bars.start_task("read") is None
 
 
 def test_links_in_a_circle_are_no_fault_of_ours(tmp_path: Path) -> None:
@@ -60,5 +60,5 @@ def test_links_in_a_circle_are_no_fault_of_ours(tmp_path: Path) -> None:
 
 def test_a_failure_is_one_line_whatever_the_file_is_called() -> None:
     name = "no\nsuch.tmap"
-    assert console.failure_line(ValueError(f"{name}: no such file"), [name]) == "no such.tmap: no such file"
-    assert console.failure_line(ValueError("is empty"), [name]) == "no such.tmap: is empty"
+    assert console.format_failure(ValueError(f"{name}: no such file"), [name]) == "no such.tmap: no such file"
+    assert console.format_failure(ValueError("is empty"), [name]) == "no such.tmap: is empty"

@@ -9,9 +9,8 @@ import pytest
 
 from tests.scenes_map import building
 from topomerge.cli.main import main as cli
-from topomerge.embedding.learned import load_embedder
-from topomerge.embedding.turns import numbers
-from topomerge.embedding.weights import find_embedder
+from topomerge.embedding.learned import find_embedder, load_embedder
+from topomerge.embedding.quarter_turns import get_rows
 
 SHIPPED = str(find_embedder())
 
@@ -21,7 +20,7 @@ def test_an_embedder_comes_out_as_it_is(tmp_path: Path, capsys: pytest.CaptureFi
     assert "numbers a room" in capsys.readouterr().out
     assert sorted(p.name for p in (tmp_path / "a" / "b").iterdir()) == ["embedder.card.json", "embedder.onnx"]
     map = building(2, 2)
-    rows = [numbers(load_embedder(folder)(map)) for folder in (tmp_path / "a" / "b", SHIPPED)]
+    rows = [get_rows(load_embedder(folder)(map)) for folder in (tmp_path / "a" / "b", SHIPPED)]
     assert rows[0].shape == (len(map.rooms), 4, 64) and np.array_equal(*rows)
 
 

@@ -17,7 +17,7 @@ from tests.scenes import two_rooms
 from tests.scenes_map import building
 from tests.types.test_deformation import deformation
 from topomerge.cli.main import main as cli
-from topomerge.cli.merge_points import point_files
+from topomerge.cli.merge import choose_point_files
 from topomerge.fusion.result import MergeResult
 from topomerge.io.maps import save_map
 from topomerge.types import Array, Deformation, Sim3, TopometricMap
@@ -53,7 +53,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
 
         monkeypatch.setattr(topomerge, "merge", merge, raising=False)
         monkeypatch.setattr("topomerge.cli.merge.map_from", lambda path, args: building(1, 1))
-        monkeypatch.setattr("topomerge.viz.merge_report.merge_html", lambda result: "a report")
+        monkeypatch.setattr("topomerge.viz.merge_report.render_merge_html", lambda result: "a report")
         status = cli(["merge", *words])
         out, err = capsys.readouterr()
         return status, out, err
@@ -86,9 +86,9 @@ def test_points_stand_where_the_merge_says(run: Run, names: tuple[str, str]) -> 
         suffix = Path(name).suffix if "la" in Path(name).suffix else ".ply"
         path = Path("m") / f"{Path(name).stem}_merged{suffix}"
         bent = BENDS[k].apply(cloud)
-        wanted = POSE.apply(bent) if k else bent
+        requested = POSE.apply(bent) if k else bent
         assert np.abs(bent - cloud).max() > 0.05
-        assert np.abs(exact(path) - wanted).max() < 1e-3
+        assert np.abs(exact(path) - requested).max() < 1e-3
         assert topomerge.read_points(path).colors is not None or name.endswith(".npy")
         assert f"{len(cloud):,} points of {name} -> {path.name}" in out
     merge = json.loads(Path("m/merge.json").read_text())
@@ -153,7 +153,7 @@ def test_points_of_an_earlier_merge_do_not_stay(run: Run) -> None:
 def test_inputs_that_are_called_alike(run: Run) -> None:
     """Also where the file system takes capitals for small letters; and only files of one suffix can be."""
     inputs = ["x/a.npy", "y/a.ply", "z/A.npy", "a_2.las", "w/a.las", "m.tmap"]
-    files = {k: path.name for k, path in point_files(inputs, Path("m")).items()}
+    files = {k: path.name for k, path in choose_point_files(inputs, Path("m")).items()}
     assert files == {0: "a_merged.ply", 1: "a_2_merged.ply", 2: "A_3_merged.ply", 3: "a_2_merged.las", 4: "a_merged.las"}
     for k, folder in enumerate(("x", "y")):
         Path(folder).mkdir()
@@ -176,13 +176,13 @@ def test_an_input_is_never_overwritten(run: Run) -> None:
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
 def test_nothing_is_half_written(run: Run, monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
-    from topomerge.io import moved_points
+    from topomerge.io import transformed_points
 
     write("a.npy", SCAN)
     write("b.csv", SCAN + np.float32(1))
     assert run("a.npy", "b.csv", "-o", "m", "--points", "-q")[0] == 0
     before = {p.name: p.read_bytes() for p in Path("m").iterdir()}
-    whole, calls = moved_points._vertices, []
+    whole, calls = transformed_points._build_vertices, []
 
     def failing(*arguments: Any) -> Array:
         calls.append(1)
@@ -190,7 +190,7 @@ def test_nothing_is_half_written(run: Run, monkeypatch: pytest.MonkeyPatch, erro
             raise error
         return whole(*arguments)
 
-    monkeypatch.setattr(moved_points, "_vertices", failing)
+    monkeypatch.setattr(transformed_points, "_build_vertices", failing)
     for folder in ("m", "new"):
         calls.clear()
         status, out, err = run("a.npy", "b.csv", "-o", folder, "--points", "-q")

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from topomerge.cli.console import failure_line, signal_behind
+from topomerge.cli.console import find_signal, format_failure
 from topomerge.errors import InputError, is_memory_short
 from topomerge.fusion.atlas import folder as atlas_folder
-from topomerge.io import atomic
-from topomerge.io.atomic import replacing
-from topomerge.viz.markup import element
+from topomerge.io import archive
+from topomerge.io.archive import replace_on_success
+from topomerge.viz.tables import build_element
 
 SHORT = [
     MemoryError(),
@@ -31,7 +31,7 @@ SHORT = [
 
 @pytest.mark.parametrize("error", SHORT)
 def test_short_memory_in_any_words(error: BaseException) -> None:
-    assert failure_line(error, ["a.ply"]).startswith("a.ply: not enough memory")
+    assert format_failure(error, ["a.ply"]).startswith("a.ply: not enough memory")
     outer = OSError("Could not find a library")
     outer.__cause__ = error
     assert is_memory_short(outer)
@@ -40,7 +40,7 @@ def test_short_memory_in_any_words(error: BaseException) -> None:
 def test_other_errors_and_circles_of_them_are_not_short_memory() -> None:
     first, second = ValueError("a"), KeyError("b")
     first.__context__, second.__context__ = second, first
-    assert not is_memory_short(first) and signal_behind(first) is None
+    assert not is_memory_short(first) and find_signal(first) is None
     assert not is_memory_short(InputError("a name that is out of memory"))
 
 
@@ -57,14 +57,16 @@ def test_a_limited_address_space_is_named(tmp_path: Path, megabytes: int) -> Non
 
 
 def test_what_killed_processes_left_is_cleared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    kill = "import os, sys; from topomerge.io.atomic import replacing\nwith replacing(sys.argv[1]): os._exit(9)"
+    kill = (
+        "import os, sys; from topomerge.io.archive import replace_on_success\nwith replace_on_success(sys.argv[1]): os._exit(9)"
+    )
     for k in range(3):
         subprocess.run([sys.executable, "-c", kill, str(tmp_path / f"m{k}.tmap")], check=False)
     assert list(tmp_path.glob(".*.part"))
-    (tmp_path / f".mine.{atomic._machine()}-{os.getpid()}.abc.part").mkdir()
+    (tmp_path / f".mine.{archive._compute_machine_id()}-{os.getpid()}.abc.part").mkdir()
     (tmp_path / ".theirs.00000000-1.abc.part").mkdir()
-    atomic._clear_stale.cache_clear()
-    with replacing(tmp_path / "a.txt") as beside:
+    archive._delete_stale_parts.cache_clear()
+    with replace_on_success(tmp_path / "a.txt") as beside:
         beside.write_text("a")
     left = sorted(p.name.split(".")[1] for p in tmp_path.glob(".*.part"))
     assert left == ["mine", "theirs"] and (tmp_path / "a.txt").read_text() == "a"
@@ -75,14 +77,14 @@ def test_an_atlas_that_cannot_be_written_leaves_no_lock(tmp_path: Path, exists: 
     place = tmp_path / "site"
     if exists:
         place.mkdir()
-    with pytest.raises(InputError, match="No space left"), atlas_folder.changing(place, []):
+    with pytest.raises(InputError, match="No space left"), atlas_folder.change_folder(place, []):
         raise OSError(28, "No space left on device")
     assert place.exists() == exists and not list(tmp_path.rglob(".lock"))
 
 
 def test_watch_that_is_interrupted_while_it_starts(tmp_path: Path) -> None:
     (tmp_path / "scans").mkdir()
-    slow = "import time, topomerge.cli.watch as w\nw._watch = lambda args: print('on', flush=True) or time.sleep(60)\n"
+    slow = "import time, topomerge.cli.atlas as w\nw._build_monitor = lambda args: print('on', flush=True) or time.sleep(60)\n"
     start = f"{slow}import sys; from topomerge.cli.main import main; sys.argv[0] = 'topomerge'; sys.exit(main())"
     process = subprocess.Popen(
         [sys.executable, "-c", start, "watch", str(tmp_path / "scans"), "-o", str(tmp_path / "site")],
@@ -97,5 +99,5 @@ def test_watch_that_is_interrupted_while_it_starts(tmp_path: Path) -> None:
 
 
 def test_control_characters_reach_no_page() -> None:
-    made = element("title", "a\x1b[31m\x07\x9b.ply", title="b\x07")
+    made = build_element("title", "a\x1b[31m\x07\x9b.ply", title="b\x07")
     assert not any(c in made for c in "\x1b\x07\x9b") and "\ufffd" in made

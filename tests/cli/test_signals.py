@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from topomerge.cli.signals import leave_on_signals
+from topomerge.cli.console import exit_on_signals
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 WAIT = 5.0  # s
@@ -21,7 +21,7 @@ WAIT = 5.0  # s
 def handlers() -> Iterator[None]:
     """The process has its own again afterwards."""
     own = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)}
-    leave_on_signals()
+    exit_on_signals()
     yield
     signal.setitimer(signal.ITIMER_REAL, 0)
     for number, handler in own.items():

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
-from topomerge.datasets.buildings.profiles import BUILDING_KINDS
+from topomerge.datasets.buildings.layouts import BUILDING_KINDS
 
 import topomerge
+from topomerge.cli.main import KINDS_OF_BUILDINGS
 from topomerge.cli.main import main as cli
-from topomerge.cli.simulate import KINDS_OF_BUILDINGS
 
 SMALL_BUILDING = ("--building", "house", "--seed", "3", "--rooms", "4", "--quiet")
 
@@ -33,7 +33,7 @@ def truth(folder: Path) -> Any:
 @pytest.mark.parametrize("place", ["file", "file/x", "/proc/x", ""])
 def test_a_folder_that_cannot_be_is_found_first(tmp_path: Path, monkeypatch: Any, capsys: Any, place: str) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("topomerge.datasets.pairs.simulate.simulate", lambda *_, **__: pytest.fail("simulated for nothing"))
+    monkeypatch.setattr("topomerge.datasets.pairs.simulate.simulate_maps", lambda *_, **__: pytest.fail("simulated for nothing"))
     Path("file").touch()
     assert cli(["simulate", "--building", "house", "-o", place]) == 1
     err = capsys.readouterr().err

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from topomerge.datasets.core.difficulty import Difficulty
-from topomerge.datasets.core.plan import Flight, Opening, Plan, PlanRoom
+from topomerge.datasets.core.building import Difficulty, Flight, Opening, Plan, PlanRoom
 
 BARE = Difficulty(  # nothing but the shell
     lintels=1, ceiling_spread=0, furniture=0, clutter=0, windows=1, glass=0, open=1, half=0, lamps=0, beams=0, columns=0,

@@ -9,9 +9,9 @@ import pytest
 
 from tests.scenes_map import building
 from topomerge import load_embedder
-from topomerge.embedding.sheets import sheet_arrays
-from topomerge.embedding.surroundings import CROP_PART, CROP_SHAPES, DOOR_PART, SHEET_PLANES, WIDE_PART, WIDE_STEP, crops
-from topomerge.embedding.turns import TurnedRows
+from topomerge.embedding.quarter_turns import TurnedRows
+from topomerge.embedding.sheets import build_sheet_arrays
+from topomerge.embedding.surroundings import CROP_PART, CROP_SHAPES, DOOR_PART, SHEET_PLANES, WIDE_PART, WIDE_STEP, cut_crops
 from topomerge.types import Array, TopometricMap
 
 SIDES = (40, 24)  # pixels of the sheet
@@ -54,7 +54,7 @@ def share_seen(part: str, at: tuple[int, int]) -> Array:
 @pytest.mark.parametrize("place", PLACES)
 def test_crops_show_what_lies_on_the_sheet_and_nothing_beyond(part: str, place: str) -> None:
     middle, at = PLACES[place]
-    shown = crops(all_seen(middle), part)
+    shown = cut_crops(all_seen(middle), part)
     assert shown.shape == (1, *CROP_SHAPES[part]) and shown.dtype == np.uint8
     crop = shown[0, 0] if part == DOOR_PART else shown[0]
     expected = share_seen(part, at)
@@ -75,14 +75,14 @@ def far_off(map: TopometricMap) -> TopometricMap:
 def without_walls(map: TopometricMap) -> TopometricMap:
     """The map's lowest layer of cells only."""
     floor = map.grid.cells[:, 2] == 0
-    return replace(map, grid=map.grid.with_cells(map.grid.cells[floor]), room=map.room[floor])
+    return replace(map, grid=map.grid.replace_cells(map.grid.cells[floor]), room=map.room[floor])
 
 
 def unseen(map: TopometricMap) -> TopometricMap:
     """The map's rooms without any cell."""
     none = np.zeros((0, 3), np.int32)
     labels = np.zeros(0, np.int32)
-    grids = {"grid": map.grid.with_cells(none), "navigable": map.navigable.with_cells(none)}
+    grids = {"grid": map.grid.replace_cells(none), "navigable": map.navigable.replace_cells(none)}
     return replace(map, **grids, room=labels, navigable_room=labels, navigable_area=None)
 
 
@@ -90,7 +90,7 @@ def unseen(map: TopometricMap) -> TopometricMap:
 @pytest.mark.parametrize("change", [far_off, without_walls, unseen])
 def test_odd_maps_have_crops_of_all_kinds(part: str, change) -> None:
     map = change(building(2))
-    shown = crops(sheet_arrays(map), part)
+    shown = cut_crops(build_sheet_arrays(map), part)
     assert shown.shape == (len(map.rooms), *CROP_SHAPES[part])
     if change is not far_off:
         assert not shown[..., SHEET_PLANES.index("wall")].any()

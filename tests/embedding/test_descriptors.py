@@ -9,12 +9,9 @@ import pytest
 
 from tests.embedding.test_graph import turned
 from tests.scenes_map import building
-from topomerge.embedding.context import with_context
-from topomerge.embedding.embedders import EMBEDDERS, embedder
-from topomerge.embedding.engineered import FEATURES, raw_features
-from topomerge.embedding.feather import feather, walk_matrix
-from topomerge.embedding.room_cells import joined, neighbours
-from topomerge.embedding.turns import numbers
+from topomerge.embedding.engineered import FEATURES, add_context, build_feather, compute_raw_features, compute_walk_matrix
+from topomerge.embedding.learned import EMBEDDERS, build_embedder
+from topomerge.embedding.quarter_turns import find_neighbours, get_rows, join_rooms
 from topomerge.errors import InputError
 from topomerge.types import TopometricMap
 
@@ -41,31 +38,31 @@ def permuted(map: TopometricMap, order: np.ndarray) -> TopometricMap:
 def test_rows_and_columns(map: TopometricMap, name: str, k: int):
     if name == "learned" and k:  # its rows see what is around them
         with pytest.raises(InputError, match="leave k out"):
-            embedder(name, k)(map)
+            build_embedder(name, k)(map)
         return
-    rows = numbers(embedder(name, k, **FAST[name])(map))
+    rows = get_rows(build_embedder(name, k, **FAST[name])(map))
     assert rows.dtype == np.float64 and len(rows) == len(map.rooms) and np.isfinite(rows).all()
-    assert rows.shape[1:] == ((4, 64) if name == "learned" else ((k + 1) * embedder(name, **FAST[name])(map).shape[1],))
+    assert rows.shape[1:] == ((4, 64) if name == "learned" else ((k + 1) * build_embedder(name, **FAST[name])(map).shape[1],))
 
 
 @pytest.mark.longer
 @pytest.mark.parametrize("name", EMBEDDERS)
 def test_order_of_rooms(map: TopometricMap, name: str):
     order = np.array([3, 0, 4, 1, 2])
-    describe = embedder(name, int(name != "learned"), **FAST[name])
-    assert np.allclose(numbers(describe(permuted(map, order))), numbers(describe(map))[order], atol=1e-6)
+    describe = build_embedder(name, int(name != "learned"), **FAST[name])
+    assert np.allclose(get_rows(describe(permuted(map, order))), get_rows(describe(map))[order], atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["engineered", "feather"])
 def test_turns_change_nothing(map: TopometricMap, name: str):
-    describe = embedder(name, 1)
+    describe = build_embedder(name, 1)
     other, storeys = turned(map), map.storeys.copy()
     storeys["floor"] += other.grid.origin[2] - map.grid.origin[2]
     assert np.allclose(describe(replace(other, storeys=storeys)), describe(map), atol=0.02)
 
 
 def test_engineered_by_hand(map: TopometricMap):
-    rows = raw_features(map)
+    rows = compute_raw_features(map)
     of = dict(zip(FEATURES, rows[0], strict=True))
     assert np.expm1(of["area"]) == pytest.approx(20.0) and of["clear_height"] == pytest.approx(2.9)
     assert np.expm1(of["projection"]) == pytest.approx(20.0) and of["step"] == pytest.approx(0.05, abs=0.11)
@@ -73,31 +70,31 @@ def test_engineered_by_hand(map: TopometricMap):
 
 
 def test_twin_rooms_are_alike(map: TopometricMap):
-    rows = embedder("engineered")(map)
+    rows = build_embedder("engineered")(map)
     apart = np.linalg.norm(rows[:, None] - rows[None], axis=2)
     assert apart[0, 1] < 0.1 * apart[0, 4]
 
 
 def test_context_of_nothing_is_the_room(map: TopometricMap):
-    describe = embedder("engineered", features="thesis")
+    describe = build_embedder("engineered", features="thesis")
     alone = replace(map, edges=map.edges[:0])
-    rows = with_context(describe, 1)(alone)
+    rows = add_context(describe, 1)(alone)
     assert np.array_equal(rows[:, :12], rows[:, 12:])
-    mean = with_context(describe, 1, "mean")(map)
+    mean = add_context(describe, 1, "mean")(map)
     assert np.allclose(mean[0, 12:], describe(map)[[0, 4]].mean(axis=0))
 
 
 def test_joined_and_neighbours(map: TopometricMap):
-    assert neighbours(map, 1)[0].tolist() == [0, 4] and neighbours(map, 2)[0].tolist() == [0, 1, 2, 3, 4]
-    one = joined(map, np.array([0, 4]))
+    assert find_neighbours(map, 1)[0].tolist() == [0, 4] and find_neighbours(map, 2)[0].tolist() == [0, 1, 2, 3, 4]
+    one = join_rooms(map, np.array([0, 4]))
     assert len(one.rooms) == 1 and one.rooms["area"][0] == pytest.approx(map.rooms["area"][[0, 4]].sum())
     assert len(one.grid) == np.isin(map.room, [0, 4]).sum()
 
 
 def test_feather_is_the_formula(map: TopometricMap):
     values = np.arange(len(map.rooms), dtype=float)[:, None]
-    rows = feather(lambda _: values, steps=2, points=1, largest=0.3)(map)
-    walk = walk_matrix(map)
+    rows = build_feather(lambda _: values, steps=2, points=1, largest=0.3)(map)
+    walk = compute_walk_matrix(map)
     assert np.allclose(walk.sum(axis=1), 1)
     waves = np.exp(0.3j * values[:, 0])
     once, twice = walk @ waves, walk @ walk @ waves
@@ -108,4 +105,4 @@ def test_bad_names():
     wrong = [("x", {}), ("", {}), ("shapedna", {"value": 3}), ("feather", {"steps": 0})]
     for name, options in [*wrong, *(("engineered", {"k": k}) for k in (-1, 100_000, 0.5, True))]:
         with pytest.raises(InputError):
-            embedder(name, **options)
+            build_embedder(name, **options)

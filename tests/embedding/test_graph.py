@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from tests.scenes_map import building
-from topomerge.embedding.graph import graph_arrays, to_graph
-from topomerge.embedding.schema import DOOR_FEATURES, EDGE_FEATURES, EDGE_KINDS, ROOM_FEATURES
+from topomerge.embedding.graph import DOOR_FEATURES, EDGE_FEATURES, EDGE_KINDS, ROOM_FEATURES, build_graph, build_graph_arrays
 from topomerge.errors import InputError
 from topomerge.types import TopometricMap, VoxelGrid
 
@@ -51,7 +50,7 @@ def turned(map: TopometricMap) -> TopometricMap:
 
 
 def test_shapes(map: TopometricMap) -> None:
-    arrays = graph_arrays(map, 64)
+    arrays = build_graph_arrays(map, 64)
     rooms, edges = len(map.rooms), len(map.edges)
     assert arrays["x"].shape == (rooms, len(ROOM_FEATURES)) and arrays["x"].dtype == np.float32
     assert arrays["room_points"].shape == (rooms, 64, 3) and arrays["room_points"].dtype == np.float32
@@ -64,7 +63,7 @@ def test_shapes(map: TopometricMap) -> None:
 
 
 def test_both_directions_agree(map: TopometricMap) -> None:
-    arrays, edges = graph_arrays(map, 8), len(map.edges)
+    arrays, edges = build_graph_arrays(map, 8), len(map.edges)
     there, back = arrays["edge_attr"][:edges], arrays["edge_attr"][edges:]
     name = {n: i for i, n in enumerate(EDGE_FEATURES)}
     assert np.array_equal(arrays["edge_index"][:, :edges], arrays["edge_index"][::-1, edges:])
@@ -77,18 +76,18 @@ def test_both_directions_agree(map: TopometricMap) -> None:
 
 
 def test_features_do_not_depend_on_the_frame(map: TopometricMap) -> None:
-    here, there = graph_arrays(map, 16), graph_arrays(turned(map), 16)
+    here, there = build_graph_arrays(map, 16), build_graph_arrays(turned(map), 16)
     for name in ("x", "edge_attr", "door_attr", "edge_index", "door_index"):
         assert np.allclose(here[name], there[name], atol=1e-4), name
     assert not np.allclose(here["pos"], there["pos"])
 
 
 def test_points_stand_on_their_floor_about_the_middle(map: TopometricMap) -> None:
-    arrays = graph_arrays(map, 512)
+    arrays = build_graph_arrays(map, 512)
     for r in range(len(map.rooms)):
         points = arrays["room_points"][r]
         assert points[:, 2].min() > -0.5 and points[:, 2].max() < 5
-        cells = map.grid.centroids()[map.room == r]
+        cells = map.grid.compute_centroids()[map.room == r]
         if len(cells):
             middle = [*map.rooms["centroid"][r][:2], 0]
             moved = cells - middle
@@ -96,26 +95,26 @@ def test_points_stand_on_their_floor_about_the_middle(map: TopometricMap) -> Non
 
 
 def test_the_same_map_gives_the_same_tensors(map: TopometricMap) -> None:
-    one, two = graph_arrays(map), graph_arrays(map)
+    one, two = build_graph_arrays(map), build_graph_arrays(map)
     assert all(one[k].tobytes() == two[k].tobytes() for k in one)
 
 
 def test_a_map_without_edges_or_rooms(map: TopometricMap) -> None:
-    lonely = graph_arrays(replace(map, edges=map.edges[:0]), 4)
+    lonely = build_graph_arrays(replace(map, edges=map.edges[:0]), 4)
     assert lonely["edge_index"].shape == (2, 0) and lonely["edge_attr"].shape == (0, len(EDGE_FEATURES))
     assert lonely["door_index"].shape == (2, 0) and (lonely["x"][:, ROOM_FEATURES.index("degree")] == 0).all()
     none = np.full(len(map.room), -1, np.int32), np.full(len(map.navigable), -1, np.int32)
     empty = replace(map, edges=map.edges[:0], rooms=map.rooms[:0], room=none[0], navigable_room=none[1])
-    assert graph_arrays(empty, 4)["x"].shape == (0, len(ROOM_FEATURES))
+    assert build_graph_arrays(empty, 4)["x"].shape == (0, len(ROOM_FEATURES))
 
 
 def test_a_wrong_number_of_points(map: TopometricMap) -> None:
     with pytest.raises(InputError, match="1 or more, not 0"):
-        graph_arrays(map, 0)
+        build_graph_arrays(map, 0)
 
 
 def test_tensors(map: TopometricMap) -> None:
     pytest.importorskip("torch_geometric")
-    data = to_graph(map, 32)
+    data = build_graph(map, 32)
     assert data.validate() and data.num_nodes == len(map.rooms) and data.num_edges == 2 * len(map.edges)
     assert data.x.shape[1] == len(ROOM_FEATURES) and data.room_points.shape == (len(map.rooms), 32, 3)

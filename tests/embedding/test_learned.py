@@ -15,14 +15,12 @@ import pytest
 
 from tests.scenes_map import building
 from topomerge.embedding import network as parts
-from topomerge.embedding.graph import graph_arrays
-from topomerge.embedding.learned import load_embedder
+from topomerge.embedding.graph import build_graph_arrays
+from topomerge.embedding.learned import EMBEDDER_FILE, find_embedder, load_embedder, read_embedder_card
 from topomerge.embedding.network import Geometry, Network, Node
-from topomerge.embedding.room_cells import joined
-from topomerge.embedding.sheets import sheet_arrays
+from topomerge.embedding.quarter_turns import TurnedRows, join_rooms
+from topomerge.embedding.sheets import build_sheet_arrays
 from topomerge.embedding.surroundings import CROP_SHAPES
-from topomerge.embedding.turns import TurnedRows
-from topomerge.embedding.weights import EMBEDDER_FILE, find_embedder, read_embedder_card
 from topomerge.errors import InputError
 from topomerge.networks.network import card_of
 
@@ -33,8 +31,8 @@ EARLIER = Path(__file__).parent / "earlier"
 def graphs() -> dict[str, dict[str, np.ndarray]]:
     """Arrays of varied maps: a house of one room, one without doors, several storeys, rooms that nothing leads to."""
     two = building(2, 3)
-    maps = {"storeys": two, "small": building(1), "one": joined(two, np.arange(3))}
-    graphs = {name: graph_arrays(map) | sheet_arrays(map) for name, map in maps.items()}
+    maps = {"storeys": two, "small": building(1), "one": join_rooms(two, np.arange(3))}
+    graphs = {name: build_graph_arrays(map) | build_sheet_arrays(map) for name, map in maps.items()}
     alone = dict(graphs["small"])
     for name, array in alone.items():
         if name.startswith(("edge", "door")):
@@ -68,29 +66,31 @@ def exported(torch, network: Network, folder: Path):
 
 def plain(rows):
     """Rows of all turns behind each other, or plain ones."""
-    return rows.flat() if isinstance(rows, TurnedRows) else rows
+    return rows.flatten() if isinstance(rows, TurnedRows) else rows
 
 
 def compare(ours, network, several: dict[str, dict[str, np.ndarray]]) -> None:
     """What is loaded gives the embeddings and dustbins of a network of torch."""
-    from topomerge.models.weights import learned
+    from topomerge.models.weights import wrap_network
 
-    theirs = learned(network)
+    theirs = wrap_network(network)
     assert ours.temperature == pytest.approx(theirs.temperature, abs=1e-7) and ours.embedder
     for name, arrays in several.items():
-        for rows, expected in zip(*(map(plain, one.graph(arrays)) for one in (ours, theirs)), strict=True):
+        for rows, expected in zip(*(map(plain, one.embed_graph(arrays)) for one in (ours, theirs)), strict=True):
             assert rows.shape == expected.shape and rows.dtype == np.float64
             assert np.abs(rows - expected).max() < 1e-5, name
 
 
 def test_the_embedder_that_ships_is_as_with_torch(torch):
-    from topomerge.models.weights import learned, read_embedder
+    from topomerge.models.weights import read_embedder, wrap_network
 
     network, about = read_embedder()
-    ours, theirs, map = load_embedder(), learned(network), building(2, 2)
+    ours, theirs, map = load_embedder(), wrap_network(network), building(2, 2)
     compare(ours, network, graphs())
-    assert ours.about == about and np.abs(ours.matchability(map) - theirs.matchability(map)).max() < 1e-5
-    for one, other in zip(ours.probabilities(map, building(3)), theirs.probabilities(map, building(3)), strict=True):
+    assert ours.about == about and np.abs(ours.compute_matchability(map) - theirs.compute_matchability(map)).max() < 1e-5
+    for one, other in zip(
+        ours.compute_probabilities(map, building(3)), theirs.compute_probabilities(map, building(3)), strict=True
+    ):
         assert np.abs(one - other).max() < 1e-5 and np.allclose(one.sum(axis=1), 1)
 
 
@@ -169,7 +169,7 @@ def test_what_earlier_versions_wrote_is_exported_and_says_the_same(torch, name, 
             assert np.abs(ours(building(2)).rows - file["one_crop"]).max() < 1e-5
         return
     with np.load(EARLIER / "expected.npz", allow_pickle=False) as file:
-        embedding, dustbin = ours.graph({n.removeprefix("graph."): file[n] for n in file.files if n.startswith("graph.")})
+        embedding, dustbin = ours.embed_graph({n.removeprefix("graph."): file[n] for n in file.files if n.startswith("graph.")})
         assert np.abs(embedding - file["pretrained.embedding"]).max() < 1e-5
         assert np.abs(dustbin - file["pretrained.dustbin"]).max() < 1e-5
 

@@ -10,19 +10,22 @@ from pathlib import Path
 
 import pytest
 
-from topomerge.embedding import schema
+from topomerge.embedding import graph
 
 ROOT = Path(__file__).parent.parent.parent
 
 
 def test_columns_are_looked_up_by_name():
-    assert [schema.TABLES["x"][k] for k in schema.columns_of_power("x", 1)] == [
+    assert [graph.TABLES["x"][k] for k in graph.find_columns_of_power("x", 1)] == [
         "height", "length", "width", "floor_spread", "door_width", "reach",
     ]  # fmt: skip
-    assert schema.columns_of_power("x", 2) == [schema.column("x", "area")] and schema.column("edge_attr", "turn_cos") == 10
-    for name, powers in schema.LENGTH_POWERS.items():
-        assert set(powers) <= set(schema.TABLES[name])
-    for columns in schema.TABLES.values():
+    assert (
+        graph.find_columns_of_power("x", 2) == [graph.find_column("x", "area")]
+        and graph.find_column("edge_attr", "turn_cos") == 10
+    )
+    for name, powers in graph.LENGTH_POWERS.items():
+        assert set(powers) <= set(graph.TABLES[name])
+    for columns in graph.TABLES.values():
         assert len(set(columns)) == len(columns)
 
 
@@ -35,7 +38,7 @@ def test_a_feature_more_makes_everything_wider(tmp_path):
         shutil.copytree(
             ROOT / folder, tmp_path / "topomerge" / ("" if folder == "topomerge" else folder), ignore=ignored, dirs_exist_ok=True
         )
-    path = tmp_path / "topomerge" / "embedding" / "schema.py"
+    path = tmp_path / "topomerge" / "embedding" / "graph.py"
     text = path.read_text()
     for name in ("ROOM_FEATURES = (", "EDGE_FEATURES = ("):
         text = text.replace(f"\n{name}", f"\n{name}\n    'brightness',")
@@ -44,7 +47,7 @@ def test_a_feature_more_makes_everything_wider(tmp_path):
 import json, torch, topomerge
 from topomerge.embedding.learned import load_embedder
 from topomerge.embedding.network import Geometry, Network, Node
-from topomerge.embedding.rooms_around import CLIMB, KIND_COLUMNS
+from topomerge.embedding.learned import CLIMB, KIND_COLUMNS
 from topomerge.errors import InputError
 from topomerge.models.embedder import Embedder
 from topomerge.models.export import build_embedder_sample
@@ -63,7 +66,7 @@ print(json.dumps({"file": topomerge.__file__, "x": tensors["x"].shape[1], "edge_
     )
     said = json.loads(done.stdout)
     assert Path(said["file"]).is_relative_to(tmp_path)
-    rooms, edges = len(schema.ROOM_FEATURES) + 1, len(schema.EDGE_FEATURES) + 1
+    rooms, edges = len(graph.ROOM_FEATURES) + 1, len(graph.EDGE_FEATURES) + 1
     assert (said["x"], said["rooms"], said["edge_attr"], said["edges"]) == (rooms, rooms, edges, edges)
     assert said["embedding"] == [6, 8] and said["columns"] == [7, 3, 4, 5]
     assert (

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from tests.matching.turned_maps import turned
 from tests.scenes_map import building
-from topomerge.embedding.sheets import sheet, sheet_arrays, wall_direction
+from topomerge.embedding.sheets import build_sheet_arrays, estimate_wall_direction, rasterise_sheet
 from topomerge.embedding.surroundings import (
     CEILING_UNIT,
     CROP,
@@ -21,7 +21,7 @@ from topomerge.embedding.surroundings import (
     SHEET_PIXEL,
     SHEET_PLANES,
     WIDE_PART,
-    crops,
+    cut_crops,
 )
 from topomerge.types import TopometricMap
 
@@ -29,7 +29,7 @@ PLANE = {name: k for k, name in enumerate(CROP_PLANES)}
 
 
 def views(map: TopometricMap) -> np.ndarray:
-    return crops(sheet_arrays(map)).astype(float) / 255
+    return cut_crops(build_sheet_arrays(map)).astype(float) / 255
 
 
 def test_a_crop_shows_the_room_in_its_middle_its_walls_and_what_lies_beyond():
@@ -46,7 +46,7 @@ def test_a_crop_shows_the_room_in_its_middle_its_walls_and_what_lies_beyond():
 
 def test_doors_stand_where_the_edges_are():
     map = building(1)
-    drawn = sheet(map)
+    drawn = rasterise_sheet(map)
     planes = drawn.planes[..., SHEET_PLANES.index("door")] > 0
     middle = np.argwhere(planes).mean(axis=0) + 0.5
     expected = map.edges["centre"][:, :2].mean(axis=0) - map.rooms["centroid"][0, :2]
@@ -97,10 +97,10 @@ def test_beyond_the_edge_of_a_map_nothing_is_seen():
 def test_a_storey_without_walls_stands_as_its_map_does():
     map = building(1)
     floor = map.grid.cells[:, 2] == 0
-    flat = replace(map, grid=map.grid.with_cells(map.grid.cells[floor]), room=map.room[floor])
-    drawn = sheet(flat)
+    flat = replace(map, grid=map.grid.replace_cells(map.grid.cells[floor]), room=map.room[floor])
+    drawn = rasterise_sheet(flat)
     assert drawn.turn.tolist() == [0.0] and not drawn.planes[..., 0].any()
-    assert crops(sheet_arrays(flat)).shape == (len(map.rooms), CROP, CROP, len(CROP_PLANES))
+    assert cut_crops(build_sheet_arrays(flat)).shape == (len(map.rooms), CROP, CROP, len(CROP_PLANES))
 
 
 @pytest.mark.parametrize("degrees", [0.0, 0.3, 17.0, 44.9, 45.2, 89.6])
@@ -112,17 +112,17 @@ def test_the_direction_of_walls_is_that_of_most_of_them(degrees):
     angle = np.radians(degrees)
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     walls = (np.concatenate([along, across, slanted]) + rng.normal(0, 0.02, (1350, 2))) @ turn
-    off = np.degrees(wall_direction(walls)) - degrees
+    off = np.degrees(estimate_wall_direction(walls)) - degrees
     assert abs((off + 45) % 90 - 45) < 0.35
 
 
 def test_no_walls_have_no_direction():
-    assert wall_direction(np.zeros((0, 2))) == 0.0
+    assert estimate_wall_direction(np.zeros((0, 2))) == 0.0
 
 
 def test_a_wide_crop_shows_twice_as_far_in_means_of_pixels():
-    arrays = sheet_arrays(building(3))
-    fine, wide = (crops(arrays, part).astype(float) for part in (CROP_PART, WIDE_PART))
+    arrays = build_sheet_arrays(building(3))
+    fine, wide = (cut_crops(arrays, part).astype(float) for part in (CROP_PART, WIDE_PART))
     inner = wide[:, 8:24, 8:24]  # the 16 m of the finer crop
     means = fine.reshape(len(fine), 16, 4, 16, 4, -1).mean(axis=(2, 4))
     assert np.abs(inner - means).max() < 1.0
@@ -130,8 +130,8 @@ def test_a_wide_crop_shows_twice_as_far_in_means_of_pixels():
 
 
 def test_crops_of_doors_have_the_door_in_their_middle_and_show_which_room_is_meant():
-    arrays = sheet_arrays(building(2))
-    shown, doors = crops(arrays, DOOR_PART), np.isfinite(arrays["door_anchor"]).all(axis=2).sum(axis=1)
+    arrays = build_sheet_arrays(building(2))
+    shown, doors = cut_crops(arrays, DOOR_PART), np.isfinite(arrays["door_anchor"]).all(axis=2).sum(axis=1)
     middle = DOOR_CROP // 2
     for room, count in zip(shown, doors, strict=True):
         assert (room[:count, middle - 1 : middle + 1, middle - 1 : middle + 1, PLANE["door"]] > 0).all()
@@ -142,7 +142,7 @@ def test_crops_of_doors_have_the_door_in_their_middle_and_show_which_room_is_mea
 def test_doors_stand_in_the_same_place_where_a_room_was_only_looked_into():
     """Half a room has its middle elsewhere; what is seen about its door is the same."""
     map = building(2)
-    far = map.navigable.centroids()[:, 1] > np.median(map.navigable.centroids()[map.navigable_room == 0, 1])
+    far = map.navigable.compute_centroids()[:, 1] > np.median(map.navigable.compute_centroids()[map.navigable_room == 0, 1])
     half = replace(map, navigable_room=np.where((map.navigable_room == 0) & far, -1, map.navigable_room))
-    one, other = (crops(sheet_arrays(m), DOOR_PART)[0, 0, ..., PLANE["wall"]] for m in (map, half))
+    one, other = (cut_crops(build_sheet_arrays(m), DOOR_PART)[0, 0, ..., PLANE["wall"]] for m in (map, half))
     assert np.array_equal(one, other) and one.any()

@@ -10,9 +10,9 @@ import pytest
 
 from tests.package_copy import copied, edit
 from tests.scenes_map import building
-from topomerge.code_digest import code_digest
-from topomerge.evaluation import describe
-from topomerge.evaluation.describe import Shelf
+from topomerge.code_digest import compute_code_digest
+from topomerge.evaluation import predict
+from topomerge.evaluation.predict import DescriptorCache
 
 
 def other_scale(package: Path) -> None:
@@ -21,7 +21,7 @@ def other_scale(package: Path) -> None:
 
 
 def other_kernel(package: Path) -> None:
-    edit(package / "kernels" / "lookup.py", "from __future__", "ANOTHER = 1\nfrom __future__")
+    edit(package / "kernels" / "voxels.py", "from __future__", "ANOTHER = 1\nfrom __future__")
 
 
 def other_network(package: Path) -> None:
@@ -36,8 +36,8 @@ def test_descriptors_of_other_code_are_refused(
     change(package)
     source = tmp_path / "a.tmap"
     source.write_bytes(b"the map")
-    shelf = Shelf(tmp_path / "shelf", source)
-    first, _ = shelf.rows(building(), {"name": "engineered"}, 0)
-    monkeypatch.setattr(describe, "code_digest", partial(code_digest, package=package))
-    again, _ = shelf.rows(building(), {"name": "engineered"}, 0)
+    shelf = DescriptorCache(tmp_path / "shelf", source)
+    first, _ = shelf.get_rows(building(), {"name": "engineered"}, 0)
+    monkeypatch.setattr(predict, "compute_code_digest", partial(compute_code_digest, package=package))
+    again, _ = shelf.get_rows(building(), {"name": "engineered"}, 0)
     assert len(list(shelf.folder.iterdir())) == files and (first == again).all()

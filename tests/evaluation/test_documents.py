@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from topomerge.code_digest import code_digest
+from topomerge.code_digest import compute_code_digest
 from topomerge.errors import InputError
 from topomerge.evaluation import documents, headline, results_check, tasks
 
@@ -40,9 +40,9 @@ def test_a_block_says_what_made_it_and_is_fresh(page: Path) -> None:
     ("stamp", "said"),
     [
         (documents.Stamp(COMMAND, MODULES, "0123456789abcdef", "x"), "the code has changed and the data has changed since"),
-        (documents.Stamp(COMMAND, MODULES, code_digest(*MODULES), "x"), "the data has changed since"),
+        (documents.Stamp(COMMAND, MODULES, compute_code_digest(*MODULES), "x"), "the data has changed since"),
         (documents.Stamp(COMMAND, ("topomerge.gone",), "0123456789abcdef", "x"), "the code has changed and the data"),
-        (documents.Stamp("python -m benchmarks.speed", MODULES, code_digest(*MODULES), "none"), ""),
+        (documents.Stamp("python -m benchmarks.speed", MODULES, compute_code_digest(*MODULES), "none"), ""),
     ],
 )
 def test_what_has_changed_is_named(page: Path, stamp: documents.Stamp, said: str) -> None:

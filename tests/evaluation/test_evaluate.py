@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from topomerge.datasets.pairs.degrade import degraded
 from topomerge.datasets.pairs.evaluation_pair import load_evaluation_pair
+from topomerge.datasets.pairs.items import check as check_recipe
+from topomerge.datasets.pairs.items import corrupt_pair
 from topomerge.datasets.pairs.pairs import Pair
-from topomerge.datasets.pairs.recipe import check as check_recipe
 
 from tests.recipes import SMALL_HOUSES
 from topomerge.config import compose
@@ -24,11 +24,11 @@ from topomerge.evaluation.settings import (
     Evaluation,
     Pairs,
     check,
-    difference,
-    folder_of,
-    prediction_settings,
-    run_title,
-    variants,
+    collect_prediction_settings,
+    find_difference,
+    format_run_title,
+    get_folder,
+    iter_variants,
 )
 from topomerge.evaluation.tables import Table, write_section
 from topomerge.types import PointCloud, Sim3
@@ -45,7 +45,7 @@ def test_every_set_composes(data: str) -> None:
     if not settings.data.real:
         check_recipe(settings.data)
         assert settings.data.maps and settings.data.split == "test"
-    assert len(list(variants(settings))) == 4 * 5
+    assert len(list(iter_variants(settings))) == 4 * 5
 
 
 def test_a_wrong_key_is_named() -> None:
@@ -66,22 +66,22 @@ def test_a_wrong_key_is_named() -> None:
 
 def test_a_folder_of_other_settings_is_refused(tmp_path: Path) -> None:
     settings = Evaluation(SMALL, folder=str(tmp_path), descriptors={"engineered": {"name": "engineered"}}, only=["engineered"])
-    folder = folder_of(settings)
+    folder = get_folder(settings)
     assert folder == tmp_path / "two"
-    claim(folder, prediction_settings(settings))
-    claim(folder, prediction_settings(settings))  # the same again
+    claim(folder, collect_prediction_settings(settings))
+    claim(folder, collect_prediction_settings(settings))  # the same again
     with pytest.raises(InputError, match=r"k: \[0\] there, \[0, 1\] now.*another folder"):
-        claim(folder, prediction_settings(replace(settings, k=[0, 1])))
+        claim(folder, collect_prediction_settings(replace(settings, k=[0, 1])))
     with pytest.raises(InputError, match=r"data\.seed: 4 there, 5 now"):
-        claim(folder, prediction_settings(replace(settings, data=replace(SMALL, seed=5))))
-    claim(folder, prediction_settings(replace(settings, rounds=10, write="x.md")))  # how it is told changes no prediction
+        claim(folder, collect_prediction_settings(replace(settings, data=replace(SMALL, seed=5))))
+    claim(folder, collect_prediction_settings(replace(settings, rounds=10, write="x.md")))  # how it is told changes no prediction
     (folder / "evaluation.json").write_text("{")
     with pytest.raises(InputError, match="damaged"):
-        claim(folder, prediction_settings(settings))
+        claim(folder, collect_prediction_settings(settings))
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "photo.png").touch()
     with pytest.raises(InputError, match="something else"):
-        claim(tmp_path / "other", prediction_settings(settings))
+        claim(tmp_path / "other", collect_prediction_settings(settings))
 
 
 def test_a_run_is_told_by_its_weights(tmp_path: Path) -> None:
@@ -90,12 +90,12 @@ def test_a_run_is_told_by_its_weights(tmp_path: Path) -> None:
         (tmp_path / name / "best" / "embedder.onnx").write_bytes(weights)
     runs = [str(tmp_path / name) for name in "ab"]
     settings = Evaluation(SMALL, run=runs, methods=["assignment", "mutual"], folder=str(tmp_path))
-    assert [v.name for v in variants(settings)] == ["a", "b"] and folder_of(settings).name == "two-a-b"
-    assert next(variants(settings)).methods == ("assignment", "mutual")
-    before = prediction_settings(settings)
+    assert [v.name for v in iter_variants(settings)] == ["a", "b"] and get_folder(settings).name == "two-a-b"
+    assert next(iter_variants(settings)).methods == ("assignment", "mutual")
+    before = collect_prediction_settings(settings)
     assert before["run"]["a"] != before["run"]["b"]
     (tmp_path / "b" / "best" / "embedder.onnx").write_bytes(b"three")
-    assert difference(before, prediction_settings(settings)).startswith("run.b")
+    assert find_difference(before, collect_prediction_settings(settings)).startswith("run.b")
 
 
 def test_runs_are_called_by_what_they_are_made_of() -> None:
@@ -103,17 +103,17 @@ def test_runs_are_called_by_what_they_are_made_of() -> None:
         "pretrained",
         "scalars + surroundings + wide_surroundings + door_surroundings, gat around ways, infonce",
     )
-    assert run_title(run) == title
+    assert format_run_title(run) == title
     settings = Evaluation(SMALL, run=[run], titles=True, mergers=[])
-    assert [v.name for v in variants(settings)] == [title] == list(prediction_settings(settings)["run"])
+    assert [v.name for v in iter_variants(settings)] == [title] == list(collect_prediction_settings(settings)["run"])
     with pytest.raises(InputError, match=re.escape(f"two are called '{title}'")):
         check(replace(settings, run=[run, "topomerge/networks"]))
 
 
 def test_the_first_difference_is_told() -> None:
-    assert difference({"a": {"b": 1}}, {"a": {"b": 1}}) == ""
-    assert difference({"a": {"b": 1}}, {"a": {"b": 2}}) == "a.b: 1 there, 2 now"
-    assert difference({}, {"c": None, "d": 1}) == "d: null there, 1 now"
+    assert find_difference({"a": {"b": 1}}, {"a": {"b": 1}}) == ""
+    assert find_difference({"a": {"b": 1}}, {"a": {"b": 2}}) == "a.b: 1 there, 2 now"
+    assert find_difference({}, {"c": None, "d": 1}) == "d: null there, 1 now"
 
 
 def test_marks_are_replaced(tmp_path: Path) -> None:
@@ -137,16 +137,16 @@ def cloud(n: int = 4000) -> PointCloud:
 
 def test_clouds_are_degraded_as_asked() -> None:
     pair = Pair("p", cloud(), cloud(), Sim3(0.5, (1.0, 0.0, 0.0)), (), 0.5, ("tls", "tls"), "x", "y")
-    thin = degraded(pair, ("density", 0.25), 1)
+    thin = corrupt_pair(pair, ("density", 0.25), 1)
     assert abs(len(thin.a) / 4000 - 0.25) < 0.03 and thin.a.labels is not None and len(thin.a.labels) == len(thin.a)
-    noisy = degraded(pair, ("noise", 0.1), 1)
+    noisy = corrupt_pair(pair, ("noise", 0.1), 1)
     assert np.std(noisy.b.points - pair.b.points) == pytest.approx(0.1, rel=0.05)
-    holed = degraded(pair, ("missing", 0.3), 1)
+    holed = corrupt_pair(pair, ("missing", 0.3), 1)
     assert 0.6 < len(holed.a) / 4000 <= 0.7
-    scaled = degraded(pair, ("scale", 2.0), 1)
+    scaled = corrupt_pair(pair, ("scale", 2.0), 1)
     assert scaled.truth is not None and pair.truth is not None
     assert scaled.truth.apply(scaled.b.points) == pytest.approx(pair.truth.apply(pair.b.points), abs=1e-4)
-    assert degraded(pair, ("", 0.0), 1) is pair
+    assert corrupt_pair(pair, ("", 0.0), 1) is pair
     with pytest.raises(InputError, match="vary: unknown 'rain'"):
         check_recipe(replace(SMALL, vary={"rain": [1.0]}))
     with pytest.raises(InputError, match=r"vary\.density must be"):
@@ -172,14 +172,14 @@ def test_two_simulated_pairs_from_beginning_to_end(tmp_path: Path, monkeypatch: 
     row = first.ranks[0]
     pair = load_evaluation_pair(tmp_path / "cache" / "pairs" / f"{row['pair']}.npz")
     assert row["queries"] == sum(len(np.unique(pair.matches[:, s])) for s in (0, 1))
-    assert len(pair.maps()[0].rooms) == len(pair.true[0]) == len(pair.twin[0])
+    assert len(pair.load_maps()[0].rooms) == len(pair.true[0]) == len(pair.twin[0])
     table = list(csv.DictReader((first.folder / "scores.csv").open()))
     assert {"variant", "method", "by", "group", "metric", "value", "low", "high"} <= set(table[0])
 
     def never(*_: object) -> None:
         raise AssertionError("predictions that are there are not made again")
 
-    monkeypatch.setattr(predicting, "described", never)
+    monkeypatch.setattr(predicting, "describe_maps", never)
     again = evaluate(replace(settings, write=str(tmp_path / "results.md")))
     assert json.dumps(again.ranks) == json.dumps(first.ranks)
     assert "<!-- evaluation:begin -->" in (tmp_path / "results.md").read_text()

@@ -19,7 +19,7 @@ def reliable():
 
 def row(kind: str = "strangers", believed: bool = False, building: str = "office-900001-1", **more: object) -> dict:
     """A row of results; `physical` and the like are as `places_of` tells them."""
-    places = importlib.import_module("topomerge.evaluation.grid_pairs").places_of
+    places = importlib.import_module("topomerge.evaluation.tasks").describe_places
     names = (building, str(more.pop("other", "lab-900009-1" if kind == "strangers" else building)))
     about = {"name": "x", "kind": kind, "sensors": ["tls", "depth"], "probability": 0.9 if believed else 0.01}
     return {**about, **places(names), "believed": believed, **more}
@@ -43,7 +43,7 @@ def row(kind: str = "strangers", believed: bool = False, building: str = "office
     ],
 )
 def test_kinds_of_pairs_that_must_not_merge(counts, kind, pair) -> None:
-    assert counts.negative_kind(pair) == kind and (not kind or kind in counts.PRIOR)
+    assert counts.classify_negative(pair) == kind and (not kind or kind in counts.PRIOR)
 
 
 def test_the_prior_is_one() -> None:
@@ -52,52 +52,57 @@ def test_the_prior_is_one() -> None:
 
 def test_a_building_counts_once_and_every_pair_is_in(counts) -> None:
     names = ("school/Sabadell1", "school/Sabadell2", "school/Sabadell3", "school/Sabadell1 + school/Sabadell2")
-    rows = counts.negatives([row(building=n, other="lab-900009-1", believed=True) for n in names])
-    rows += counts.negatives([row(building=f"office-{900000 + k}-1") for k in range(9)])
-    name, pairs, believed, buildings, interval, *_ = counts.tally("stranger", rows)
+    rows = counts.select_negatives([row(building=n, other="lab-900009-1", believed=True) for n in names])
+    rows += counts.select_negatives([row(building=f"office-{900000 + k}-1") for k in range(9)])
+    name, pairs, believed, buildings, interval, *_ = counts.format_tally("stranger", rows)
     assert (name, pairs, believed, buildings) == ("stranger", 13, 4, 10)
     assert interval == "1: 0.3 to 44.5 %"  # Clopper and Pearson, 1 of 10
 
 
 def test_what_nobody_can_tell_is_in_and_told(counts) -> None:
     alike = [row("twin-wing", believed=True, differs=0.1), row("lookalike", lookalike="mirror", tellable=False)]
-    rows = counts.negatives([*alike, row("twin-wing", differs=2.0), row("lookalike", lookalike="mirror", tellable=True)])
-    assert [counts.tellable(r) for r in rows] == [False, False, True, True]
-    assert counts.tally("all", rows)[1:3] == [4, 1] and counts.tally("all", rows)[5:7] == [2, 1]
-    lines = counts.false_merges(rows).splitlines()
+    rows = counts.select_negatives([*alike, row("twin-wing", differs=2.0), row("lookalike", lookalike="mirror", tellable=True)])
+    assert [counts.is_tellable(r) for r in rows] == [False, False, True, True]
+    assert counts.format_tally("all", rows)[1:3] == [4, 1] and counts.format_tally("all", rows)[5:7] == [2, 1]
+    lines = counts.tabulate_false_merges(rows).splitlines()
     assert lines[-1].startswith("| **indistinguishable**") and "| 2 | 1 |" in lines[-1]
-    assert counts.rate_at(rows)[0] > 0
+    assert counts.compute_rate(rows)[0] > 0
 
 
 def test_a_right_pose_of_parts_of_a_row_is_no_false_merge(counts) -> None:
     right, wrong = ([0.1, 0.0, 0.2], [4.2, 0.0, 0.1])
     rows = [row("overlap", believed=True, common=50.0, lookalike="modules", tellable=True, err=e) for e in (right, wrong)]
-    assert [counts.false_merge(r) for r in rows] == [False, True]
+    assert [counts.is_false_merge(r) for r in rows] == [False, True]
 
 
 def test_a_truth_that_is_wrong_is_left_out(counts) -> None:
-    assert counts.negatives([row("overlap", believed=True, common=0.0, sensors=["tls", "drawing"])]) == []
+    assert counts.select_negatives([row("overlap", believed=True, common=0.0, sensors=["tls", "drawing"])]) == []
 
 
 def test_the_rate_at_a_prior_by_hand(counts) -> None:
     strangers = [row(believed=True), row(), row(building="office-900002-1"), row(building="office-900002-1")]
-    rows = counts.negatives([*strangers, row("other-storey", believed=True)])
-    rate, low, high = counts.rate_at(rows, {"stranger": 0.4, "other storey": 0.2, "twin wing": 0.4})
+    rows = counts.select_negatives([*strangers, row("other-storey", believed=True)])
+    rate, low, high = counts.compute_rate(rows, {"stranger": 0.4, "other storey": 0.2, "twin wing": 0.4})
     assert rate == pytest.approx((0.4 * 0.25 + 0.2 * 1.0) / 0.6)  # twin wings were not measured
     assert 0 < low < rate < high < 1
-    many = counts.negatives([row(building=f"office-{900000 + k}-1") for k in range(200)])
-    assert counts.rate_at(many)[0] == 0 and counts.rate_at(many)[2] < 0.02
-    assert "Not measured" in counts.headline(rows) and "twin wing" in counts.headline(rows).split("Not measured")[1]
-    assert counts.rate_at([])[0] != counts.rate_at([])[0]
+    many = counts.select_negatives([row(building=f"office-{900000 + k}-1") for k in range(200)])
+    assert counts.compute_rate(many)[0] == 0 and counts.compute_rate(many)[2] < 0.02
+    assert "Not measured" in counts.format_headline(rows) and "twin wing" in counts.format_headline(rows).split("Not measured")[1]
+    assert counts.compute_rate([])[0] != counts.compute_rate([])[0]
 
 
 def test_origins(reliable) -> None:
     procedural, plans, real, made_alike = reliable.ORIGINS
-    assert reliable.origin(row()) == reliable.origin({"source": "procedural"}) == reliable.origin({}) == procedural
-    assert reliable.origin(row(building="school/Franch1")) == reliable.origin({"source": "ifc"}) == plans
-    assert reliable.origin(row(other="school/Franch1")) == plans
-    assert reliable.origin({"source": "carmen", "other_source": "utexas"}) == real
-    assert reliable.origin({"lookalike": "modules", "source": "procedural"}) == made_alike
+    assert (
+        reliable.classify_origin(row())
+        == reliable.classify_origin({"source": "procedural"})
+        == reliable.classify_origin({})
+        == procedural
+    )
+    assert reliable.classify_origin(row(building="school/Franch1")) == reliable.classify_origin({"source": "ifc"}) == plans
+    assert reliable.classify_origin(row(other="school/Franch1")) == plans
+    assert reliable.classify_origin({"source": "carmen", "other_source": "utexas"}) == real
+    assert reliable.classify_origin({"lookalike": "modules", "source": "procedural"}) == made_alike
 
 
 def test_probabilities_below_the_truth_show_above_a_tenth_only(reliable) -> None:
@@ -113,6 +118,6 @@ def test_probabilities_below_the_truth_show_above_a_tenth_only(reliable) -> None
 def test_shares_of_few_buildings_show_their_range() -> None:
     tables = importlib.import_module("topomerge.evaluation.merge_report")
     rows = [row("overlap", method="ours", answered=True, common=90.0, err=[e, 0.0, 0.0], seconds=1.0) for e in (0.05, 0.3, 3.0)]
-    assert tables.share(rows, tables.good) == "67 (1 building)"
+    assert tables.format_share(rows, tables.is_good) == "67 (1 building)"
     text = tables.tabulate_groups(rows, lambda r: "all", ["all"], "pairs")
     assert text.splitlines()[-1] == "| all | 3 | 2 | 67 (1 building) | 33 (1 building) | 0 (1 building) | 0 | 1.0 |"

@@ -5,16 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from topomerge.datasets.simulation.floor_truth import NOT_JUDGED, OUTSIDE_ROOMS, Truth
-from topomerge.datasets.simulation.joined_truth import joined_truth
+from topomerge.datasets.simulation.floor_truth import NOT_JUDGED, OUTSIDE_ROOMS, FloorTruth, join_truths
 
 from topomerge.evaluation.joined import Settings, tabulate
 from topomerge.types import Sim3
 
 
-def truth(raster: list[list[int]], anchors: np.ndarray, drift: np.ndarray, visited: list[bool]) -> Truth:
+def truth(raster: list[list[int]], anchors: np.ndarray, drift: np.ndarray, visited: list[bool]) -> FloorTruth:
     none = np.zeros((0, 5))
-    return Truth(
+    return FloorTruth(
         np.array([raster]), np.zeros(2), np.array(visited), np.zeros(1), np.full(1, 2.5), none, np.zeros((0, 2), int), np.eye(4),
         anchors, drift, np.array(True),
     )  # fmt: skip
@@ -24,13 +23,13 @@ def test_places_of_a_joined_map_go_back_by_the_drift_that_merging_left():
     pose = Sim3(0.5, (3.0, 1.0, 0.0))
     a = truth([[0, NOT_JUDGED]], np.array([[0.0, 0, 1]]), np.array([[0.1, 0, 0]]), [True, False])
     b = truth([[NOT_JUDGED, 1]], np.array([[5.0, 0, 1]]), np.array([[0, 0.2, 0]]), [False, True])
-    joined = joined_truth(a, b, pose, (lambda p: p, lambda p: pose.apply(p) + (0.05, 0, 0)))
+    joined = join_truths(a, b, pose, (lambda p: p, lambda p: pose.apply(p) + (0.05, 0, 0)))
     assert joined.raster.tolist() == [[[0, 1]]] and joined.visited.tolist() == [True, True]
-    assert np.allclose(joined.place(np.array([[0.3, 0.1, 1.0]])), [[0.4, 0.1, 1.0]])
+    assert np.allclose(joined.transform_to_building(np.array([[0.3, 0.1, 1.0]])), [[0.4, 0.1, 1.0]])
     there = pose.apply(np.array([[5.0, 0, 1]])) + (0.05, 0, 0)
-    assert np.allclose(joined.place(there), pose.apply(np.array([[5.0, 0.2, 1]])))
+    assert np.allclose(joined.transform_to_building(there), pose.apply(np.array([[5.0, 0.2, 1]])))
     first = replace(a, raster=np.array([[[OUTSIDE_ROOMS, NOT_JUDGED]]]))
-    assert joined_truth(first, b, pose, (lambda p: p, pose.apply)).raster.tolist() == [[[OUTSIDE_ROOMS, 1]]]
+    assert join_truths(first, b, pose, (lambda p: p, pose.apply)).raster.tolist() == [[[OUTSIDE_ROOMS, 1]]]
 
 
 def row(name: str, iou: float, doubled: float) -> dict[str, object]:

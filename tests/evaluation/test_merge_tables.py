@@ -6,7 +6,14 @@ from typing import Any
 
 import pytest
 
-from topomerge.evaluation.merge_tables import chosen, decides, independence, merging, reliability, sites
+from topomerge.evaluation.merge_tables import (
+    select_last_variant,
+    tabulate_descriptor_effect,
+    tabulate_independence,
+    tabulate_merging,
+    tabulate_reliability,
+    tabulate_sites,
+)
 from topomerge.evaluation.settings import Evaluation
 
 SETTINGS = Evaluation(rounds=50)
@@ -35,7 +42,7 @@ ROWS = [
 
 
 def test_sites_in_numbers_of_pairs() -> None:
-    table = sites(ROWS)
+    table = tabulate_sites(ROWS)
     assert table.head[:4] == ["site", "the two maps are", "captures", "pairs"]
     assert [list(row) for row in table.rows] == [
         ["flat", "two captures", "3", "2", "2", "1", "1", "2", "0", "0"],
@@ -45,7 +52,7 @@ def test_sites_in_numbers_of_pairs() -> None:
 
 
 def test_independence_over_sites() -> None:
-    table = independence(ROWS, SETTINGS)
+    table = tabulate_independence(ROWS, SETTINGS)
     cells = {row[0]: dict(zip(table.head, row, strict=True)) for row in table.rows}
     independent = cells["two captures"]
     assert (independent["pairs"], independent["sites"]) == ("3", "2")
@@ -64,28 +71,28 @@ def test_what_decides() -> None:
     learned[1]["place"] = [1.0, 3.0, 0.0, 179.9]
     learned[2] |= {"believed": 1, "merged": 1, "refused": 0, "probability": 0.85}
     again = [{**r, "variant": "again"} for r in learned]
-    table = decides([*ROWS, *learned, *again])
+    table = tabulate_descriptor_effect([*ROWS, *learned, *again])
     assert [list(row) for row in table.rows] == [
         ["walls alone", "learned", "4", "3", "3", "1.000", "0.450"],
         ["walls alone", "again", "4", "3", "3", "1.000", "0.450"],
         ["learned", "again", "4", "4", "4", "0.000", "0.000"],
     ]
-    without = decides([*ROWS, *({**r, "variant": "none", "place": []} for r in ROWS)])
+    without = tabulate_descriptor_effect([*ROWS, *({**r, "variant": "none", "place": []} for r in ROWS)])
     assert without.rows[0][4:6] == ["0", "inf"]
-    assert {r["variant"] for r in chosen([*ROWS, *learned])} == {"learned"} and chosen([]) == []
+    assert {r["variant"] for r in select_last_variant([*ROWS, *learned])} == {"learned"} and select_last_variant([]) == []
 
 
 def test_ways_that_merge_alike_share_their_rows() -> None:
     alike = [{**r, "variant": "learned", "seconds": 3.0} for r in ROWS]
     other = [{**r, "variant": "shape", **REFUSED} for r in ROWS]
-    table = merging([*ROWS, *alike, *other], "", SETTINGS)
+    table = tabulate_merging([*ROWS, *alike, *other], "", SETTINGS)
     assert [row[0] for row in table.rows] == ["walls alone = learned", "shape"]
     assert table.rows[0][-1] == "3.0"
 
 
 def test_calibration_by_origin() -> None:
     plans = [{**r, "origin": "procedural", "probability": p} for r in ROWS for p in (0.0, 0.75)]
-    table = reliability([], [*ROWS, *plans])
+    table = tabulate_reliability([], [*ROWS, *plans])
     rows = {row[1]: row[2:] for row in table.rows}
     assert list(rows) == ["procedural", "real maps"]
     assert rows["real maps"][:4] == ["4", "0.78", "0.75", "0.325"]  # .9 against 2 of 3, .4 against 1 of 1
@@ -93,6 +100,9 @@ def test_calibration_by_origin() -> None:
     assert rows["procedural"][5:9] == ["4", "0.75", "0.75", "0.000"]
 
 
-@pytest.mark.parametrize("table", [sites([]), decides([]), reliability([], []), merging([], "", SETTINGS)])
+@pytest.mark.parametrize(
+    "table",
+    [tabulate_sites([]), tabulate_descriptor_effect([]), tabulate_reliability([], []), tabulate_merging([], "", SETTINGS)],
+)
 def test_no_merge_at_all(table: Any) -> None:
     assert table.rows == []

@@ -24,7 +24,7 @@ def test_kinds_and_bins_do_not_depend_on_the_order(module) -> None:
     assert modality({"sensors": ("laser2d", "lidar")}) == modality({"sensors": ("lidar", "laser2d")}) == "with a slice"
     assert modality({"sensors": ("drawing", "laser2d")}) == "with a floor plan"
     assert modality({"sensors": ("tls", "depth")}) == "3D–3D"
-    assert [pairs.bin_of(m2) for m2 in (1.0, 39.9, 40.0, 80.0)] == ["<40 m²", "<40 m²", "40–80 m²", "≥80 m²"]
+    assert [pairs.find_bin(m2) for m2 in (1.0, 39.9, 40.0, 80.0)] == ["<40 m²", "<40 m²", "40–80 m²", "≥80 m²"]
 
 
 @pytest.mark.longer
@@ -32,21 +32,23 @@ def test_plans_that_differ_only_where_nobody_looked_are_the_same() -> None:
     drawings = importlib.import_module("topomerge.datasets.pairs.grid_drawings")
     building = make_building("office", 5, 2)
     lower = np.array([i for i, r in enumerate(building.rooms) if r.storey == 0])
-    here = drawings.Place("x", "a", building, Sim3(), 0, lower)
-    assert drawings.differing(here, here, 0)["walls_differ"] == 0
-    everywhere, two = (drawings.differing(drawings.replace(here, visited=v), here, 1)["walls_differ"] for v in (lower, lower[:2]))
+    here = drawings.MapOrigin("x", "a", building, Sim3(), 0, lower)
+    assert drawings.measure_differences(here, here, 0)["walls_differ"] == 0
+    everywhere, two = (
+        drawings.measure_differences(drawings.replace(here, visited=v), here, 1)["walls_differ"] for v in (lower, lower[:2])
+    )
     assert 0 <= two <= everywhere
 
 
 def test_a_slice_or_a_drawing_says_nothing_of_its_height() -> None:
-    right = importlib.import_module("topomerge.training.belief_hypotheses").right
+    right = importlib.import_module("topomerge.training.belief_hypotheses").is_hypothesis_right
     off = [0.1, 1.0, 1.0]
     assert right(off, ("tls", "laser2d")) and right(off, ("drawing", "tls")) and not right(off, ("tls", "depth"))
     assert not right(None, ("tls", "laser2d"))
 
 
 def test_a_slice_or_a_drawing_on_the_wrong_storey_is_wrong() -> None:
-    right = importlib.import_module("topomerge.training.belief_hypotheses").right
+    right = importlib.import_module("topomerge.training.belief_hypotheses").is_hypothesis_right
     for sensors in (("tls", "laser2d"), ("drawing", "tls"), ("laser2d", "laser2d")):
         assert not right([0.05, 2.9, 0.1], sensors) and not right([0.05, -2.9, 0.1], sensors)
         assert right([0.05, 0.45, 0.1], sensors) and right([0.05, -0.45, 0.1], sensors)
@@ -59,7 +61,7 @@ def cached(**about: object) -> SimpleNamespace:
 
 def test_where_both_maps_are_from(module, monkeypatch) -> None:
     pairs = module("grid_pairs")
-    monkeypatch.setattr(pairs, "other_buildings", lambda split: {(0, 7): "school/Sabadell3"})
+    monkeypatch.setattr(pairs, "map_other_buildings", lambda split: {(0, 7): "school/Sabadell3"})
     one = cached(building="office-900001-2", kind="overlap", sensors=["tls", "depth"], set=0, item=3)
     assert pairs.buildings_of(one, "test") == ("office-900001-2", "office-900001-2")
     two = cached(building="school/Sabadell1", kind="other-building", sensors=["tls", "depth"], set=0, item=7)
@@ -87,7 +89,7 @@ def test_pairs_of_the_tables_are_not_made_without_the_real_plans(monkeypatch, tm
 
 
 def test_what_makes_a_pair_hard(module) -> None:
-    hard = module("grid_pairs").hard_of
+    hard = module("grid_pairs").list_difficulties
     assert hard(cached(difficulty={"moved": 0.6, "gone": 0.25, "glass": 0.1})) == ["much moved furniture"]
     assert hard(cached(difficulty={"moved": 0.3, "glass": 0.5})) == ["glass walls"] and hard(cached()) == []
 

@@ -38,7 +38,7 @@ def test_a_set_or_a_preset_that_is_not_there_is_named(tmp_path) -> None:
 
 def test_sets_keep_to_their_buildings(benchmark) -> None:
     """Development sees training buildings only, everything else test buildings; no two maps share a name."""
-    from topomerge.datasets.plans.splits import split_of
+    from topomerge.datasets.plans.splits import find_split
 
     cases = importlib.import_module("topomerge.evaluation.cases")
     for name, group in cases.GROUPS.items():
@@ -46,7 +46,7 @@ def test_sets_keep_to_their_buildings(benchmark) -> None:
         assert len({c.name for c in found}) == len(found)
         for case in found:
             if case.source in ("procedural", "r2v", "campus"):
-                of = split_of(case.source, str(case.seed) if case.source == "procedural" else case.building)
+                of = find_split(case.source, str(case.seed) if case.source == "procedural" else case.building)
                 assert of == ("train" if name == "dev" else "test"), case.name
     assert len(cases.select_cases(["all"], 1)) == len({c.set for c in cases.select_cases(["all"])})
 
@@ -55,12 +55,12 @@ def test_sets_keep_to_their_buildings(benchmark) -> None:
 @pytest.mark.data
 def test_rooms_of_a_robot_grid_are_those_of_its_segmentation(benchmark, data_dir, tmp_path) -> None:
     """IPA's own lab: at most one of the ten rooms that a person drew is missing, whatever corners are rooms beside them."""
-    from topomerge.datasets.simulation.floor_truth import judge
+    from topomerge.datasets.simulation.floor_truth import evaluate_map
 
     from topomerge.extraction.extract import extract
 
     scans = importlib.import_module("topomerge.evaluation.scans")
     case = scans.Case("grids", "ipa", "lab_ipa", "")
     scan = scans.load_scan(case, tmp_path, data_dir)
-    rooms = judge(extract(scan.cloud, voxel_size=benchmark.VOXEL), scan.truth).rooms
+    rooms = evaluate_map(extract(scan.cloud, voxel_size=benchmark.VOXEL), scan.truth).rooms
     assert len(rooms.each) == 10 and rooms.recall >= 0.9 and rooms.iou >= 0.8 and rooms.precision >= 0.75

@@ -7,23 +7,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, twins
+from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, find_twins
 
 from topomerge.errors import InputError
-from topomerge.evaluation.groups import draws, gain, hit_buildings, value
-from topomerge.evaluation.predict import mutual
+from topomerge.evaluation.groups import compute_gain, compute_value, count_hit_buildings, draw_buildings
+from topomerge.evaluation.predict import match_mutually
 from topomerge.evaluation.score import (
-    after_counts,
-    match_counts,
-    merge_counts,
-    modality,
-    overlap_bin,
-    pose_error,
-    rank_counts,
-    ranks_of,
-    within,
+    classify_modality,
+    classify_overlap,
+    count_matches,
+    count_merges,
+    count_ranks,
+    count_ranks_after,
+    is_within,
+    measure_pose_error,
+    rank_partners,
 )
-from topomerge.evaluation.tables import cell
+from topomerge.evaluation.tables import format_value
 from topomerge.types import Sim3, TrueRoom
 
 
@@ -46,7 +46,7 @@ def hand_made_pair(**changes: Any) -> EvaluationPair:
 
 def test_matches_are_counted_by_hand() -> None:
     rooms = np.array([(0, 1), (1, 0), (2, 0), (3, 3), (4, 2)])  # right, right, right piece of the same room, wrong, wrong
-    counts = match_counts(hand_made_pair(), rooms)
+    counts = count_matches(hand_made_pair(), rooms)
     assert (counts["predicted"], counts["right"], counts["units"], counts["found"]) == (5, 3, 3, 2)
     assert (counts["predicted_twin"], counts["right_twin"], counts["units_twin"], counts["found_twin"]) == (1, 0, 1, 0)
     assert (counts["predicted_single"], counts["right_single"], counts["units_single"], counts["found_single"]) == (4, 3, 2, 2)
@@ -54,26 +54,26 @@ def test_matches_are_counted_by_hand() -> None:
 
 
 def test_no_match_at_all() -> None:
-    counts = match_counts(hand_made_pair(), np.zeros((0, 2), int))
+    counts = count_matches(hand_made_pair(), np.zeros((0, 2), int))
     assert (counts["predicted"], counts["right"], counts["units"], counts["found"]) == (0, 0, 3, 0)
     unmatched_pair = hand_made_pair(matches=np.zeros((0, 2), int))
-    counts = match_counts(unmatched_pair, np.array([(0, 0)]))
+    counts = count_matches(unmatched_pair, np.array([(0, 0)]))
     assert (counts["predicted"], counts["right"], counts["units"], counts["found"], counts["pairs"]) == (1, 0, 0, 0, 1)
 
 
 def test_ranks_by_hand() -> None:
     cost = np.array([[0.5, 0.1, 0.3], [0.2, 0.2, 0.9]])
-    rooms, rank = ranks_of(cost, np.array([(0, 2), (1, 0)]))
+    rooms, rank = rank_partners(cost, np.array([(0, 2), (1, 0)]))
     assert rooms.tolist() == [0, 1]
     assert rank.tolist() == [2, 2]  # 0.1 is cheaper than 0.3; the other 0.2 costs as much, and counts before
-    assert ranks_of(cost, np.array([(0, 2), (0, 1)]))[1].tolist() == [1]  # the better of two partners
+    assert rank_partners(cost, np.array([(0, 2), (0, 1)]))[1].tolist() == [1]  # the better of two partners
 
 
 def test_rank_counts_of_both_directions() -> None:
     cost = np.ones((5, 4))
     cost[[0, 1, 2], [1, 0, 0]] = 0.0  # right and cheap
     cost[3, 2] = 2.0  # right but dear
-    counts = rank_counts(hand_made_pair(), cost)
+    counts = count_ranks(hand_made_pair(), cost)
     assert counts["queries"] == 4 + 3
     assert counts["chance"] == pytest.approx(4 / 4 + 4 / 5)  # four pairs of rooms, among four of b, and among five of a
     assert counts["first"] == 3 + 2  # rooms 0, 1 and 2 of a; rooms 0 and 1 of b
@@ -88,21 +88,21 @@ def test_ranks_after_consensus() -> None:
     cost = np.ones((5, 4))
     cost[0, 3] = 0.5  # the descriptor prefers the wrong room to room 0's partner
     agreed = np.array([(0, 1), (3, 3)])  # right, wrong
-    counts = after_counts(hand_made_pair(), cost, agreed)
-    assert rank_counts(hand_made_pair(), cost)["first"] == 0
+    counts = count_ranks_after(hand_made_pair(), cost, agreed)
+    assert count_ranks(hand_made_pair(), cost)["first"] == 0
     assert counts == {"first_after": 2, "first_single_after": 2, "five_after": 7}  # room 0 of a, room 1 of b, both without twin
-    assert all(np.isnan(v) for v in after_counts(hand_made_pair(), cost, None).values()) and cost.min() == 0.5
+    assert all(np.isnan(v) for v in count_ranks_after(hand_made_pair(), cost, None).values()) and cost.min() == 0.5
 
 
 def test_poses() -> None:
     truth = Sim3(0.3, (1.0, 2.0, 0.0))
     off = Sim3(0.3, (1.3, 2.4, 0.6))
-    assert pose_error(off, truth, np.array([5.0, 0.0, 0.0])) == pytest.approx((0.5, 0.6, 0.0))
-    assert pose_error(Sim3(0.3 - 2 * np.pi + 0.1), Sim3(0.3), np.zeros(3))[2] == pytest.approx(np.degrees(0.1))
-    assert within((0.3, 0.3, 4.9), False, (0.5, 5.0))
-    assert not within((0.3, 0.45, 1.0), False, (0.5, 5.0)) and within((0.3, 0.45, 1.0), True, (0.5, 5.0))
-    assert not within((0.1, 0.0, 5.1), False, (0.5, 5.0))
-    assert not within((0.1, 3.1, 1.0), True, (0.5, 5.0))
+    assert measure_pose_error(off, truth, np.array([5.0, 0.0, 0.0])) == pytest.approx((0.5, 0.6, 0.0))
+    assert measure_pose_error(Sim3(0.3 - 2 * np.pi + 0.1), Sim3(0.3), np.zeros(3))[2] == pytest.approx(np.degrees(0.1))
+    assert is_within((0.3, 0.3, 4.9), False, (0.5, 5.0))
+    assert not is_within((0.3, 0.45, 1.0), False, (0.5, 5.0)) and is_within((0.3, 0.45, 1.0), True, (0.5, 5.0))
+    assert not is_within((0.1, 0.0, 5.1), False, (0.5, 5.0))
+    assert not is_within((0.1, 3.1, 1.0), True, (0.5, 5.0))
 
 
 def verdict(pose: Sim3 | None, believed: bool) -> dict[str, Any]:
@@ -120,7 +120,7 @@ def verdict(pose: Sim3 | None, believed: bool) -> dict[str, Any]:
     ],
 )
 def test_merges(pose: Sim3 | None, believed: bool, expected: dict[str, int]) -> None:
-    counts = merge_counts(hand_made_pair(), verdict(pose, believed))
+    counts = count_merges(hand_made_pair(), verdict(pose, believed))
     assert {k: counts[k] for k in expected} == expected and counts["mergeable"] == 1
     assert counts["good"] == [True]
 
@@ -129,36 +129,36 @@ def test_a_merge_in_rooms() -> None:
     """The pose of the second row is 0.3 m off in each room; that of the first is right in the near one and not in the far one."""
     near, far = np.array([(5.0, 0.0, 0.0), (5.5, 0.5, 0.0)]), np.array([(90.0, 0.0, 0.0), (100.0, 0.0, 0.0)])
     turned = Sim3(0.3 + np.radians(0.5), (1.0, 2.0, 0.0))  # 5 cm at 5.5 m, 0.87 m at 100 m
-    counts = merge_counts(hand_made_pair(), verdict(turned, True), [near, far])
+    counts = count_merges(hand_made_pair(), verdict(turned, True), [near, far])
     assert (counts["with_rooms"], counts["every_room"], counts["rooms_shared"], counts["rooms_near"]) == (1, 0, 2, 1)
     assert counts["farthest_room"] == pytest.approx(2 * 100 * np.sin(np.radians(0.25))) and counts["fine"] == 1
-    moved = merge_counts(hand_made_pair(), verdict(Sim3(0.3, (1.3, 2.0, 0.0)), True), [near, far])
+    moved = count_merges(hand_made_pair(), verdict(Sim3(0.3, (1.3, 2.0, 0.0)), True), [near, far])
     assert (moved["every_room"], moved["rooms_near"]) == (0, 0) and moved["farthest_room"] == pytest.approx(0.3)
-    assert merge_counts(hand_made_pair(), verdict(turned, True), [near])["every_room"] == 1
+    assert count_merges(hand_made_pair(), verdict(turned, True), [near])["every_room"] == 1
     about = {**hand_made_pair().about, "sensors": ["laser2d", "tls"]}
     for storey, right in ((0.4, 1), (3.0, 0)):  # a slice tells no height within its storey
-        raised = merge_counts(hand_made_pair(about=about), verdict(Sim3(0.3, (1.0, 2.0, storey)), True), [near])
+        raised = count_merges(hand_made_pair(about=about), verdict(Sim3(0.3, (1.0, 2.0, storey)), True), [near])
         assert (raised["near"], raised["every_room"], raised["false"]) == (right, right, 1 - right)
-    none = merge_counts(hand_made_pair(), verdict(None, False), [near, far])
+    none = count_merges(hand_made_pair(), verdict(None, False), [near, far])
     assert (none["with_rooms"], none["every_room"], none["rooms_near"]) == (1, 0, 0)
-    assert merge_counts(hand_made_pair(), verdict(turned, True))["with_rooms"] == 0
+    assert count_merges(hand_made_pair(), verdict(turned, True))["with_rooms"] == 0
 
 
 def test_whatever_is_believed_of_two_places_is_false() -> None:
     hard = hand_made_pair(about={"kind": "other-storey", "common": 0.0, "sensors": ["tls", "tls"], "rooms": "labelled"})
-    counts = merge_counts(hard, verdict(Sim3(0.3, (1.0, 2.0, 0.0)), True))
+    counts = count_merges(hard, verdict(Sim3(0.3, (1.0, 2.0, 0.0)), True))
     assert (counts["mergeable"], counts["near"], counts["false"]) == (0, 0, 1)
 
 
 def test_kinds_of_maps() -> None:
-    assert modality(["tls", "depth"]) == modality(["model", "tls"]) == "3D scans"
-    assert modality(["laser2d", "tls"]) == modality(["phone", "phone"]) == "with a slice"
-    assert modality(["laser2d", "drawing"]) == modality(["phone", "drawing"]) == "with a floor plan"
+    assert classify_modality(["tls", "depth"]) == classify_modality(["model", "tls"]) == "3D scans"
+    assert classify_modality(["laser2d", "tls"]) == classify_modality(["phone", "phone"]) == "with a slice"
+    assert classify_modality(["laser2d", "drawing"]) == classify_modality(["phone", "drawing"]) == "with a floor plan"
 
 
 def test_bins() -> None:
-    assert [overlap_bin(v) for v in (0.0, 0.1, 0.3, 0.5, 1.0)] == ["0", "0.1", "0.25", "0.5", "0.75"]
-    assert overlap_bin(0.0, "twin-wing") == "twin-wing"
+    assert [classify_overlap(v) for v in (0.0, 0.1, 0.3, 0.5, 1.0)] == ["0", "0.1", "0.25", "0.5", "0.75"]
+    assert classify_overlap(0.0, "twin-wing") == "twin-wing"
 
 
 ROWS = [
@@ -169,43 +169,45 @@ ROWS = [
 
 
 def test_ratios_are_of_sums() -> None:
-    assert value(ROWS, "precision").value == 4 / 8
-    assert value(ROWS, "recall").value == 4 / 12
-    assert value(ROWS, "F1").value == pytest.approx(2 * (1 / 2) * (1 / 3) / (1 / 2 + 1 / 3))
-    assert value(ROWS, "recall@1").value == 2 / 8
-    assert (value(ROWS, "recall").pairs, value(ROWS, "recall").buildings) == (3, 2)
-    assert np.isnan(value(ROWS[2:], "precision").value) and np.isnan(value([], "F1").value)
+    assert compute_value(ROWS, "precision").value == 4 / 8
+    assert compute_value(ROWS, "recall").value == 4 / 12
+    assert compute_value(ROWS, "F1").value == pytest.approx(2 * (1 / 2) * (1 / 3) / (1 / 2 + 1 / 3))
+    assert compute_value(ROWS, "recall@1").value == 2 / 8
+    assert (compute_value(ROWS, "recall").pairs, compute_value(ROWS, "recall").buildings) == (3, 2)
+    assert np.isnan(compute_value(ROWS[2:], "precision").value) and np.isnan(compute_value([], "F1").value)
 
 
 def test_the_interval_draws_whole_buildings() -> None:
     many = [{"building": str(i), "pair": str(i), "first": i % 2, "queries": 1} for i in range(400)]
-    wide = value(many, "recall@1", 2000)
+    wide = compute_value(many, "recall@1", 2000)
     assert wide.high - wide.low == pytest.approx(2 * 1.96 * np.sqrt(0.25 / 400), rel=0.1) and not wide.ranged
-    assert draws(3, 50).sum(axis=1).tolist() == [3] * 50
-    twice = value([*many, *many], "recall@1", 2000)  # more pairs of the same buildings tell nothing more
+    assert draw_buildings(3, 50).sum(axis=1).tolist() == [3] * 50
+    twice = compute_value([*many, *many], "recall@1", 2000)  # more pairs of the same buildings tell nothing more
     assert (twice.low, twice.high, twice.pairs, twice.buildings) == (wide.low, wide.high, 400, 400)
 
 
 def test_few_buildings_have_a_range_and_no_interval() -> None:
-    recall = value(ROWS, "recall@1")
+    recall = compute_value(ROWS, "recall@1")
     assert (recall.low, recall.high, recall.ranged) == (0.0, 0.5, True)  # building b, building a
-    assert cell(recall) == "0.25, 0.00–0.50 (2 buildings)" and cell(recall, False) == "0.25"
-    one = value(ROWS[:2], "recall@1")
-    assert one.low == one.high == one.value and cell(one) == "0.50"
+    assert format_value(recall) == "0.25, 0.00–0.50 (2 buildings)" and format_value(recall, False) == "0.25"
+    one = compute_value(ROWS[:2], "recall@1")
+    assert one.low == one.high == one.value and format_value(one) == "0.50"
     empty = [{"building": str(i), "pair": f"e{i}", "first": 0, "queries": 0} for i in range(20)]
-    with_empty = value([*ROWS, *empty], "recall@1")  # buildings without a query say nothing of it
+    with_empty = compute_value([*ROWS, *empty], "recall@1")  # buildings without a query say nothing of it
     assert (with_empty.low, with_empty.high, with_empty.counted, with_empty.buildings) == (0.0, 0.5, 2, 22)
     eight = [{"building": str(i), "pair": str(i), "first": 1, "queries": 1} for i in range(8)]
-    assert cell(value(eight, "recall@1")) == "1.00 [1.00, 1.00]" and "(7 buildings)" in cell(value(eight[:7], "recall@1"))
+    assert format_value(compute_value(eight, "recall@1")) == "1.00 [1.00, 1.00]" and "(7 buildings)" in format_value(
+        compute_value(eight[:7], "recall@1")
+    )
 
 
 def test_a_gain_is_paired() -> None:
     better = [{**r, "first": r["first"] + 1} for r in ROWS]
-    recall_gain = gain(better, ROWS, "recall@1", 500)
+    recall_gain = compute_gain(better, ROWS, "recall@1", 500)
     assert recall_gain.value == 3 / 8 and (recall_gain.low, recall_gain.high) == (0.25, 0.5)  # 1 of 4 more, 2 of 4 more
-    assert gain(ROWS, ROWS, "recall@1", 500).high == 0
+    assert compute_gain(ROWS, ROWS, "recall@1", 500).high == 0
     many = [{"building": str(i), "pair": str(i), "first": i % 2, "queries": 2} for i in range(40)]
-    more = gain([{**r, "first": r["first"] + 1} for r in many], many, "recall@1", 500)
+    more = compute_gain([{**r, "first": r["first"] + 1} for r in many], many, "recall@1", 500)
     assert (more.value, more.low, more.high) == pytest.approx(
         (0.5, 0.5, 0.5)
     )  # drawn alike, so that what differs between buildings goes
@@ -213,7 +215,7 @@ def test_a_gain_is_paired() -> None:
 
 def test_wrong_merges_by_building() -> None:
     rows = [{"building": str(i // 2), "false": int(i in (0, 1))} for i in range(20)]  # two in one building
-    hit, buildings, low, high = hit_buildings(rows, "false")
+    hit, buildings, low, high = count_hit_buildings(rows, "false")
     assert (hit, buildings) == (1, 10)
     assert (low, high) == pytest.approx((0.00253, 0.44502), abs=1e-4)  # Clopper & Pearson of 1 in 10
 
@@ -223,9 +225,9 @@ def test_twins() -> None:
         return TrueRoom("", np.array([(x, 0), (x + wide, 0), (x + wide, deep), (x, deep)]), 0.0, 2.5)
 
     rooms = (room(0, 3, 4), room(5, 4, 3.02), room(10, 3, 5))  # the second is the first, turned
-    assert twins(np.array([0, 1, 2, -1]), np.array([0, 1, 2]), rooms, rooms).tolist() == [True, True, False, False]
-    assert twins(np.array([0, 2]), np.array([0, 2]), rooms, rooms).tolist() == [False, False]  # b does not hold room 1
-    assert twins(np.array([0]), np.array([0]), rooms, rooms, same=False).tolist() == [True]  # another building
+    assert find_twins(np.array([0, 1, 2, -1]), np.array([0, 1, 2]), rooms, rooms).tolist() == [True, True, False, False]
+    assert find_twins(np.array([0, 2]), np.array([0, 2]), rooms, rooms).tolist() == [False, False]  # b does not hold room 1
+    assert find_twins(np.array([0]), np.array([0]), rooms, rooms, same=False).tolist() == [True]  # another building
 
 
 def test_mutual_matches() -> None:
@@ -236,8 +238,8 @@ def test_mutual_matches() -> None:
             return rows, columns
 
     maps: Any = (None, None)
-    rooms, probability = mutual(Learned(), maps)
+    rooms, probability = match_mutually(Learned(), maps)
     assert rooms.tolist() == [[0, 0]]  # room 1 of a likes room 0 best, which likes room 0; room 2 has no partner
     assert probability == pytest.approx([np.sqrt(0.9 * 0.7)])
     with pytest.raises(InputError, match="mutual needs"):
-        mutual(object(), maps)
+        match_mutually(object(), maps)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from topomerge.datasets.pairs.flat import Flat
+from topomerge.datasets.pairs.flat_maps import FlatMap
 from topomerge.datasets.plans import sealed
 
 from tests.datasets.plans import plan_files as write
@@ -71,7 +71,7 @@ def test_a_new_version_needs_no_word(page: Path, module: ModuleType, monkeypatch
     assert module.main([]) == 0
     monkeypatch.setattr(module, "__version__", f"{module.__version__}.1")
     assert module.main([]) == 0
-    assert module.blocks(page.read_text()) == ["0.0.9", module.__version__.removesuffix(".1"), module.__version__]
+    assert module.list_blocks(page.read_text()) == ["0.0.9", module.__version__.removesuffix(".1"), module.__version__]
 
 
 def test_a_crash_leaves_the_page_whole(page: Path, module: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -96,7 +96,7 @@ def test_a_crash_leaves_the_page_whole(page: Path, module: ModuleType, monkeypat
 def test_the_first_block_makes_the_page(tmp_path: Path, module: ModuleType, page: Path) -> None:
     assert module.main(["--page", str(tmp_path / "new.md")]) == 0
     text = (tmp_path / "new.md").read_text(encoding="utf-8")
-    assert text.startswith(module.HEAD) and len(module.blocks(text)) == 1
+    assert text.startswith(module.HEAD) and len(module.list_blocks(text)) == 1
 
 
 def test_a_small_run_writes_nowhere_unless_it_is_told(page: Path, module: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
@@ -113,13 +113,13 @@ def test_a_published_set_needs_a_folder(page: Path, module: ModuleType, capsys: 
 def test_the_page_in_the_docs_is_what_the_run_goes_on_with(module: ModuleType) -> None:
     text = (Path(module.__file__).parent.parent.parent / "docs" / "results" / "sealed.md").read_text(encoding="utf-8")
     assert text.startswith(module.HEAD)
-    assert len(module.blocks(text)) == text.count("\n## ")
+    assert len(module.list_blocks(text)) == text.count("\n## ")
 
 
 def test_what_is_counted(measures: ModuleType) -> None:
     wrong = {**MERGE, "right": False, "place": "z"}
     twin = {**MERGE, "kind": "twin-wing", "right": False, "believed": False}
-    lines = list(measures.tables([MERGE, wrong, twin, {**twin, "differs": 0.1}, {**MERGE, "common": 3.0}]))
+    lines = list(measures.format_tables([MERGE, wrong, twin, {**twin, "differs": 0.1}, {**MERGE, "common": 3.0}]))
     assert any(line.startswith("| procedural: at least 40 m² in common | 2 | 2 | 1 | 0 | 1 | 1 | 1–99 % |") for line in lines)
     assert any(line.startswith("| procedural: less than 40 m² in common | 1 |") for line in lines)
     assert any(line.startswith("| procedural: twin wing | 1 | 1 | 0 | 0 | 0 | 0 | 0–98 % |") for line in lines)
@@ -128,8 +128,8 @@ def test_what_is_counted(measures: ModuleType) -> None:
 
 def test_halves_of_a_floor_share_the_middle() -> None:
     x, y = (a.ravel() for a in np.meshgrid(np.arange(0, 10, 0.1), np.arange(0, 10, 0.1)))
-    flat = Flat(np.zeros((1, 2)), np.column_stack([x, y]), 0.1)
-    a, b = importlib.import_module("topomerge.evaluation.sealed_measures").cut(flat, 3)
+    flat = FlatMap(np.zeros((1, 2)), np.column_stack([x, y]), 0.1)
+    a, b = importlib.import_module("topomerge.evaluation.sealed_measures").cut_floor(flat, 3)
     both = len({tuple(p) for p in a.free.tolist()} & {tuple(p) for p in b.free.tolist()})
     assert len(a.free) == pytest.approx(0.65 * len(flat.free), rel=0.03) == pytest.approx(len(b.free), rel=0.03)
     assert both == pytest.approx(0.3 * len(flat.free), rel=0.1)
@@ -163,23 +163,23 @@ def made_up(folder: Path) -> Path:
 
 def test_real_sites_are_measured_within_the_gate_only(tmp_path: Path, measures: ModuleType) -> None:
     data = made_up(tmp_path)
-    item = measures.SealedItem("merges", "robots' grids", measures.robot_rows, (data,))
+    item = measures.SealedItem("merges", "robots' grids", measures.measure_robot_pairs, (data,))
     shut = measures.measured(item)
     assert [row["failed"].split(": ")[:2] for row in shut] == [["home_x", "sealed"], ["home_y", "sealed"]]
-    assert measures.sealed_plans(data) == []
-    with sealed.sealed_run():
-        assert measures.sealed_plans(data) == [(data / "utexas_amrl_vectormaps", "AHG1")]
+    assert measures.list_sealed_plans(data) == []
+    with sealed.open_sealed_set():
+        assert measures.list_sealed_plans(data) == [(data / "utexas_amrl_vectormaps", "AHG1")]
         rows = measures.measured(item)
     assert [row["kind"] for row in rows] == ["overlap", "overlap", "other-building"]
     assert [row["place"] for row in rows] == ["strands/home_x", "strands/home_y", "strands/home_x + strands/home_y"]
     assert rows[0]["common"] > 20 and rows[2]["err"] is None
-    ranking = measures.SealedItem("ranking", "robots' grids", measures.robot_ranks, (data,))
+    ranking = measures.SealedItem("ranking", "robots' grids", measures.rank_robot_rooms, (data,))
     assert all("sealed" in row["failed"] for row in measures.measured(ranking))
-    with sealed.sealed_run():
+    with sealed.open_sealed_set():
         ranked = measures.measured(ranking)
     assert [row["embedder"] for row in ranked] == ["learned", "engineered"] * (len(ranked) // 2) and ranked
     assert all(0 <= row["first"] <= row["five"] <= row["queries"] and row["queries"] >= 2 for row in ranked)
-    lines = "\n".join(measures.tables([*ranked, {**ranked[0], "place": "another", "first": 0}]))
+    lines = "\n".join(measures.format_tables([*ranked, {**ranked[0], "place": "another", "first": 0}]))
     assert f"| robots' grids | learned | {len(ranked) // 2 + 1} |" in lines and "| merges |" not in lines
 
 

@@ -24,11 +24,11 @@ def test_one_small_case(tmp_path) -> None:
 
 
 def test_cases_are_of_the_validation_list() -> None:
-    from topomerge.datasets.plans.splits import split_of
+    from topomerge.datasets.plans.splits import find_split
 
     benchmark = importlib.import_module("topomerge.evaluation.walls")
-    assert {split_of("procedural", str(case.seed)) for case in benchmark.draw_cases(False)} == {"validation"}
-    assert {split_of("procedural", str(case.seed)) for case in benchmark.draw_cases(True)} == {"train"}
+    assert {find_split("procedural", str(case.seed)) for case in benchmark.draw_cases(False)} == {"validation"}
+    assert {find_split("procedural", str(case.seed)) for case in benchmark.draw_cases(True)} == {"train"}
 
 
 @pytest.mark.parametrize(("shift", "off"), [(0.05, 0.05), (0.3, 0.3), (0.5, np.inf)])

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from topomerge.extraction.partition import LeastSize, partition_rooms
 from topomerge.extraction.plans.passages import Pair, Passage
-from topomerge.extraction.plans.plan import profile_bands
+from topomerge.extraction.plans.plan import build_profile_bands
 from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES, ClassifiedStorey, StoreyPlan
-from topomerge.extraction.segment import Scorer, SegmentedStorey
+from topomerge.extraction.segment import LeastSize, Scorer, SegmentedStorey, partition_rooms
 from topomerge.types import Array
 
 ANY_WIDTH = LeastSize(0.8, 0.8, 0.0, 0.0)
@@ -21,7 +20,7 @@ def storey_of(
     shape, nothing = segment.shape, np.full(segment.shape, np.nan)
     inside, profile = segment >= 0, np.zeros(segment.shape, np.uint64)
     plan = StoreyPlan(
-        np.zeros(2), edge, ~inside, inside, profile, profile_bands(edge), np.zeros(shape), nothing, np.full(shape, 3.0)
+        np.zeros(2), edge, ~inside, inside, profile, build_profile_bands(edge), np.zeros(shape), nothing, np.full(shape, 3.0)
     )
     classes = ClassifiedStorey(np.zeros((*shape, len(COLUMN_CLASSES)), np.float32), np.zeros(2), edge, 0.0)
     return SegmentedStorey(0, plan, classes, np.ones(shape) if clearance is None else clearance, segment, passages)

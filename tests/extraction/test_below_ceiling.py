@@ -40,9 +40,9 @@ def flat(top: float) -> np.ndarray:
 def test_what_ends_below_head_height_is_furniture(top: float) -> None:
     map = tm.extract(flat(top))
     assert len(map.rooms) == 2 and len(map.storeys) == 1 and len(map.edges) == 1
-    assert np.abs(map.navigable.centroids()[:, 2] - 0.05).max() < 0.4  # nobody stands on a worktop
+    assert np.abs(map.navigable.compute_centroids()[:, 2] - 0.05).max() < 0.4  # nobody stands on a worktop
     assert (map.rooms["lo"][:, 0].min() < 0.3) and map.rooms["hi"][:, 0].max() > 11.7
-    places = map.navigable.centroids()[:, :2]
+    places = map.navigable.compute_centroids()[:, :2]
     for x0, y0, _, x1, y1, _ in KITCHEN[2:]:  # the island and the bar stand in the room
         middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
         room = map.navigable_room[np.abs(places - middle).max(axis=1) < 0.3]

@@ -9,7 +9,7 @@ import pytest
 
 import topomerge as tm
 from tests.scenes import Scene
-from topomerge.extraction.attributes import ONE_DOORWAY, distinct_doors, rooms_at
+from topomerge.extraction.attributes import ONE_DOORWAY, find_rooms_at, select_distinct_doors
 from topomerge.types import TopometricMap
 
 
@@ -29,9 +29,9 @@ def with_another(map: TopometricMap, **fields) -> TopometricMap:
 
 
 def test_all_doors_of_a_plain_map_stay(three_rooms):
-    assert len(three_rooms.edges) == 2 and distinct_doors(three_rooms) is three_rooms
+    assert len(three_rooms.edges) == 2 and select_distinct_doors(three_rooms) is three_rooms
     bare = replace(three_rooms, edges=three_rooms.edges[:0])
-    assert distinct_doors(bare) is bare
+    assert select_distinct_doors(bare) is bare
 
 
 def test_of_a_doorway_told_twice_the_rooms_across_it_stay(three_rooms):
@@ -39,13 +39,13 @@ def test_of_a_doorway_told_twice_the_rooms_across_it_stay(three_rooms):
     first = three_rooms.edges[0]
     outer = sorted({0, 1, 2} - set(first["rooms"].tolist()) | {int(first["rooms"].min())})
     false = with_another(three_rooms, rooms=outer, confidence=1.0, centre=first["centre"] + (0.0, 0.2, 0.0))
-    assert np.array_equal(distinct_doors(false).edges, three_rooms.edges)
+    assert np.array_equal(select_distinct_doors(false).edges, three_rooms.edges)
 
 
 def test_of_two_between_the_same_rooms_the_surer_one_stays(three_rooms):
     for confidence in (0.3, 1.0):
         surest = max(confidence, float(three_rooms.edges["confidence"][0]))
-        out = distinct_doors(with_another(three_rooms, confidence=confidence)).edges
+        out = select_distinct_doors(with_another(three_rooms, confidence=confidence)).edges
         assert len(out) == 2 and surest in out["confidence"]
 
 
@@ -55,20 +55,22 @@ def test_doors_beside_each_other_and_stairs_stay(three_rooms):
     stairs = with_another(three_rooms, kind="stairs")
     above = with_another(three_rooms, centre=centre + (0.0, 0.0, 3.0))
     for map in (beside, stairs, above):
-        assert distinct_doors(map) is map
+        assert select_distinct_doors(map) is map
 
 
 def test_the_order_of_the_doors_changes_nothing(three_rooms):
     doubled = with_another(three_rooms, rooms=[0, 2], confidence=0.9)
     turned = replace(doubled, edges=doubled.edges[::-1].copy())
-    assert {e.tobytes() for e in distinct_doors(doubled).edges} == {e.tobytes() for e in distinct_doors(turned).edges}
+    assert {e.tobytes() for e in select_distinct_doors(doubled).edges} == {
+        e.tobytes() for e in select_distinct_doors(turned).edges
+    }
 
 
 def test_rooms_at_places(three_rooms):
     x = np.array([2.5, 7.5, 12.5, 30.0])
     floor = float(three_rooms.storeys["floor"][0])
-    room = rooms_at(three_rooms, np.column_stack([x, np.full(4, 2.5), np.full(4, floor + 0.05)]))
+    room = find_rooms_at(three_rooms, np.column_stack([x, np.full(4, 2.5), np.full(4, floor + 0.05)]))
     assert len(set(room[:3].tolist())) == 3 and (room[:3] >= 0).all() and room[3] == -1
-    assert (rooms_at(three_rooms, np.array([[2.5, 2.5, floor + 3.0]])) == -1).all() and len(
-        rooms_at(three_rooms, np.zeros((0, 3)))
+    assert (find_rooms_at(three_rooms, np.array([[2.5, 2.5, floor + 3.0]])) == -1).all() and len(
+        find_rooms_at(three_rooms, np.zeros((0, 3)))
     ) == 0

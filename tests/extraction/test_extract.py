@@ -15,7 +15,7 @@ from topomerge.types import PointCloud, TopometricMap
 
 def room_at(result: TopometricMap, x: float, y: float, z: float = 0.0) -> int:
     """Room of the navigable cell nearest to a point."""
-    distance = np.linalg.norm(result.navigable.centroids() - (x, y, z), axis=1)
+    distance = np.linalg.norm(result.navigable.compute_centroids() - (x, y, z), axis=1)
     return int(result.navigable_room[distance.argmin()])
 
 
@@ -112,8 +112,8 @@ def test_two_storeys_with_a_stair():
     # a straight stair from x = 1 to 5.93 along y = 3.8 to 5
     np.testing.assert_allclose(result.edges["lower"][0], (1.6, 4.4, 0.4), atol=0.4)
     np.testing.assert_allclose(result.edges["upper"][0], (5.3, 4.4, 2.6), atol=0.5)
-    storey = result.storey_of_cells()
-    z = result.grid.centroids()[:, 2]
+    storey = result.find_cell_storeys()
+    z = result.grid.compute_centroids()[:, 2]
     assert (storey[(z > 3.2)] == 1).mean() > 0.95 and (storey[z < 1.3] == 0).all()
 
 
@@ -127,7 +127,7 @@ def test_a_table_is_no_room():
     result = extract(scenes.table().points(0.005))
     assert len(result.rooms) == 1
     assert result.rooms["area"][0] == pytest.approx(20 - 2, rel=0.15)
-    assert result.navigable.centroids()[:, 2].max() < 0.5
+    assert result.navigable.compute_centroids()[:, 2].max() < 0.5
 
 
 def test_a_mezzanine_is_a_storey():

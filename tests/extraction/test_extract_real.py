@@ -52,7 +52,7 @@ def test_a_building_model(data_dir: Path) -> None:
     large = [r for r in cloud.rooms if r.kind not in ("Roof", "Foyer", "Stair", "Hallway") and _area(r.polygon) > 8]
     for room in large:
         middle = np.array([*room.polygon.mean(axis=0), room.floor])
-        found.add(int(result.navigable_room[np.linalg.norm(result.navigable.centroids() - middle, axis=1).argmin()]))
+        found.add(int(result.navigable_room[np.linalg.norm(result.navigable.compute_centroids() - middle, axis=1).argmin()]))
     assert len(found) >= 0.7 * len(large)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.scenes_map import building
-from topomerge.extraction.attributes import PATCH_AREA, without_patches
+from topomerge.extraction.attributes import PATCH_AREA, remove_patches
 from topomerge.types import EDGE_DTYPE, WINDOW_DTYPE, TopometricMap
 
 NOWHERE = np.zeros((0, 3))
@@ -27,7 +27,7 @@ def with_patch(area: float = 1.5, storeys: int = 1) -> TopometricMap:
 
 def test_a_patch_is_of_no_room_and_the_others_are_as_they_were():
     map = with_patch()
-    other = without_patches(map, NOWHERE)
+    other = remove_patches(map, NOWHERE)
     stays = np.delete(np.arange(len(map.rooms)), 1)
     assert np.array_equal(other.rooms, map.rooms[stays])
     for labels, before in ((other.room, map.room), (other.navigable_room, map.navigable_room)):
@@ -46,7 +46,7 @@ def test_areas_and_narrowings_of_a_patch_go_with_it():
     narrows = np.zeros(count, EDGE_DTYPE)
     narrows["rooms"] = np.arange(2 * count).reshape(count, 2)
     area = np.where(map.navigable_room >= 0, 2 * map.navigable_room, -1).astype(np.int32)
-    other = without_patches(replace(map, areas=areas, narrows=narrows, navigable_area=area), NOWHERE)
+    other = remove_patches(replace(map, areas=areas, narrows=narrows, navigable_area=area), NOWHERE)
     assert len(other.areas) == 2 * (count - 1) and len(other.narrows) == count - 1
     assert (other.areas["room"][other.narrows["rooms"]] == np.arange(count - 1)[:, None]).all()
     inside = other.navigable_room >= 0
@@ -62,12 +62,12 @@ def test_rooms_stay(why: str):
     elif why == "large":
         map = with_patch(PATCH_AREA)
     elif why == "entered":
-        places = map.navigable.centroids()[map.navigable_room == 1][:1] + (0.0, 0.0, 1.4)
+        places = map.navigable.compute_centroids()[map.navigable_room == 1][:1] + (0.0, 0.0, 1.4)
     else:
         rooms = map.rooms.copy()
         rooms["area"] = 1.0
         map = replace(map, rooms=rooms, edges=map.edges[:0])
-    assert without_patches(map, places) is map
+    assert remove_patches(map, places) is map
 
 
 def test_patches_of_a_storey_that_has_nothing_else_stay():
@@ -76,5 +76,5 @@ def test_patches_of_a_storey_that_has_nothing_else_stay():
     rooms = map.rooms.copy()
     rooms["area"][upper] = 1.0
     edges = map.edges[~upper[map.edges["rooms"]].any(axis=1)]
-    other = without_patches(replace(map, rooms=rooms, edges=edges), NOWHERE)
+    other = remove_patches(replace(map, rooms=rooms, edges=edges), NOWHERE)
     assert (other.rooms["storey"] == 1).sum() == upper.sum() and len(other.rooms) == len(map.rooms) - 1

@@ -20,7 +20,7 @@ def pairs(map: TopometricMap) -> set[tuple[int, int]]:
 
 def room_at(map: TopometricMap, x: float, y: float, z: float) -> int:
     """Room of the navigable cell nearest to a point."""
-    return int(map.navigable_room[np.linalg.norm(map.navigable.centroids() - (x, y, z), axis=1).argmin()])
+    return int(map.navigable_room[np.linalg.norm(map.navigable.compute_centroids() - (x, y, z), axis=1).argmin()])
 
 
 def flight(scene: Scene, x: float, y: tuple[float, float], low: float, high: float, tread: float = 0.28) -> None:

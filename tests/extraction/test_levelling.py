@@ -14,14 +14,14 @@ from topomerge.extraction.levelling import (
     LARGEST_TILT,
     LEAST_TILT,
     LevelledChunks,
-    degrees_from_z,
+    build_rotation_about,
+    compute_rotation_to_z,
     find_up,
-    levelled_cloud,
-    levelled_grid,
-    rotation_about,
-    rotation_to_z,
+    measure_degrees_from_z,
+    transform_cloud,
+    transform_grid,
 )
-from topomerge.types import PointCloud, VoxelGrid, transformed
+from topomerge.types import PointCloud, VoxelGrid, transform_points
 
 FAR = np.array([431_000.0, 5_812_000.0, 40.0])  # m, in a national grid
 
@@ -59,10 +59,12 @@ def ramp(length: float, climb: float) -> np.ndarray:
 def test_up_is_found(degrees: float, noise: float) -> None:
     for about in (0.0, 33.0, 90.0, 250.0):
         up = find_up(tilted(scenes.corridor().points(noise), degrees, about))
-        assert up is not None and abs(degrees_from_z(up) - degrees) < 0.2
+        assert up is not None and abs(measure_degrees_from_z(up) - degrees) < 0.2
         off = np.degrees(np.arccos(np.clip(up @ rotation(degrees, about)[:, 2], -1, 1)))
         assert off < 0.2
-        assert np.allclose(rotation_to_z(up) @ up, (0, 0, 1)) and np.isclose(np.linalg.det(rotation_to_z(up)), 1.0)
+        assert np.allclose(compute_rotation_to_z(up) @ up, (0, 0, 1)) and np.isclose(
+            np.linalg.det(compute_rotation_to_z(up)), 1.0
+        )
 
 
 @pytest.mark.parametrize("degrees", [0.0, 0.5 * LEAST_TILT, LARGEST_TILT + 8])
@@ -101,7 +103,7 @@ def test_rooms_and_doors_are_those_of_the_level_cloud() -> None:
         assert len(map.rooms) == len(level.rooms) == 9 and len(map.storeys) == 1
         assert sorted(map.edges["kind"]) == sorted(level.edges["kind"])
         assert np.allclose(np.sort(map.rooms["area"]), np.sort(level.rooms["area"]), rtol=0.05)
-        there = transformed(map.levelling, tilted(points, degrees, about))
+        there = transform_points(map.levelling, tilted(points, degrees, about))
         assert np.abs(np.ptp(there[:, 2]) - np.ptp(points[:, 2])) < 0.1
 
 
@@ -123,7 +125,7 @@ def test_chunks_are_levelled_alike_however_they_are_cut() -> None:
         moved = np.concatenate([chunk.points for chunk in levelled])
         assert levelled.warnings == ["a.ply: tilted by 6.0 degrees: levelled"]
         assert len(moved) == len(points) and abs(np.ptp(moved[:, 2]) - 2.7) < 0.1
-        assert np.abs(moved - transformed(levelled.matrix, points)).max() < 1e-4
+        assert np.abs(moved - transform_points(levelled.matrix, points)).max() < 1e-4
 
 
 def test_far_from_the_origin_heights_stay_near() -> None:
@@ -136,20 +138,20 @@ def test_far_from_the_origin_heights_stay_near() -> None:
 
 
 def test_poses_and_free_cells_move_along() -> None:
-    matrix = rotation_about(np.array([3.0, 2.0, 1.0]), rotation(11.0, 50.0))
+    matrix = build_rotation_about(np.array([3.0, 2.0, 1.0]), rotation(11.0, 50.0))
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = ((1.0, 2.0, 1.5), (4.0, 2.0, 1.5))
     poses[1, :3, :3] = Rotation.from_euler("z", 30, degrees=True).as_matrix()
     cells = np.argwhere(np.ones((20, 12, 8), bool))
     free = VoxelGrid.from_cells(cells, np.array([0.1, -0.3, 0.2]), 0.2)
     cloud = PointCloud(np.float32([[1, 2, 3], [np.nan, 0, 0]]), poses=poses, pose_of=np.int32([0, 1]), free=free)
-    moved = levelled_cloud(cloud, matrix)
+    moved = transform_cloud(cloud, matrix)
     assert np.allclose(moved.points[0], (matrix @ (1, 2, 3, 1))[:3], atol=1e-5) and np.isnan(moved.points[1]).all()
     assert np.allclose(moved.poses, matrix @ poses) and np.allclose(moved.poses[1, :3, 3], (matrix @ (4.0, 2.0, 1.5, 1))[:3])
     assert moved.free is not None and 0.97 < len(moved.free) / len(free) < 1.03
-    back = free.contains(free.locate(transformed(np.linalg.inv(matrix), moved.free.centroids())))
-    assert back.all() and moved.free.contains(moved.free.locate(transformed(matrix, free.centroids()))).mean() > 0.85
-    assert len(levelled_grid(free.subset(np.zeros(len(free), bool)), matrix)) == 0
+    back = free.contains(free.locate(transform_points(np.linalg.inv(matrix), moved.free.compute_centroids())))
+    assert back.all() and moved.free.contains(moved.free.locate(transform_points(matrix, free.compute_centroids()))).mean() > 0.85
+    assert len(transform_grid(free.select_cells(np.zeros(len(free), bool)), matrix)) == 0
 
 
 def test_rays_of_a_tilted_scan_start_where_the_sensor_was() -> None:
@@ -161,7 +163,7 @@ def test_rays_of_a_tilted_scan_start_where_the_sensor_was() -> None:
     cloud = PointCloud(tilted(points, 8.0, 70.0), poses=turn @ poses, pose_of=(points[:, 0] > 4).astype(np.int32))
     map = tm.extract(cloud)
     assert len(map.rooms) == 2 and (map.rooms["entered"] > 0.5).all()
-    places = transformed(map.levelling @ turn, poses[:, :3, 3])
+    places = transform_points(map.levelling @ turn, poses[:, :3, 3])
     assert map.free is not None and map.free.contains(map.free.locate(places)).all()
 
 

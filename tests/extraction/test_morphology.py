@@ -6,7 +6,7 @@ import edt
 import numpy as np
 import pytest
 
-from topomerge.extraction.morphology import _closing, _near, horizontal_distance_field, on_all_sides
+from topomerge.extraction.morphology import _find_closing_columns, _near, compute_horizontal_distance_field, is_surrounded
 from topomerge.types import VoxelGrid
 
 
@@ -20,7 +20,7 @@ def test_closing_is_the_same_in_tiles_and_at_once() -> None:
     """A gap across the border of two tiles is closed; a wider one is not."""
     x = np.concatenate([np.arange(200, 254), np.arange(258, 300), np.arange(310, 340)])
     floor = np.array([(i, j) for i in x for j in range(250, 265)])
-    added = _closing(floor, 3.0)
+    added = _find_closing_columns(floor, 3.0)
     assert set(added[:, 0].tolist()) == {254, 255, 256, 257} and set(added[:, 1].tolist()) <= set(range(250, 265))
     assert len(added) >= 4 * 13
 
@@ -29,6 +29,6 @@ def test_closing_is_the_same_in_tiles_and_at_once() -> None:
 def test_cells_on_all_sides_are_those_of_the_distance_field(edge: float) -> None:
     cells = np.unique(np.random.default_rng(2).integers(0, 30, (25_000, 3)), axis=0).astype(np.int32)
     grid = VoxelGrid.from_cells(cells, np.zeros(3), edge)
-    field = horizontal_distance_field(grid)
+    field = compute_horizontal_distance_field(grid)
     for radius in range(4):
-        assert np.array_equal(on_all_sides(grid, grid.cells, radius), field >= radius)
+        assert np.array_equal(is_surrounded(grid, grid.cells, radius), field >= radius)

@@ -13,14 +13,14 @@ import topomerge.extraction
 from tests.extraction.elevations.doors import three_doors
 from tests.extraction.segments import storey_of
 from topomerge.errors import InputError
+from topomerge.extraction import extract as evidence
 from topomerge.extraction import extract as pipeline
-from topomerge.extraction import passages as evidence
 from topomerge.extraction import segment, walls
 from topomerge.extraction.elevations.doorways import DOORWAY_DTYPE
-from topomerge.extraction.passages import EVIDENCE, PASSAGES_FILE, SCORE_INPUTS, choose_scorer
+from topomerge.extraction.extract import EVIDENCE, PASSAGES_FILE, SCORE_INPUTS, choose_scorer
 from topomerge.extraction.plans.passages import Passage
 from topomerge.extraction.segment import find_segments, split_segments
-from topomerge.io.weight_files import read_weights_json
+from topomerge.io.archive import read_weights_json
 
 ONCE = (
     (pipeline, "rasterise_storeys"),

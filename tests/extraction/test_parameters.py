@@ -10,7 +10,7 @@ import pytest
 from tests import scenes
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
-from topomerge.extraction.parameters import PRESETS, DefaultParameters, SharedParameters, ThesisParameters, chosen_parameters
+from topomerge.extraction.parameters import PRESETS, DefaultParameters, SharedParameters, ThesisParameters, resolve_parameters
 
 
 def test_each_preset_has_only_what_it_uses() -> None:
@@ -29,15 +29,15 @@ def test_a_parameter_of_the_other_preset_is_refused(preset: str, key: str, owner
 
 def test_unknown_names() -> None:
     with pytest.raises(InputError, match="unknown parameter 'rnge' of the extraction: preset 'thesis' has .*range"):
-        chosen_parameters("thesis", {"rnge": 3})
+        resolve_parameters("thesis", {"rnge": 3})
     for preset in ("these", 5, SharedParameters()):
         with pytest.raises(InputError, match="unknown preset .* take one of default, thesis"):
-            chosen_parameters(preset, {})  # type: ignore[arg-type]
+            resolve_parameters(preset, {})  # type: ignore[arg-type]
 
 
 def test_single_parameters_are_overridden() -> None:
-    assert chosen_parameters("default", {"door": 0.7}) == DefaultParameters(door=0.7)
-    assert chosen_parameters(ThesisParameters(range=4.0), {"view_radius": 1.0}) == ThesisParameters(range=4.0, view_radius=1.0)
+    assert resolve_parameters("default", {"door": 0.7}) == DefaultParameters(door=0.7)
+    assert resolve_parameters(ThesisParameters(range=4.0), {"view_radius": 1.0}) == ThesisParameters(range=4.0, view_radius=1.0)
 
 
 @pytest.mark.parametrize("preset", ["default", "thesis"])

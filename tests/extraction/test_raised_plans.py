@@ -14,10 +14,10 @@ from topomerge import networks
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.extraction.scan import read_scan
-from topomerge.extraction.slices import is_raised, with_raised_slice
+from topomerge.extraction.slices import is_raised, raise_slice
 from topomerge.extraction.voxels import voxelise
 from topomerge.io import read_points
-from topomerge.io.weight_files import VARIABLE
+from topomerge.io.archive import VARIABLE
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def drawn(tmp_path: Path) -> Path:
 def test_a_raised_plan_is_one_in_any_frame(drawn: Path, ceiling: bool) -> None:
     cloud = read_points(drawn, resolution=0.05, ceiling=ceiling)
     scan = read_scan(cloud, 0.1)
-    assert is_raised(scan.grid) and scan.fine is not None and with_raised_slice(scan).fine is None
+    assert is_raised(scan.grid) and scan.fine is not None and raise_slice(scan).fine is None
     turn = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]])
     assert is_raised(read_scan(cloud.points @ turn.T + (3.03, -7.1, 2.22), 0.1).grid)
 
@@ -46,7 +46,7 @@ def test_a_raised_plan_is_one_at_any_resolution(drawn: Path, resolution: float) 
 
 def test_a_scan_is_none() -> None:
     scan = read_scan(two_rooms().points(), 0.1)
-    assert not is_raised(scan.grid) and with_raised_slice(scan) is scan
+    assert not is_raised(scan.grid) and raise_slice(scan) is scan
 
 
 def test_walls_without_anything_in_between_but_with_a_lintel_are_none(drawn: Path) -> None:

@@ -18,15 +18,15 @@ from topomerge.extraction.room_odds import (
     POSE_FEATURES,
     ROOM_FEATURES,
     ROOM_ODDS_FILE,
-    pose_features,
-    room_features,
-    thin_share,
-    with_room_odds,
+    add_room_probabilities,
+    compute_pose_features,
+    compute_room_features,
+    measure_thin_share,
 )
 from topomerge.io import read_points
-from topomerge.io.weight_files import VARIABLE, weights_file
-from topomerge.kernels.sight import seen_from
-from topomerge.types import ROOM_ODDS, Array, PointCloud, Sim3, TopometricMap, mostly_unseen, with_outline_odds
+from topomerge.io.archive import VARIABLE, find_weights_file
+from topomerge.kernels.rays import is_seen_from
+from topomerge.types import ROOM_ODDS, Array, PointCloud, Sim3, TopometricMap, add_outline_odds, is_mostly_unseen
 
 LEFT, RIGHT = (2.0, 2.0, 1.4), (6.0, 2.0, 1.4)  # places of a sensor in both rooms
 
@@ -84,7 +84,7 @@ def test_without_places_a_cone_through_the_door_was_looked_into(points: Array, g
 
 def test_features_of_a_cone(points: Array, glimpse: Array) -> None:
     """The looker sees no wall that the door is in; a corner beside the door is seen from within only."""
-    both = [room_features(extract(p, carve=False)) for p in (points, glimpse)]
+    both = [compute_room_features(extract(p, carve=False)) for p in (points, glimpse)]
     column = {name: k for k, name in enumerate(ROOM_FEATURES)}
     assert all(x.shape == (2, len(ROOM_FEATURES)) and np.isfinite(x).all() for x in both)
     whole, cone = (x[np.argsort(-x[:, column["log_area"]])][-1] for x in both)
@@ -97,10 +97,10 @@ def test_rays_tell_who_was_where(points: Array) -> None:
     map = extract(points, carve=False)
     left, right = side_rooms(map)
     starts = np.where(np.arange(len(points))[:, None] % 4 > 0, LEFT, RIGHT)
-    poses = pose_features(map, (starts, points))
+    poses = compute_pose_features(map, (starts, points))
     assert poses is not None and poses.shape == (2, len(POSE_FEATURES)) and (poses[:, 0] == 1).all()
     assert poses[left, 1] == pytest.approx(0.75, abs=0.01) and poses[right, 1] == pytest.approx(0.25, abs=0.01)
-    alone = pose_features(map, (np.tile(LEFT, (len(points), 1)), points))
+    alone = compute_pose_features(map, (np.tile(LEFT, (len(points), 1)), points))
     assert alone is not None and alone[right].tolist() == [0, 0] and alone[left].tolist() == [1, 1]
 
 
@@ -112,11 +112,11 @@ def test_places_over_no_room_say_nothing(points: Array, place: tuple[float, floa
     """Poses that are no numbers, of another frame or of another building: the map is judged by what was seen of it."""
     map = extract(points, carve=False)
     starts = np.tile(place, (len(points), 1))
-    assert pose_features(map, (starts, points)) is None
-    assert np.array_equal(with_room_odds(map, (starts, points)).rooms, with_room_odds(map).rooms)
-    assert pose_features(map, (np.zeros((0, 3)), np.zeros((0, 3)))) is None and pose_features(map, None) is None
+    assert compute_pose_features(map, (starts, points)) is None
+    assert np.array_equal(add_room_probabilities(map, (starts, points)).rooms, add_room_probabilities(map).rooms)
+    assert compute_pose_features(map, (np.zeros((0, 3)), np.zeros((0, 3)))) is None and compute_pose_features(map, None) is None
     some = np.where(np.arange(len(points))[:, None] % 3 > 0, LEFT, place)  # most are good ones: those count
-    assert pose_features(map, (some, points)) is not None
+    assert compute_pose_features(map, (some, points)) is not None
 
 
 @pytest.mark.longer
@@ -140,7 +140,7 @@ def test_no_rooms_no_odds(points: Array) -> None:
         room=np.full(len(map.grid), -1, np.int32), navigable_room=none, navigable_area=none, rooms=map.rooms[:0],
         edges=map.edges[:0], areas=map.areas[:0], narrows=map.narrows[:0],
     )  # fmt: skip
-    assert len(with_room_odds(empty).rooms) == 0 and room_features(empty).shape == (0, len(ROOM_FEATURES))
+    assert len(add_room_probabilities(empty).rooms) == 0 and compute_room_features(empty).shape == (0, len(ROOM_FEATURES))
 
 
 @pytest.mark.longer
@@ -148,18 +148,18 @@ def test_by_the_outline_alone(points: Array) -> None:
     """Maps of the thesis' preset, and of earlier files."""
     rooms = extract(points, carve=False).rooms
     rooms["completeness"] = (0.59, 0.6)
-    odds = with_outline_odds(rooms)
-    assert mostly_unseen(rooms).tolist() == odds["glimpsed"].tolist() == [True, False]
+    odds = add_outline_odds(rooms)
+    assert is_mostly_unseen(rooms).tolist() == odds["glimpsed"].tolist() == [True, False]
     assert odds["entered"].tolist() == [0, 1] and odds["whole"].tolist() == [0, 1]
     thesis = extract(points, preset="thesis").rooms
-    assert np.array_equal(thesis["glimpsed"], mostly_unseen(thesis))
+    assert np.array_equal(thesis["glimpsed"], is_mostly_unseen(thesis))
 
 
 @pytest.mark.parametrize(
     "change", [{"features": ["none"]}, {"entered": [1.0]}, {"scale": [float("nan")] * 13}, {"open": {}}, {"grids": [1.0]}]
 )
 def test_damaged_weights_are_named(points: Array, change: dict[str, object], tmp_path, monkeypatch) -> None:
-    values = json.loads(weights_file("topomerge.extraction", ROOM_ODDS_FILE).read_text())
+    values = json.loads(find_weights_file("topomerge.extraction", ROOM_ODDS_FILE).read_text())
     (tmp_path / ROOM_ODDS_FILE).write_text(json.dumps({**values, **change}))
     monkeypatch.setenv(VARIABLE, str(tmp_path))
     with pytest.raises(InputError, match="room_odds.json: .*task=room_odds"):
@@ -172,10 +172,10 @@ def test_sight_ends_at_what_is_not_free() -> None:
     free[4] = False
     free[4, 4] = True  # a door
     targets = np.array([[6, 4], [6, 8], [8, 6], [5, 0]])
-    assert seen_from(free, targets, np.array([[0, 4]]), 20.0).tolist() == [True, False, False, False]
-    assert seen_from(free, targets, np.array([[0, 4], [2, 3]]), 20.0).tolist() == [True, False, True, False]
-    assert not seen_from(free, targets, np.array([[0, 4]]), 5.0).any()
-    assert not seen_from(free, targets, np.zeros((0, 2), np.int64), 20.0).any()
+    assert is_seen_from(free, targets, np.array([[0, 4]]), 20.0).tolist() == [True, False, False, False]
+    assert is_seen_from(free, targets, np.array([[0, 4], [2, 3]]), 20.0).tolist() == [True, False, True, False]
+    assert not is_seen_from(free, targets, np.array([[0, 4]]), 5.0).any()
+    assert not is_seen_from(free, targets, np.zeros((0, 2), np.int64), 20.0).any()
 
 
 @pytest.fixture(scope="module")
@@ -218,7 +218,7 @@ def test_rays_through_a_window_of_a_grid_are_only_looked_into(fan_grid, cell, sp
 
 def test_rays_have_an_open_outline_and_are_thin(fan_grid) -> None:
     map = fan_grid(*FANS[0])
-    x = dict(zip(GRID_FEATURES, room_features(map, GRID_FEATURES).T, strict=True))
+    x = dict(zip(GRID_FEATURES, compute_room_features(map, GRID_FEATURES).T, strict=True))
     outside = map.rooms["centroid"][:, 0] > 12.7
     assert (x["open_outline"][outside] > 0.3).all() and (x["open_outline"][~outside] < 0.1).all()
     assert (x["thin"][~outside & (map.rooms["area"] > 15)] < 0.05).all()
@@ -229,15 +229,15 @@ def test_a_single_ray_is_thin_and_a_room_is_not(edge: float) -> None:
     room, ray = np.zeros((2, 100, 100), bool)
     room[10:50, 10:50] = True
     ray[10:90, 10 : 10 + round(0.4 / edge)] = True
-    assert thin_share(room, edge) < 0.01 and thin_share(ray, edge) == 1
+    assert measure_thin_share(room, edge) < 0.01 and measure_thin_share(ray, edge) == 1
     joined = room.copy()
     joined[50:90, 20 : 20 + round(0.4 / edge)] = True
-    assert thin_share(joined, edge) == pytest.approx((joined & ~room).sum() / joined.sum(), abs=0.1)
+    assert measure_thin_share(joined, edge) == pytest.approx((joined & ~room).sum() / joined.sum(), abs=0.1)
 
 
 def test_grids_and_scans_are_weighed_by_models_of_their_own(points: Array) -> None:
     map = extract(points, carve=False)
-    scan, grid = with_room_odds(map).rooms, with_room_odds(map, None, raised=True).rooms
+    scan, grid = add_room_probabilities(map).rooms, add_room_probabilities(map, None, raised=True).rooms
     assert not np.array_equal(scan["entered"], grid["entered"]) and ((grid["entered"] >= 0) & (grid["entered"] <= 1)).all()
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from topomerge.errors import InputError
-from topomerge.extraction.scan import read_scan, reasons
+from topomerge.extraction.scan import add_reasons, read_scan
 from topomerge.types import PointCloud, VoxelGrid
 
 POINTS = np.array([(x / 10 + 0.05, y / 10 + 0.05, 0.05) for x in range(8) for y in range(8)], np.float32)
@@ -63,5 +63,5 @@ def test_points_are_numbers() -> None:
 def test_what_looked_wrong_is_told_with_the_error() -> None:
     with pytest.raises(InputError, match=r"^no finite point: nothing to voxelise \(and all points were NaN\)$"):
         read_scan(PointCloud(np.zeros((0, 3), np.float32), warnings=("all points were NaN",)), 0.1)
-    with pytest.raises(InputError, match="^why$"), reasons(()):
+    with pytest.raises(InputError, match="^why$"), add_reasons(()):
         raise InputError("why")

@@ -9,9 +9,9 @@ import topomerge as tm
 from tests import scenes
 from topomerge.errors import InputError
 from topomerge.extraction.scan import Scan
-from topomerge.extraction.slices import with_raised_slice
+from topomerge.extraction.slices import raise_slice
 from topomerge.extraction.voxels import voxelise
-from topomerge.kernels.carve import count_rays
+from topomerge.kernels.rays import count_rays
 from topomerge.types import PointCloud
 
 HEIGHT = 0.4  # m
@@ -102,7 +102,7 @@ def test_points_that_hang_in_a_doorway_do_not_shut_it(known):
 def test_columns_that_many_rays_went_through_are_free_and_walls_stay():
     cloud = two_rooms(strays=12)
     rays = cloud.poses[cloud.pose_of, :3, 3], cloud.points
-    clear, full = (with_raised_slice(Scan(voxelise(c), rays=r)).grid for c, r in ((two_rooms(), None), (cloud, rays)))
+    clear, full = (raise_slice(Scan(voxelise(c), rays=r)).grid for c, r in ((two_rooms(), None), (cloud, rays)))
     assert len(clear) and wall_area(full) == pytest.approx(wall_area(clear), rel=0.03)
     assert not standing(full, 4.0, np.mean(DOOR)) and standing(full, 4.0, 1.0) and standing(full, 0.0, 3.0)
 
@@ -113,7 +113,7 @@ def wall_area(grid) -> float:
 
 def standing(grid, x: float, y: float) -> bool:
     """Is anything above the floor within 0.1 m?"""
-    above = grid.centroids()[grid.cells[:, 2] > grid.cells[:, 2].min() + 3]
+    above = grid.compute_centroids()[grid.cells[:, 2] > grid.cells[:, 2].min() + 3]
     return bool((np.abs(above[:, :2] - (x, y)) < 0.11).all(axis=1).any())
 
 

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from topomerge.errors import InputError
-from topomerge.extraction.cleaning import cell_middles, grouped, with_means, without_gaps
+from topomerge.extraction.cleaning import add_means, coarsen_until_dense, compute_cell_means, label_groups
 from topomerge.extraction.scan import Scan
-from topomerge.extraction.slices import with_raised_slice
+from topomerge.extraction.slices import raise_slice
 from topomerge.extraction.voxels import LatticeCells, voxelise
-from topomerge.kernels import voxelise as kernel
+from topomerge.kernels import voxels as kernel
 from topomerge.types import PointCloud, VoxelGrid
 
 RNG = np.random.default_rng(5)
@@ -64,25 +64,25 @@ def test_cells_know_where_their_points_lie_on_average():
     points = np.random.default_rng(5).normal(0, 1, (20_000, 3)).astype(np.float32)
     shift = np.array([85_000.0, 447_000.0, -3.0])
     grid = voxelise(PointCloud(points, shift), 0.25)
-    rows = grid.rows(grid.locate(points + shift))
+    rows = grid.find_rows(grid.locate(points + shift))
     mean = np.column_stack([np.bincount(rows, (points + shift)[:, k]) for k in range(3)]) / np.bincount(rows)[:, None]
-    assert np.abs(cell_middles(grid) - mean).max() < 0.25 / 256  # in whole 256ths of a cell
-    assert abs((cell_middles(grid) - mean).mean()) < 0.25 / 256 / 10
-    assert np.abs(with_means(grid, points + shift).properties["offset"].astype(int) - grid.properties["offset"]).max() <= 1
+    assert np.abs(compute_cell_means(grid) - mean).max() < 0.25 / 256  # in whole 256ths of a cell
+    assert abs((compute_cell_means(grid) - mean).mean()) < 0.25 / 256 / 10
+    assert np.abs(add_means(grid, points + shift).properties["offset"].astype(int) - grid.properties["offset"]).max() <= 1
 
 
 def test_cells_that_are_joined_keep_the_mean_of_their_points():
     rng = np.random.default_rng(6)
     wall = np.column_stack([np.full(400, 3.137), rng.uniform(0, 6, 400), rng.uniform(0, 3, 400)])  # too few points for 0.1 m
-    grid = without_gaps(voxelise(wall.astype(np.float32)), 7, [])
-    assert grid.edge > 0.1 and np.abs(cell_middles(grid)[:, 0] - 3.137).max() < 0.002
+    grid = coarsen_until_dense(voxelise(wall.astype(np.float32)), 7, [])
+    assert grid.edge > 0.1 and np.abs(compute_cell_means(grid)[:, 0] - 3.137).max() < 0.002
 
 
 def test_walls_of_a_slice_stand_where_its_points_are():
     room = np.concatenate([[(x, y, 0.4) for x in np.linspace(0.03, 6.03, 200)] for y in (0.03, 5.03)])
     room = np.concatenate([room, room[:, [1, 0, 2]]]).astype(np.float32)
-    raised = with_raised_slice(Scan(voxelise(room))).grid
-    walls = cell_middles(raised)[raised.cells[:, 2] > raised.cells[:, 2].min()]
+    raised = raise_slice(Scan(voxelise(room))).grid
+    walls = compute_cell_means(raised)[raised.cells[:, 2] > raised.cells[:, 2].min()]
     assert len(np.unique(raised.cells[:, 2])) > 10
     off = np.abs(walls[:, :2] - 0.03 - np.round(walls[:, :2] - 0.03)).min(axis=1)
     assert np.median(off) < 0.001 and off.max() < 0.05  # corners lie between two walls
@@ -90,8 +90,8 @@ def test_walls_of_a_slice_stand_where_its_points_are():
 
 def test_without_points_a_cell_lies_in_its_middle():
     grid = VoxelGrid.from_cells(np.array([[0, 0, 0], [4, 1, 2]]), np.array([1.0, 2.0, 3.0]), 0.2)
-    assert (cell_middles(grid) == grid.centroids()).all()
-    assert np.abs(cell_middles(with_means(grid, np.zeros((0, 3)))) - grid.centroids()).max() < 0.2 / 256
+    assert (compute_cell_means(grid) == grid.compute_centroids()).all()
+    assert np.abs(compute_cell_means(add_means(grid, np.zeros((0, 3)))) - grid.compute_centroids()).max() < 0.2 / 256
 
 
 def test_many_chunks_give_what_one_gives():
@@ -111,7 +111,7 @@ def test_cells_of_chunks_are_those_of_numpy(away: float):
     held = LatticeCells(0.25)
     for chunk in chunks:
         held.add(PointCloud(chunk.astype(np.float32)))
-    cells, counts, sums = held.all()
+    cells, counts, sums = held.get_cells()
     places = np.concatenate(chunks).astype(np.float32).astype(np.float64) / 0.25
     expected, row, number = np.unique(np.floor(places).astype(np.int64), axis=0, return_inverse=True, return_counts=True)
     order = np.lexsort(cells.T[::-1])
@@ -126,7 +126,7 @@ def test_of_more_cells_than_are_wanted_there_are_none():
     held = LatticeCells(0.05, most=1000)
     for _ in range(4):
         held.add(PointCloud(rng.uniform(0, 4, (800, 3)).astype(np.float32)))
-    assert held.within(voxelise(rng.uniform(0, 4, (800, 3)).astype(np.float32))) is None
+    assert held.select_within(voxelise(rng.uniform(0, 4, (800, 3)).astype(np.float32))) is None
 
 
 def test_shift_moves_the_origin_exactly():
@@ -176,7 +176,7 @@ def test_an_extent_between_table_and_sorting(size):
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform(0, size, (2000, 3)), rng.uniform(0, 5, (2000, 3))]).astype(np.float32)
     cells, counts = twin(points, 0.1)
-    base, found, number, _ = kernel.occupied(points, np.zeros(3), 0.1)
+    base, found, number, _ = kernel.find_occupied_cells(points, np.zeros(3), 0.1)
     keys = [tuple(c) for c in (found + base).tolist()]
     assert set(keys) == cells and dict(zip(keys, number.tolist(), strict=True)) == counts
 
@@ -189,7 +189,7 @@ def test_absurd_voxel_size_is_refused(edge):
 
 def test_table_and_sorting_agree(monkeypatch):
     points = np.random.default_rng(2).uniform(-5, 5, (3000, 3)).astype(np.float32)
-    base, cells, counts, sums = kernel.occupied(points, np.zeros(3), 0.1)
+    base, cells, counts, sums = kernel.find_occupied_cells(points, np.zeros(3), 0.1)
     other_base, other_cells, other_counts, other_sums = kernel._split(points, np.zeros(3), 0.1)
     order, other = np.lexsort((cells + base).T), np.lexsort((other_cells + other_base).T)
     assert ((cells + base)[order] == (other_cells + other_base)[other]).all()
@@ -230,6 +230,6 @@ def test_groups_are_those_of_a_dense_raster(density: float):
     dense = RNG.random((14, 9, 11)) < density
     cells = np.argwhere(dense)
     labels, count = ndimage.label(dense, np.ones((3, 3, 3)))
-    group = grouped(cells * 7 + RNG.integers(0, 7, cells.shape) - 30 * 7, 7)
+    group = label_groups(cells * 7 + RNG.integers(0, 7, cells.shape) - 30 * 7, 7)
     assert group.max() + 1 == count
     assert len(set(zip(group.tolist(), labels[dense].tolist(), strict=True))) == count

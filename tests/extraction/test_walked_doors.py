@@ -10,7 +10,7 @@ import pytest
 
 from tests.extraction.elevations.doors import SHUT_DOOR, flush_door
 from tests.scenes import Scene, two_rooms
-from topomerge.extraction.attributes import SHUT_LATER_CHANCE, room_changes, rooms_under, with_walked_doors
+from topomerge.extraction.attributes import SHUT_LATER_CHANCE, add_walked_doors, find_room_changes, find_rooms_under
 from topomerge.extraction.extract import extract
 from topomerge.types import PointCloud, TopometricMap
 
@@ -38,14 +38,14 @@ THROUGH_WALLS = way((1, 4), (6, 4), (6, 0.3), (1, 0.3))
 
 
 def test_rooms_are_those_of_the_floor_below(map):
-    left, right, high, outside = rooms_under(map, np.array([(1, 2, 1.4), (6, 2, 1.4), (1, 2, 4.0), (20, 2, 1.4)]))
+    left, right, high, outside = find_rooms_under(map, np.array([(1, 2, 1.4), (6, 2, 1.4), (1, 2, 4.0), (20, 2, 1.4)]))
     assert left >= 0 and right >= 0 and left != right and high == outside == -1
 
 
 def test_a_way_through_the_door_proves_it(map):
-    (change,) = room_changes(map, THROUGH)
+    (change,) = find_room_changes(map, THROUGH)
     assert change[0] == (0, 1) and change[1][0] < 4.4 and change[2][0] > 3.6
-    proven, doubt = with_walked_doors(map, THROUGH)
+    proven, doubt = add_walked_doors(map, THROUGH)
     assert not doubt and proven.edges["confidence"].tolist() == [0.98] and len(proven.edges) == len(map.edges) == 1
     assert np.array_equal(proven.edges["centre"], map.edges["centre"])
 
@@ -53,12 +53,12 @@ def test_a_way_through_the_door_proves_it(map):
 def test_a_door_that_was_shut_later_is_one(map):
     shut = map.edges.copy()
     shut["open"], shut["confidence"] = False, 0.6
-    proven, doubt = with_walked_doors(replace(map, edges=shut), THROUGH)
+    proven, doubt = add_walked_doors(replace(map, edges=shut), THROUGH)
     assert not doubt and proven.edges["open"].all() and proven.edges["confidence"][0] == 0.98
 
 
 def test_a_door_that_nothing_shows_is_added(map):
-    proven, doubt = with_walked_doors(replace(map, edges=map.edges[:0]), THROUGH)
+    proven, doubt = add_walked_doors(replace(map, edges=map.edges[:0]), THROUGH)
     (door,) = proven.edges
     assert not doubt and door["rooms"].tolist() == [0, 1] and door["open"] and door["kind"] == "door"
     assert door["centre"][:2] == pytest.approx([4, 2], abs=0.4) and door["direction"] == pytest.approx(0, abs=0.01)
@@ -66,14 +66,14 @@ def test_a_door_that_nothing_shows_is_added(map):
 
 def test_a_door_whose_lintel_the_way_meets_once_is_open(map):
     high = THROUGH[::-1] + (0, 0, 0.75)
-    assert with_walked_doors(replace(map, edges=map.edges[:0]), high)[0].edges["open"].tolist() == [False]
-    proven, _ = with_walked_doors(replace(map, edges=map.edges[:0]), np.concatenate([THROUGH, high]))
+    assert add_walked_doors(replace(map, edges=map.edges[:0]), high)[0].edges["open"].tolist() == [False]
+    proven, _ = add_walked_doors(replace(map, edges=map.edges[:0]), np.concatenate([THROUGH, high]))
     assert proven.edges["open"].tolist() == [True]
 
 
 @pytest.mark.parametrize("back", [1, -1])
 def test_there_and_back_is_one_door(map, back):
-    proven, _ = with_walked_doors(replace(map, edges=map.edges[:0]), np.concatenate([THROUGH, THROUGH[::-1]])[::back])
+    proven, _ = add_walked_doors(replace(map, edges=map.edges[:0]), np.concatenate([THROUGH, THROUGH[::-1]])[::back])
     assert len(proven.edges) == 1
 
 
@@ -83,14 +83,14 @@ def test_there_and_back_is_one_door(map, back):
     ids=["in two places", "off the floors"],
 )
 def test_a_way_through_walls_is_of_another_building(map, places):
-    proven, doubt = with_walked_doors(map, places)
+    proven, doubt = add_walked_doors(map, places)
     assert proven is map and "through walls" in doubt
 
 
 @pytest.mark.parametrize("back", [False, True], ids=["there", "there and back"])
 def test_one_thin_place_that_a_way_leads_through_is_a_door_that_was_shut_later(map, back):
     places = way((1, 4), (6, 4))
-    proven, doubt = with_walked_doors(map, np.concatenate([places, places[::-1]]) if back else places)
+    proven, doubt = add_walked_doors(map, np.concatenate([places, places[::-1]]) if back else places)
     added = proven.edges[~proven.edges["open"]]
     assert not doubt and len(proven.edges) == 2 and added["rooms"].tolist() == [[0, 1]]
     assert added["centre"][0, :2] == pytest.approx([4, 4], abs=0.1) and added["width"] == [0.9] and added["kind"] == ["door"]
@@ -99,7 +99,7 @@ def test_one_thin_place_that_a_way_leads_through_is_a_door_that_was_shut_later(m
 
 def test_few_places_of_a_good_way_through_a_wall_are_one_door_only_if_they_are_one(map):
     good = np.concatenate([THROUGH, THROUGH[::-1]] * 4)
-    once, twice = (with_walked_doors(map, np.concatenate([good, more])) for more in (way((1, 2), (1, 4), (6, 4)), THROUGH_WALLS))
+    once, twice = (add_walked_doors(map, np.concatenate([good, more])) for more in (way((1, 2), (1, 4), (6, 4)), THROUGH_WALLS))
     assert not once[1] and once[0].edges["open"].tolist() == [True, False]
     assert not twice[1] and twice[0].edges["open"].tolist() == [True]
 
@@ -114,14 +114,14 @@ def test_what_is_thick_is_no_door(deep, doors):
     scene = Scene().shell(0, 0, 7, 5).wall((4, 0), (4, 5))
     scene.box(4.1, 1.5, 0, 4.1 + deep, 2.5, 2.2)
     map = by_its_plan(scene)
-    proven, doubt = with_walked_doors(map, way((1, 2), (6, 2)))
+    proven, doubt = add_walked_doors(map, way((1, 2), (6, 2)))
     assert len(map.rooms) == 2 and len(proven.edges) == doors and bool(doubt) == (not doors)
 
 
 @pytest.mark.parametrize(("y", "doors"), [(3.1, 1), (4.2, 2)], ids=["beside it", "away from it"])
 def test_a_way_through_the_wall_beside_a_door_drifted(y, doors):
     map = by_its_plan(two_rooms().wall((4, 2.7), (7, 2.7)))
-    proven, doubt = with_walked_doors(map, way((1, y), (6, y)))
+    proven, doubt = add_walked_doors(map, way((1, y), (6, y)))
     assert len(map.rooms) == 3 and len(map.edges) == 1 and len(proven.edges) == doors and bool(doubt) == (doors == 1)
 
 
@@ -137,7 +137,7 @@ def test_a_way_through_the_wall_beside_a_door_drifted(y, doors):
     ids=["none", "nan", "in one room", "elsewhere", "a jump"],
 )
 def test_what_changes_no_room_changes_nothing(map, places):
-    proven, doubt = with_walked_doors(map, places)
+    proven, doubt = add_walked_doors(map, places)
     assert proven is map and not doubt
 
 

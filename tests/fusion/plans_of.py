@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tests.scenes import HEIGHT, Scene
-from topomerge.extraction.cleaning import with_means
+from topomerge.extraction.cleaning import add_means
 from topomerge.types import Sim3, VoxelGrid
 
 MOVE = Sim3(2.1, (7.0, -3.0, 0.4))
@@ -44,7 +44,7 @@ def grid_of(points: np.ndarray, frame: Sim3 | None = None, edge: float = 0.1, me
     base = np.floor(points.min(axis=0) / edge).astype(np.int64)
     cells = np.floor(points / edge).astype(np.int64) - base
     grid = VoxelGrid.from_cells(cells, base * edge, edge)
-    return with_means(grid, points) if mean else grid
+    return add_means(grid, points) if mean else grid
 
 
 def off(found: Sim3, true: Sim3, at=(10.0, 7.0, 1.0)) -> tuple[float, float]:

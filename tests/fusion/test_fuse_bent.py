@@ -11,8 +11,8 @@ from scipy import ndimage
 import topomerge as tm
 from tests.fusion.atlas.atlas_scenes import office_map, truth
 from tests.types.test_deformation import deformation
-from topomerge.fusion.fuse import fuse, room_of_rooms, rooms_in_common
-from topomerge.fusion.resampling import resampled
+from topomerge.fusion.fuse import find_joined_rooms, fuse, match_common_rooms
+from topomerge.fusion.resampling import resample_cells
 from topomerge.types import Array, Deformation, Placement, Sim3, TopometricMap, VoxelGrid
 
 POSE = Sim3(0.4, (1.23, 4.56, 0.03))
@@ -45,11 +45,11 @@ def straight(halves) -> TopometricMap:
 def test_a_bent_floor_has_no_holes(seed):
     x, y = np.meshgrid(np.arange(180), np.arange(60), indexing="ij")
     floor = VoxelGrid.from_cells(np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3), edge=0.1)
-    cells, rows = resampled(floor, Placement(POSE, bent_by(seed)), np.array([-9.0, -9.0, 0.0]), 0.1)
+    cells, rows = resample_cells(floor, Placement(POSE, bent_by(seed)), np.array([-9.0, -9.0, 0.0]), 0.1)
     image = image_of(cells)
     assert np.array_equal(ndimage.binary_fill_holes(image), image) and np.ptp(cells[:, 2]) == 0
     assert ndimage.label(image)[1] == 1
-    laid = Placement(POSE, bent_by(seed)).transform_points(floor.centroids())
+    laid = Placement(POSE, bent_by(seed)).transform_points(floor.compute_centroids())
     away = np.linalg.norm((np.array([-9.0, -9.0, 0.0]) + (cells + 0.5) * 0.1 - laid[rows])[:, :2], axis=1)
     assert away.max() < 0.1
 
@@ -58,8 +58,8 @@ def test_a_bent_floor_has_no_holes(seed):
 def test_a_bent_wall_stays_whole(seed):
     x, z = np.meshgrid(np.arange(180), np.arange(25), indexing="ij")
     wall = VoxelGrid.from_cells(np.stack([x, 0 * x + 5, z], axis=-1).reshape(-1, 3), edge=0.1)
-    cells, _ = resampled(wall, Placement(POSE, bent_by(seed)), np.zeros(3), 0.1)
-    laid = Placement(POSE, bent_by(seed)).transform_points(wall.centroids())
+    cells, _ = resample_cells(wall, Placement(POSE, bent_by(seed)), np.zeros(3), 0.1)
+    laid = Placement(POSE, bent_by(seed)).transform_points(wall.compute_centroids())
     assert {tuple(c) for c in np.floor(laid / 0.1).astype(int).tolist()} <= {tuple(c) for c in cells.tolist()}  # none is lost
     assert ndimage.label(image_of(cells), np.ones((3, 3)))[1] == 1 and 0.7 * len(wall) < len(cells) < 1.4 * len(wall)
 
@@ -69,7 +69,7 @@ def test_a_wall_through_two_storeys_that_part_has_no_gap():
     moves[5:, 1] = 0.3  # the upper storey goes aside
     x, z = np.meshgrid(np.arange(100), np.arange(55), indexing="ij")
     wall = VoxelGrid.from_cells(np.stack([x, 0 * x + 5, z], axis=-1).reshape(-1, 3), edge=0.1)
-    cells, _ = resampled(wall, Placement(Sim3(), deformation(moves, storeys=2)), np.zeros(3), 0.1)
+    cells, _ = resample_cells(wall, Placement(Sim3(), deformation(moves, storeys=2)), np.zeros(3), 0.1)
     for low, high in pairwise(np.unique(cells[:, 2])):
         assert high == low + 1
         here, there = (np.unique(cells[cells[:, 2] == level, 1]) for level in (low, high))
@@ -97,18 +97,18 @@ def test_what_drift_bent_is_joined_as_if_it_were_straight(halves, straight):
     anchors = low[:2] + (high - low)[:2] * np.array([[0.1], [0.5], [0.9]])
     none = np.full((3, 3, 3), np.nan)
     drift = Deformation(anchors, np.zeros(3, int), east.storeys["floor"][:1], moves, none, np.full(3, -1, np.int32), 4.0)
-    cells, edge = resampled(east.grid, Placement(Sim3(), drift), low, east.grid.edge)[0], east.grid.edge
+    cells, edge = resample_cells(east.grid, Placement(Sim3(), drift), low, east.grid.edge)[0], east.grid.edge
     grid = VoxelGrid.from_cells(cells - cells.min(axis=0), low + cells.min(axis=0) * edge, edge)
     bent_east = tm.extract(grid, name="bent")
     back = _inverse(drift)
-    assert np.abs(back.apply(drift.apply(east.grid.centroids())) - east.grid.centroids()).max() < 0.03
+    assert np.abs(back.apply(drift.apply(east.grid.compute_centroids())) - east.grid.compute_centroids()).max() < 0.03
     joined = fuse((west, bent_east), [(0, Sim3()), (1, truth(0, 2))], {1: back})
     assert len(joined.rooms) == len(straight.rooms)
     assert np.allclose(sorted(joined.rooms["area"]), sorted(straight.rooms["area"]), atol=1.0)
-    of_east = room_of_rooms(bent_east, joined, truth(0, 2), back)
+    of_east = find_joined_rooms(bent_east, joined, truth(0, 2), back)
     assert (of_east >= 0).all()
-    rooms, shared = rooms_in_common(west, bent_east, truth(0, 2), (None, back))
-    both = room_of_rooms(west, joined, Sim3())
+    rooms, shared = match_common_rooms(west, bent_east, truth(0, 2), (None, back))
+    both = find_joined_rooms(west, joined, Sim3())
     assert len(rooms) and shared.max() > 0.9
     assert any(both[i] == of_east[j] for i, j in rooms.tolist())
 

@@ -9,11 +9,11 @@ import pytest
 
 from tests.scenes_map import building, same
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.solve import atlas
-from topomerge.fusion.inputs import check_different, check_pair, check_units, checked_threshold, loaded, pair_warnings
+from topomerge.fusion.atlas.solve import build_atlas
+from topomerge.fusion.inputs import check_different, check_pair, check_units, iter_pair_warnings, load_input, resolve_threshold
 from topomerge.fusion.pipeline import merge
 from topomerge.io.maps import save_map
-from topomerge.registration.verify import model
+from topomerge.registration.verify import load_model
 from topomerge.types import PointCloud, TopometricMap
 
 
@@ -69,7 +69,7 @@ def test_what_is_no_map_is_named():
         merge([building(1), PointCloud(np.zeros((1, 3)))])
 
 
-@pytest.mark.parametrize("function", [merge, atlas])
+@pytest.mark.parametrize("function", [merge, build_atlas])
 def test_what_is_no_list_of_maps_is_named(function):
     name = function.__name__
     for maps in (building(1), (building(k) for k in (1, 2)), "a.tmap"):
@@ -80,17 +80,17 @@ def test_what_is_no_list_of_maps_is_named(function):
 def test_maps_are_read_where_they_are_files(tmp_path):
     save_map(building(1), tmp_path / "a.tmap")
     for path in (tmp_path / "a.tmap", str(tmp_path / "a.tmap")):
-        assert same(loaded(path), building(1))
+        assert same(load_input(path), building(1))
 
 
 def test_storeys_twice_as_high_are_told_of_with_the_unit_in_mind():
     low, high = with_storeys(building(1), 2.5, 2.7, 9.0), with_storeys(building(2), 6.2)
     high = replace(high, source="hall.ply")
     said = "hall.ply: storeys are 6.2 m high, in building.ply 2.7 m: the units may differ"
-    assert list(pair_warnings(low, high, "fixed")) == list(pair_warnings(high, low, "fixed")) == [said]
-    assert not list(pair_warnings(low, high, "free"))
-    assert not list(pair_warnings(low, with_storeys(building(2), 5.8), "fixed"))
-    assert not list(pair_warnings(low, with_storeys(building(2), np.nan), "fixed"))
+    assert list(iter_pair_warnings(low, high, "fixed")) == list(iter_pair_warnings(high, low, "fixed")) == [said]
+    assert not list(iter_pair_warnings(low, high, "free"))
+    assert not list(iter_pair_warnings(low, with_storeys(building(2), 5.8), "fixed"))
+    assert not list(iter_pair_warnings(low, with_storeys(building(2), np.nan), "fixed"))
 
 
 def test_few_rooms_are_told_of():
@@ -102,11 +102,11 @@ def test_few_rooms_are_told_of():
         "building.ply: has one room: little can be compared",
         "the second map: has no rooms: only walls and empty space can be compared",
     ]
-    assert list(pair_warnings(one, none, "fixed")) == said
+    assert list(iter_pair_warnings(one, none, "fixed")) == said
 
 
 def test_a_threshold_is_a_probability():
-    assert checked_threshold(None) == model()["threshold"] and checked_threshold(0) == 0.0 and checked_threshold(1) == 1.0
+    assert resolve_threshold(None) == load_model()["threshold"] and resolve_threshold(0) == 0.0 and resolve_threshold(1) == 1.0
     for wrong in (-0.1, 1.01, float("nan")):
         with pytest.raises(InputError, match="between 0 and 1"):
-            checked_threshold(wrong)
+            resolve_threshold(wrong)

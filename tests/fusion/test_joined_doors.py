@@ -10,7 +10,7 @@ import pytest
 import topomerge as tm
 from tests.scenes import Scene
 from topomerge.fusion.fuse import fuse
-from topomerge.fusion.transfer import laid_part, with_doors
+from topomerge.fusion.transfer import add_part_doors, transform_part
 from topomerge.types import Placement, Sim3, TopometricMap
 
 MOVE = Sim3(0.6, (3.0, -2.0, 0.5))
@@ -61,20 +61,24 @@ def test_a_door_that_no_map_has_where_both_sides_were_seen_is_none(open_map):
     false["centre"] = (5.0, 4.5, 0.0)
     false["rooms"] = np.sort(open_map.edges["rooms"][np.abs(open_map.edges["centre"][:, 0] - 5) < 1][0])
     doubtful = replace(open_map, edges=np.concatenate([open_map.edges, false]))
-    checked = with_doors(doubtful, [laid_part(open_map, Placement(Sim3()))])
+    checked = add_part_doors(doubtful, [transform_part(open_map, Placement(Sim3()))])
     assert (checked.edges["centre"] == open_map.edges["centre"]).all() and len(checked.edges) == len(open_map.edges)
 
 
 def test_what_only_the_joined_map_shows_on_both_sides_may_be_a_door(open_map):
-    west = replace(open_map, navigable_room=np.where(open_map.navigable.centroids()[:, 0] < 5, open_map.navigable_room, -1))
+    west = replace(
+        open_map, navigable_room=np.where(open_map.navigable.compute_centroids()[:, 0] < 5, open_map.navigable_room, -1)
+    )
     west = replace(west, edges=west.edges[:0], navigable_area=None)
-    assert len(with_doors(open_map, [laid_part(west, Placement(Sim3()))]).edges) >= 1
+    assert len(add_part_doors(open_map, [transform_part(west, Placement(Sim3()))]).edges) >= 1
 
 
 def test_a_part_without_doors_and_one_without_rooms_change_nothing(open_map):
     bare = replace(open_map, edges=open_map.edges[:0])
     empty = replace(bare, navigable_room=np.full(len(bare.navigable), -1, np.int32), navigable_area=None)
-    assert len(with_doors(bare, [laid_part(bare, Placement(Sim3())), laid_part(empty, Placement(Sim3()))]).edges) == 0
+    assert (
+        len(add_part_doors(bare, [transform_part(bare, Placement(Sim3())), transform_part(empty, Placement(Sim3()))]).edges) == 0
+    )
 
 
 def test_a_door_lies_where_the_surest_part_saw_it(open_map):
@@ -86,10 +90,10 @@ def test_a_door_lies_where_the_surest_part_saw_it(open_map):
     moved = edges.copy()
     moved["centre"][:, 1] -= 0.4
     moved["confidence"] = 0.8
-    parts = [laid_part(replace(open_map, edges=e), Placement(Sim3())) for e in (first, second)]
+    parts = [transform_part(replace(open_map, edges=e), Placement(Sim3())) for e in (first, second)]
     for order in (parts, parts[::-1]):
-        out = with_doors(replace(open_map, edges=moved), order).edges
+        out = add_part_doors(replace(open_map, edges=moved), order).edges
         assert len(out) == len(edges) and np.allclose(out["centre"], edges["centre"])
         assert np.allclose(out["width"], 0.83) and np.allclose(out["confidence"], 0.95)
-    alone = with_doors(replace(open_map, edges=moved), parts[:1]).edges
+    alone = add_part_doors(replace(open_map, edges=moved), parts[:1]).edges
     assert np.allclose(alone["centre"], first["centre"]) and np.allclose(alone["confidence"], 0.8)

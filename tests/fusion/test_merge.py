@@ -17,11 +17,11 @@ from tests.fusion.plans_of import MOVE, off, office, part
 from tests.scenes import Scene, two_rooms
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.solve import solve
-from topomerge.fusion.fuse import room_of_rooms
-from topomerge.fusion.inputs import checked_threshold, risk_threshold
-from topomerge.fusion.result import MERGE_STEPS, MergeResult, merge_to_json
-from topomerge.matching.odds import match_probability
-from topomerge.types import Sim3, TopometricMap, mostly_unseen
+from topomerge.fusion.fuse import find_joined_rooms
+from topomerge.fusion.inputs import find_risk_threshold, resolve_threshold
+from topomerge.fusion.result import MERGE_STEPS, MergeResult, serialise_merge
+from topomerge.matching.consistency import compute_match_probability
+from topomerge.types import Sim3, TopometricMap, is_mostly_unseen
 
 
 def map_of(points: np.ndarray, name: str, frame: Sim3 | None = None) -> TopometricMap:
@@ -61,11 +61,11 @@ def refused(halves, stranger):
 
 def test_what_it_may_be_and_what_each_place_says_stand_in_the_listing(merged, refused):
     for result in (merged, refused):
-        listing = merge_to_json(result)
+        listing = serialise_merge(result)
         assert sum(listing["alternatives"].values()) == pytest.approx(1.0, abs=1e-4)
         assert listing["alternatives"]["here"] == pytest.approx(result.probability, abs=1e-5)
         assert listing["places"] and all(set(p) == {"at", "m2", "log_odds"} for p in listing["places"])
-    at = np.array([p["at"] for p in merge_to_json(merged)["places"]])
+    at = np.array([p["at"] for p in serialise_merge(merged)["places"]])
     assert (at[:, :2] > (-1, -1)).all() and (at[:, :2] < (25, 15)).all()  # in the frame of the first map
 
 
@@ -73,11 +73,11 @@ def test_what_it_may_be_and_what_each_place_says_stand_in_the_listing(merged, re
 def test_what_the_maps_are_of_raises_what_is_believed_and_a_risk_sets_the_threshold(halves, stranger, refused):
     each = [tm.merge([halves[0], stranger], same=same).probability for same in ("building", "storey")]
     assert refused.probability <= each[0] <= each[1]
-    assert 0.5 <= risk_threshold(1000) < checked_threshold(None) < risk_threshold(5) < 1
+    assert 0.5 <= find_risk_threshold(1000) < resolve_threshold(None) < find_risk_threshold(5) < 1
     with pytest.raises(InputError, match="same must be nothing, building, storey"):
         tm.merge(halves, same="house")
     with pytest.raises(InputError, match=r"risk 1e-05: the lowest measured risk"):
-        risk_threshold(1e-5)
+        find_risk_threshold(1e-5)
 
 
 def test_two_halves_are_merged(merged, halves):
@@ -137,21 +137,23 @@ def test_rooms_match_where_both_saw_them(merged, halves):
         if both_whole:
             assert np.linalg.norm(a.rooms["centroid"][i] - there) < 0.5
         assert 0 < match.probability <= merged.probability and match.maps == (0, 1)
-    within = room_of_rooms(a, merged.map, Sim3()), room_of_rooms(b, merged.map, merged.transforms[1])
+    within = find_joined_rooms(a, merged.map, Sim3()), find_joined_rooms(b, merged.map, merged.transforms[1])
     assert all(within[0][m.rooms[0]] == within[1][m.rooms[1]] for m in merged.matches)
 
 
 def test_whole_rooms_are_surer_than_scraps(halves):
     a = halves[0]
-    whole, scrap = (int(pick(np.where(mostly_unseen(a.rooms), np.nan, a.rooms["area"]))) for pick in (np.nanargmax, np.nanargmin))
+    whole, scrap = (
+        int(pick(np.where(is_mostly_unseen(a.rooms), np.nan, a.rooms["area"]))) for pick in (np.nanargmax, np.nanargmin)
+    )
     tiny = replace(a, rooms=a.rooms.copy())
     tiny.rooms["area"][scrap] = 0.6
-    assert match_probability(tiny, tiny, np.array([[scrap, scrap]]), np.ones(1))[0] < 0.75
+    assert compute_match_probability(tiny, tiny, np.array([[scrap, scrap]]), np.ones(1))[0] < 0.75
     rooms = np.array([[whole, whole]])
-    one, half = match_probability(a, a, rooms, np.ones(1)), match_probability(a, a, rooms, np.full(1, 0.2))
-    pieces = match_probability(a, a, np.array([[whole, whole], [whole, whole + 1]]), np.ones(2))
+    one, half = compute_match_probability(a, a, rooms, np.ones(1)), compute_match_probability(a, a, rooms, np.full(1, 0.2))
+    pieces = compute_match_probability(a, a, np.array([[whole, whole], [whole, whole + 1]]), np.ones(2))
     assert one[0] > 0.85 and half[0] < one[0] and pieces[0] < one[0] - 0.01
-    assert match_probability(a, a, np.zeros((0, 2), int), np.zeros(0)).shape == (0,)
+    assert compute_match_probability(a, a, np.zeros((0, 2), int), np.zeros(0)).shape == (0,)
 
 
 def test_unrelated_maps_are_refused(refused):
@@ -176,15 +178,15 @@ def test_a_threshold_is_kept_to(halves, merged):
 
 @pytest.mark.longer
 def test_cells_of_maps_that_were_joined_before_are_theirs(merged, halves):
-    from topomerge.viz.merge_report import _seen
+    from topomerge.viz.merge_report import _compute_observers
 
     again = tm.merge([merged.map, halves[1]])
-    seen = _seen(again)
+    seen = _compute_observers(again)
     assert np.array_equal(seen == 1, (again.map.provenance & 0b100) == 0) and np.bincount(seen)[3] > 1000
 
 
 def test_json_has_the_schema(merged, refused):
-    listing = merge_to_json(merged)
+    listing = serialise_merge(merged)
     assert list(listing)[:5] == ["format", "status", "probability", "reason", "descriptor"]
     assert list(listing)[5:] == [
         "maps",
@@ -207,7 +209,7 @@ def test_json_has_the_schema(merged, refused):
     assert np.allclose((np.array(entry["matrix"]) @ point)[:3], merged.transforms[1].apply(point[None, :3])[0])
     assert all(set(m) == {"maps", "rooms", "probability"} and m["maps"] == [0, 1] for m in listing["matches"])
     assert set(listing["seconds"]) == set(MERGE_STEPS)
-    assert merge_to_json(refused)["transforms"] == {} and merge_to_json(refused)["matches"] == []
+    assert serialise_merge(refused)["transforms"] == {} and serialise_merge(refused)["matches"] == []
     json.dumps(listing, allow_nan=False)
 
 
@@ -218,7 +220,7 @@ def test_save_writes_all_and_a_refusal_takes_back_the_rest(merged, refused, tmp_
     assert sorted(p.name for p in folder.iterdir()) == ["map.tmap", "merge.json", "merged.ply", "report.html"]
     back = tm.load_map(folder / "map.tmap")
     assert np.array_equal(back.provenance, merged.map.provenance) and len(back.rooms) == len(merged.map.rooms)
-    assert json.loads((folder / "merge.json").read_text()) == merge_to_json(merged)
+    assert json.loads((folder / "merge.json").read_text()) == serialise_merge(merged)
     (folder / "notes.txt").write_text("mine")
     refused.save(folder)
     assert sorted(p.name for p in folder.iterdir()) == ["merge.json", "notes.txt", "report.html"]
@@ -241,9 +243,9 @@ def test_saving_leaves_nothing_half_written(merged, tmp_path, monkeypatch):
 
 @pytest.mark.longer
 def test_the_report_says_it_all(merged, refused):
-    from topomerge.viz.merge_report import merge_html
+    from topomerge.viz.merge_report import render_merge_html
 
-    text = merge_html(merged)
+    text = render_merge_html(merged)
     for words in (
         "Merged · probability",
         "matching walls",
@@ -253,8 +255,8 @@ def test_the_report_says_it_all(merged, refused):
         'data-room="b0"',
     ):
         assert words in text
-    assert merge_html(merged) == text and "http" not in text.replace("http-equiv", "")
-    no = merge_html(refused)
+    assert render_merge_html(merged) == text and "http" not in text.replace("http-equiv", "")
+    no = render_merge_html(refused)
     assert "Not merged" in no and "Why it is not believed" in no and "data-scene=" not in no
 
 
@@ -299,7 +301,7 @@ def test_three_maps_are_merged_by_an_atlas(tmp_path, remembered):
     result = tm.merge([office_map(0), office_map(1), office_map(2)])
     assert result.merged and result.probability > 0.9 and set(result.transforms) == {1, 2}
     assert {m.maps for m in result.matches} == {(0, 1), (0, 2), (1, 2)}
-    listing = merge_to_json(result)
+    listing = serialise_merge(result)
     assert list(listing["transforms"]) == ["1", "2"] and listing["transforms"]["2"]["into"] == 0
     assert listing["transforms"]["2"]["rmse_m"] < 0.05
     json.dumps(listing, allow_nan=False)

@@ -15,12 +15,12 @@ from topomerge.registration.pipeline import register
 @pytest.mark.slow  # of simulated maps: test_registration
 @pytest.mark.data
 @pytest.mark.parametrize("wanted", ["carmen/orebro-first-last", "utexas/gdc1-1s"])
-def test_a_stated_storey_never_lowers_a_right_pose_of_real_maps(data_dir: Path, wanted: str) -> None:
-    source, name = wanted.split("/")
-    pair = dict(sources.pair_makers(source, data_dir))[name]()
+def test_a_stated_storey_never_lowers_a_right_pose_of_real_maps(data_dir: Path, requested: str) -> None:
+    source, name = requested.split("/")
+    pair = dict(sources.iter_pair_makers(source, data_dir))[name]()
     a, b = extract(pair.a), extract(pair.b)
     each = [register(a, b, same=same) for same in ("nothing", "building", "storey")]
-    middle = b.grid.centroids().mean(axis=0)[None]
+    middle = b.grid.compute_centroids().mean(axis=0)[None]
     error = (each[0].transform.apply(middle) - pair.truth.apply(middle))[0, :2]
     assert np.linalg.norm(error) < 1.0 and each[0].transform == each[1].transform == each[2].transform
     believed = [found.probability for found in each]
@@ -33,7 +33,7 @@ def test_a_stated_storey_never_lowers_a_right_pose_of_real_maps(data_dir: Path, 
 def test_a_drawing_whose_scale_is_not_that_of_the_map_is_not_believed(data_dir: Path) -> None:
     """It is larger by a fifth. Walls of two captures met it well in a wrong place, and the next best place was not looked at: the
     hundred best of the correlation did not hold it."""
-    pairs = dict(office_floor.pairs(data_dir / "halmstad_office_f5"))
+    pairs = dict(office_floor.iter_pairs(data_dir / "halmstad_office_f5"))
     for name in ("F5_01-F5_layout", "F5_04-F5_layout"):
         pair = pairs[name]()
         registration = register(*(extract(cloud) for cloud in (pair.a, pair.b)))

@@ -11,10 +11,10 @@ import pytest
 from tests.scenes_map import building
 from tests.types.test_deformation import deformation, points
 from topomerge.errors import InputError
-from topomerge.fusion.result import BEND_PARAMETER, MergeResult, bends_of, merge_to_json, room_moves
+from topomerge.fusion.result import BEND_PARAMETER, MergeResult, fit_room_moves, read_bends, serialise_merge
 from topomerge.io.maps import load_map, save_map
 from topomerge.types import Deformation, Placement, Sim3
-from topomerge.viz.report import report_html
+from topomerge.viz.report import render_report_html
 
 POSE = Sim3(0.7, (480_000.0, 5_400_000.0, 12.0))  # into a national grid
 MOVES = np.random.default_rng(4).normal(0, (0.2, 0.2, 0.01, 0.0), (6, 4))
@@ -30,7 +30,7 @@ def test_a_map_that_was_bent_and_saved_is_read_again(tmp_path) -> None:
     result = merged(deformation(MOVES, storeys=2))
     save_map(result.map, tmp_path / "map.tmap")
     joined = load_map(tmp_path / "map.tmap")
-    ((number, read),) = bends_of(joined).items()
+    ((number, read),) = read_bends(joined).items()
     assert (number, joined.parameters[BEND_PARAMETER][0]["source"]) == (1, "b.ply")
     p = points(high=5.5)
     there = result.placements[1].transform_points(p)
@@ -42,8 +42,8 @@ def test_a_map_that_was_bent_and_saved_is_read_again(tmp_path) -> None:
 def test_rigid_maps_leave_no_trace() -> None:
     for bend in (None, deformation(np.zeros((0, 4)))):
         result = merged(bend)
-        assert BEND_PARAMETER not in result.map.parameters and bends_of(result.map) == {}
-        assert merge_to_json(result)["bend"] == {} and result.placements[1].bend is None
+        assert BEND_PARAMETER not in result.map.parameters and read_bends(result.map) == {}
+        assert serialise_merge(result)["bend"] == {} and result.placements[1].bend is None
     assert np.allclose(result.placements[1].transform_points(points()), POSE.apply(points()))
     assert set(result.placements) == {0, 1} and MergeResult("abstained", 0.1, "").placements == {}
 
@@ -60,7 +60,7 @@ def test_each_room_has_a_transform_of_its_own() -> None:
     nan[1] = np.diag([0.04, 0.01, 1e-4])
     bend = Deformation(anchors, np.zeros(n, int), np.zeros(1), moves, nan, np.arange(n, dtype=np.int32), 2.0)
     result = merged(bend)
-    listing = json.loads(json.dumps(merge_to_json(result), allow_nan=False))["bend"]["1"]
+    listing = json.loads(json.dumps(serialise_merge(result), allow_nan=False))["bend"]["1"]
     assert len(listing["pieces"]) == n and listing["reach_m"] == 2.0
     rooms = result.maps[1].rooms
     assert [entry["room"] for entry in listing["rooms"]] == list(range(len(rooms)))
@@ -81,7 +81,7 @@ def test_each_room_has_a_transform_of_its_own() -> None:
 def test_a_room_without_a_floor_moves_with_its_middle() -> None:
     b = building(2, 1)
     bare = replace(b, navigable_room=np.where(b.navigable_room == 1, -1, b.navigable_room))
-    moves = room_moves(bare, deformation(np.tile([0.3, -0.2, 0.0, 0.0], (5, 1))))
+    moves = fit_room_moves(bare, deformation(np.tile([0.3, -0.2, 0.0, 0.0], (5, 1))))
     assert np.allclose(moves.shift, [0.3, -0.2]) and np.allclose(moves.turn, 0.0, atol=1e-9)
 
 
@@ -105,13 +105,13 @@ def test_damaged_bending_is_told_in_one_line(tmp_path, damaged) -> None:
     (entry,) = joined.parameters[BEND_PARAMETER]
     odd = replace(joined, parameters={BEND_PARAMETER: damaged(entry)})
     with pytest.raises(InputError, match="damaged bending") as caught:
-        bends_of(odd)
+        read_bends(odd)
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 300
-    assert "Parameters" in report_html(odd)
+    assert "Parameters" in render_report_html(odd)
 
 
 def test_the_report_of_a_joined_map_does_not_list_all_pieces() -> None:
-    assert "of 1 of its maps" in report_html(merged(deformation(MOVES, storeys=2)).map)
+    assert "of 1 of its maps" in render_report_html(merged(deformation(MOVES, storeys=2)).map)
 
 
 def test_a_placement_without_bending_is_its_pose() -> None:

@@ -51,11 +51,11 @@ def read_cloud(path: Path) -> int:
 
 def read_las(path: Path) -> int:
     """Read points, and write them elsewhere with all else that the file says of them."""
-    from topomerge.io.moved_points import save_moved
+    from topomerge.io.transformed_points import save_transformed_points
 
     found = read_cloud(path)
     with tempfile.TemporaryDirectory() as folder:
-        save_moved(path, Path(folder) / f"moved{path.suffix}", lambda points: points, np.zeros(3))
+        save_transformed_points(path, Path(folder) / f"moved{path.suffix}", lambda points: points, np.zeros(3))
     return found
 
 
@@ -69,14 +69,14 @@ def read_bag(path: Path) -> int:
 
 def read_map(path: Path) -> int:
     """Read a map, what `topomerge info` prints of it, and how the maps that it was joined of were bent."""
-    from topomerge.fusion.result import bends_of
-    from topomerge.io.listing import json_text, map_to_json, map_to_text
+    from topomerge.fusion.result import read_bends
+    from topomerge.io.listing import convert_map_to_json, format_json, format_map
     from topomerge.io.maps import load_map
 
     found = load_map(path)
-    map_to_text(found)
-    json_text(map_to_json(found))
-    bends_of(found)
+    format_map(found)
+    format_json(convert_map_to_json(found))
+    read_bends(found)
     return len(found.rooms)
 
 
@@ -141,7 +141,7 @@ def write_corpus(folder: Path) -> dict[str, Path]:
     from PIL import Image
 
     from tests.types.test_deformation import deformation
-    from topomerge.fusion.result import with_bends
+    from topomerge.fusion.result import add_bends
     from topomerge.io.maps import save_map
     from topomerge.types import Placement, Sim3
 
@@ -156,7 +156,7 @@ def write_corpus(folder: Path) -> dict[str, Path]:
     found["text.pgm"].write_text("P2\n8 6\n255\n" + " ".join(str(v) for v in np.tile([0, 205, 254], 16)) + "\n")
     found["map.tmap"] = folder / "map.tmap"
     turn = deformation(np.tile([0.1, 0.0, 0.01, 0.0], (4, 1)))
-    save_map(with_bends(building(2, 2), {1: Placement(Sim3(0.3), turn)}, ["a.ply", "b.ply"]), found["map.tmap"])
+    save_map(add_bends(building(2, 2), {1: Placement(Sim3(0.3), turn)}, ["a.ply", "b.ply"]), found["map.tmap"])
     found["plain.npz"] = folder / "plain.npz"
     np.savez(found["plain.npz"], points=samples.box_points(50), poses=np.eye(4)[None], pose_of=np.zeros(50, np.int32))
     found["pairs.yaml"] = folder / "pairs.yaml"
@@ -204,7 +204,7 @@ def write_plans(folder: Path) -> dict[str, Path]:
 
 def write_embedder(folder: Path) -> dict[str, Path]:
     """The embedder that ships, and its card."""
-    from topomerge.embedding.weights import find_embedder
+    from topomerge.embedding.learned import find_embedder
     from topomerge.networks.network import card_of
 
     return {path.name: Path(shutil.copy(path, folder)) for path in (find_embedder(), card_of(find_embedder()))}

@@ -162,7 +162,7 @@ def in_zip(data: bytes, rng: Rng) -> bytes:
 
 def in_pages(data: bytes, rng: Rng) -> bytes:
     """Damage within the pages of an E57 file, their checksums made to fit."""
-    from topomerge.kernels.codecs import crc32c
+    from topomerge.kernels.codecs import compute_crc32c
 
     if len(data) < 1024:
         return general(data, rng)
@@ -174,7 +174,7 @@ def in_pages(data: bytes, rng: Rng) -> bytes:
     body = body[:start] + way(body[start:], rng)
     body = body[: len(body) // 1020 * 1020 if rng.random() < 0.2 else pages.shape[0] * 1020].ljust(pages.shape[0] * 1020, b"\0")
     table = np.frombuffer(body, np.uint8).reshape(-1, 1020)
-    sums = crc32c(np.ascontiguousarray(table)).astype(">u4")[:, None].view(np.uint8)
+    sums = compute_crc32c(np.ascontiguousarray(table)).astype(">u4")[:, None].view(np.uint8)
     return np.hstack([table, sums]).tobytes()
 
 

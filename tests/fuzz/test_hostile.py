@@ -191,7 +191,7 @@ def test_yaml_that_would_be_endless(worker: Worker, tmp_path: Path) -> None:
 
 def relaid(data: bytes, change: list[tuple[str, str]]) -> bytes:
     """An E57 file with another XML part (regular expressions and what replaces them), its lengths and checksums made to fit."""
-    from topomerge.kernels.codecs import crc32c
+    from topomerge.kernels.codecs import compute_crc32c
 
     body = bytearray(np.frombuffer(data, np.uint8).reshape(-1, 1024)[:, :1020].tobytes())
     at = bytes(body).find(b"<?xml")
@@ -204,7 +204,7 @@ def relaid(data: bytes, change: list[tuple[str, str]]) -> bytes:
     body += b"\0" * (-len(body) % 1020)
     body[16:24], body[32:40] = struct.pack("<Q", len(body) // 1020 * 1024), struct.pack("<Q", len(xml))
     pages = np.frombuffer(bytes(body), np.uint8).reshape(-1, 1020)
-    return np.hstack([pages, crc32c(np.ascontiguousarray(pages)).astype(">u4")[:, None].view(np.uint8)]).tobytes()
+    return np.hstack([pages, compute_crc32c(np.ascontiguousarray(pages)).astype(">u4")[:, None].view(np.uint8)]).tobytes()
 
 
 def test_e57_with_points_that_take_no_bytes(worker: Worker, tmp_path: Path) -> None:

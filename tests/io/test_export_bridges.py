@@ -15,7 +15,7 @@ from PIL import Image
 import topomerge as tm
 from tests.scenes_map import building
 from topomerge.errors import InputError
-from topomerge.io.exports.tf2 import FramePose, frame_poses
+from topomerge.io.exports.tf2 import FramePose, read_frame_poses
 from topomerge.types import Sim3, TopometricMap
 
 
@@ -39,7 +39,7 @@ def test_markers_are_the_rooms_and_doors(tmp_path: Path) -> None:
     assert {m.header.frame_id for listed in topics.values() for m in listed} == {"map"}
     for r, marker in enumerate(rooms):
         points = np.array([(p.x, p.y, p.z) for p in marker.points])
-        assert np.array_equal(points, map.navigable.centroids()[map.navigable_room == r])
+        assert np.array_equal(points, map.navigable.compute_centroids()[map.navigable_room == r])
         assert marker.type == marker.CUBE_LIST and marker.scale.x == map.navigable.edge and marker.color.a > 0
     for marker, edge in zip(topics["/topomerge/doors"], map.edges, strict=True):
         a, b = (np.array((p.x, p.y)) for p in marker.points)
@@ -80,7 +80,7 @@ def test_robots_are_kept_out_of_what_is_outside(tmp_path: Path) -> None:
     image = np.array(Image.open(files["storey_0_keepout.pgm"]))
     assert set(np.unique(image)) == {0, 254}
     low, size = np.array(about["origin"][:2]), about["resolution"]
-    i, j = np.floor((map.navigable.centroids()[:, :2] - low) / size).astype(int).T
+    i, j = np.floor((map.navigable.compute_centroids()[:, :2] - low) / size).astype(int).T
     value = image[len(image) - 1 - j, i]
     assert (value[map.navigable_room == 1] == 0).all() and (value[map.navigable_room != 1] == 254).all()
 
@@ -112,7 +112,7 @@ def published(path: Path) -> list[dict[str, str]]:
 
 
 def test_frames_are_where_the_merge_laid_them(tmp_path: Path) -> None:
-    transforms = frame_poses(merged(tmp_path / "merged", listing()))
+    transforms = read_frame_poses(merged(tmp_path / "merged", listing()))
     (path,) = tm.save_export(building(2, 1), "tf2", tmp_path / "a.launch.xml", transforms=transforms)
     (said,) = published(path)
     assert (said["frame-id"], said["child-frame-id"]) == ("robot_1", "b")
@@ -126,28 +126,30 @@ def test_frames_are_where_the_merge_laid_them(tmp_path: Path) -> None:
 
 def test_names_of_frames(tmp_path: Path) -> None:
     folder = merged(tmp_path / "merged", listing())
-    assert [(t.parent, t.child) for t in frame_poses(folder, ["robot_1/map", "robot_2/map"])] == [("robot_1/map", "robot_2/map")]
+    assert [(t.parent, t.child) for t in read_frame_poses(folder, ["robot_1/map", "robot_2/map"])] == [
+        ("robot_1/map", "robot_2/map")
+    ]
     same = merged(tmp_path / "same", listing(maps=[{"source": "one/a.ply"}, {"source": "two/a.ply"}]))
-    assert [(t.parent, t.child) for t in frame_poses(same)] == [("map_0", "map_1")]
+    assert [(t.parent, t.child) for t in read_frame_poses(same)] == [("map_0", "map_1")]
     for names, words in (
         (["a"], "1 names, but there are 2 maps"),
         (["a", "b c"], "no name of a frame"),
         (["a", "a"], "one name"),
     ):
         with pytest.raises(InputError, match=words):
-            frame_poses(folder, names)
+            read_frame_poses(folder, names)
 
 
 @pytest.mark.parametrize("about", [{}, [], {"maps": 3}, listing(transforms={"1": {"into": 7}}), listing(transforms={"x": {}})])
 def test_a_damaged_listing_is_refused(tmp_path: Path, about: object) -> None:
     folder = merged(tmp_path / "merged", about)
     with pytest.raises(InputError, match=r"merge\.json: damaged"):
-        frame_poses(folder)
+        read_frame_poses(folder)
 
 
 def test_what_has_no_transform_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is no folder of a merge or an atlas"):
-        frame_poses(tmp_path)
+        read_frame_poses(tmp_path)
     with pytest.raises(InputError, match="needs to know where maps lie"):
         tm.save_export(building(2, 1), "tf2", tmp_path / "a.xml")
     larger = [FramePose("a", "b", Sim3(0.0, (0.0, 0.0, 0.0), 1.25))]

@@ -17,8 +17,8 @@ from tests.io.test_export_plans import geojson, with_areas, write
 from tests.scenes_map import same
 from topomerge.errors import InputError
 from topomerge.io.exports import FORMATS
-from topomerge.structure.plan_structure import plan_structure
-from topomerge.types import ROOM_ODDS, confident
+from topomerge.structure.plan_structure import build_plan_structure
+from topomerge.types import ROOM_ODDS, filter_confident
 
 
 def described(root: xml.Element, kind: str) -> dict[str, dict[str, str]]:
@@ -32,7 +32,7 @@ def described(root: xml.Element, kind: str) -> dict[str, dict[str, str]]:
 
 def test_doubtful_rooms_take_their_doors_along() -> None:
     map = doubted()
-    sure = confident(map, 0.7)
+    sure = filter_confident(map, 0.7)
     assert sure.rooms["confidence"].tolist() == [0.9, 0.8, 0.7, 0.95], "what is as likely as asked for stays"
     assert np.array_equal(sure.rooms, map.rooms[[0, 2, 3, 4]])
     assert len(sure.edges) == 0, "rooms 1 and 5 took three of them along, one is doubtful itself"
@@ -44,7 +44,7 @@ def test_doubtful_rooms_take_their_doors_along() -> None:
 
 def test_doors_have_the_new_numbers_of_their_rooms() -> None:
     map = doubted()
-    sure = confident(map, 0.5)
+    sure = filter_confident(map, 0.5)
     assert sure.edges["rooms"].tolist() == [[2, 4], [3, 4], [1, 4]]
     assert sure.edges["centre"].tolist() == map.edges["centre"][2:].tolist()
     assert map.edges["rooms"].tolist()[2:] == [[3, 5], [4, 5], [2, 5]], "the map itself stays"
@@ -54,7 +54,7 @@ def test_a_window_between_two_rooms_stays_with_the_likely_one() -> None:
     map = doubted()
     rooms, windows = map.rooms.copy(), map.windows.copy()
     rooms["confidence"], windows["confidence"] = [0.1, 1, 1, 1, 1, 1], 1.0
-    sure = confident(replace(map, rooms=rooms, windows=windows), 0.5)
+    sure = filter_confident(replace(map, rooms=rooms, windows=windows), 0.5)
     assert sure.windows["rooms"].tolist() == [[1, -1]] and sure.windows["width"].tolist() == [0.6]
 
 
@@ -62,31 +62,31 @@ def test_areas_and_narrowings_go_with_their_room() -> None:
     map = with_areas()
     rooms = map.rooms.copy()
     rooms["confidence"] = [0.1, 1, 1, 1, 1, 1]
-    sure = confident(replace(map, rooms=rooms), 0.5)
+    sure = filter_confident(replace(map, rooms=rooms), 0.5)
     assert sure.areas["room"].tolist() == [0, 1, 2, 3, 4, 4] and sure.narrows["rooms"].tolist() == [[4, 5]]
     rooms["confidence"] = [1, 1, 1, 1, 1, 0.1]
-    sure = confident(replace(map, rooms=rooms), 0.5)
+    sure = filter_confident(replace(map, rooms=rooms), 0.5)
     assert sure.areas["room"].tolist() == [0, 1, 2, 3, 4] and len(sure.narrows) == 0
 
 
 @pytest.mark.parametrize("least", [0.5, 0.7, 1.0])
 def test_what_is_left_is_a_map(tmp_path: Path, least: float) -> None:
-    sure = confident(doubted(), least)
+    sure = filter_confident(doubted(), least)
     topomerge.save_map(sure, tmp_path / "a.tmap")
     again = topomerge.load_map(tmp_path / "a.tmap")
     assert same(again, sure) and again.windows.tobytes() == sure.windows.tobytes()
-    assert same(confident(again, least), again), "all that is left is likely enough"
+    assert same(filter_confident(again, least), again), "all that is left is likely enough"
 
 
 @pytest.mark.parametrize("name", ["geojson", "graphml", "indoorgml", "dsg"])
 def test_zero_keeps_every_byte(tmp_path: Path, name: str) -> None:
     map = doubted()
-    assert confident(map, 0) is map and len(confident(nothing(), 0.5).rooms) == 0
+    assert filter_confident(map, 0) is map and len(filter_confident(nothing(), 0.5).rooms) == 0
     (path,) = topomerge.save_export(map, name, tmp_path / "a", min_confidence=0)
     whole = path.read_bytes()
     assert whole == write(map, name, tmp_path / "b").read_bytes()
     (path,) = topomerge.save_export(map, name, tmp_path / "a", min_confidence=0.5)
-    assert path.read_bytes() == write(confident(map, 0.5), name, tmp_path / "b").read_bytes() != whole
+    assert path.read_bytes() == write(filter_confident(map, 0.5), name, tmp_path / "b").read_bytes() != whole
 
 
 @pytest.mark.parametrize("wrong", [-0.1, 1.1, float("nan"), float("inf")])
@@ -155,7 +155,7 @@ def test_windows_of_indoorgml(tmp_path: Path) -> None:
     root = xml.parse(write(map, "indoorgml", tmp_path / "a.gml")).getroot()
     panes = {b.get(GML + "id"): b for b in root.iter(CORE + "CellSpaceBoundary") if b.get(GML + "id", "")[0] == "P"}
     assert list(panes) == ["P0", "P1", "P2"] and all(pane.find(CORE + "duality") is None for pane in panes.values())
-    for pane, window, seen in zip(panes.values(), plan_structure(map).windows, map.windows, strict=True):
+    for pane, window, seen in zip(panes.values(), build_plan_structure(map).windows, map.windows, strict=True):
         low, high = positions(pane).min(axis=0), positions(pane).max(axis=0)
         assert high[2] - low[2] == pytest.approx(window["head"] - window["sill"], abs=1e-3)
         assert low[2] == pytest.approx(seen["centre"][2] + window["sill"], abs=1e-3)
@@ -170,4 +170,6 @@ def test_windows_of_geojson_lie_in_their_walls(tmp_path: Path) -> None:
     map = doubted()
     features = json.loads(write(map, "geojson", tmp_path / "a.geojson").read_text())["features"]
     panes = [f["properties"] for f in features if f["properties"].get("of") == "window"]
-    assert [pane["window"] for pane in panes] == np.flatnonzero(plan_structure(map).windows["wall"] >= 0).tolist() == [0, 1, 2]
+    assert (
+        [pane["window"] for pane in panes] == np.flatnonzero(build_plan_structure(map).windows["wall"] >= 0).tolist() == [0, 1, 2]
+    )

@@ -18,7 +18,7 @@ from tests.io.export_maps import AT, GRID, doubted, flat, nothing, rectangles, s
 from tests.io.indoorgml_structure import CORE, GML, check, is_closed, positions, volume
 from tests.io.test_export_plans import with_areas, write
 from tests.scenes import HEIGHT, THICK, corridor, two_rooms
-from topomerge.structure.plan_structure import plan_structure
+from topomerge.structure.plan_structure import build_plan_structure
 from topomerge.types import TopometricMap
 
 
@@ -157,7 +157,7 @@ def test_ifc_doors_fill_openings_that_void_walls(tmp_path):
     element = importlib.import_module("ifcopenshell.util.element")
     map = topomerge.extract(two_rooms().points())
     model = ifcopenshell.open(str(write(map, "ifc", tmp_path / "a.ifc")))
-    walls = plan_structure(map).walls
+    walls = build_plan_structure(map).walls
     assert len(model.by_type("IfcWall")) == len(walls) == 7
     (voids,), (fills,) = model.by_type("IfcRelVoidsElement"), model.by_type("IfcRelFillsElement")
     assert voids.RelatedOpeningElement == fills.RelatingOpeningElement and fills.RelatedBuildingElement.is_a("IfcDoor")
@@ -184,7 +184,7 @@ def test_indoorgml_walls_are_cells_that_share_the_faces_of_rooms(tmp_path):
     assert len(cells) == len(walls) + 2 and all(cell.find(CORE + "duality") is None for cell in walls.values())
     assert all(is_closed(solid) and volume(solid) > 0 for solid in root.iter(GML + "Solid"))
     plans = {name: shapely.MultiPoint(positions(cell)[:, :2]).convex_hull for name, cell in cells.items()}
-    carrier = next(k for k, wall in enumerate(plan_structure(map).walls) if wall["faces"] == 2)
+    carrier = next(k for k, wall in enumerate(build_plan_structure(map).walls) if wall["faces"] == 2)
     parts = [plans[name] for name in walls if name.split("-")[0] == f"W{carrier}"]
     assert len(parts) == 3, "beside the door, and over it"
     for name in ("C0", "C1"):

@@ -16,7 +16,7 @@ from tests.io.export_maps import AT, GRID, nothing, rectangles, two_floors, with
 from tests.scenes import THICK, two_rooms
 from tests.scenes_map import building
 from topomerge.errors import InputError
-from topomerge.io.exports import FORMATS, formats, outputs
+from topomerge.io.exports import FORMATS, parse_formats, prepare_outputs
 from topomerge.io.exports.geojson import Origin, parse_origin
 from topomerge.io.points import read_points
 from topomerge.types import AREA_DTYPE, TopometricMap
@@ -25,7 +25,7 @@ STRUCTURE = ("wall", "wall_opening")
 
 
 def write(map: TopometricMap, name: str, path: Path, **options) -> Path:
-    ((place, save),) = outputs(map, name, path, False, **options)
+    ((place, save),) = prepare_outputs(map, name, path, False, **options)
     assert place == path
     save(path)
     return path
@@ -200,7 +200,7 @@ def test_clouds_read_back(tmp_path, suffix, at):
     map = building(1, 1, at)
     path = write(map, suffix.replace("laz", "las"), tmp_path / f"a.{suffix}")
     cloud = read_points(path)
-    assert cloud.points + cloud.shift == pytest.approx(map.grid.centroids(), abs=0.0011)
+    assert cloud.points + cloud.shift == pytest.approx(map.grid.compute_centroids(), abs=0.0011)
     assert cloud.colors is not None and len(np.unique(cloud.colors[map.room == 1], axis=0)) == 1
 
 
@@ -208,15 +208,15 @@ def test_rooms_in_las(tmp_path):
     laspy = pytest.importorskip("laspy")
     map = two_floors()
     las = laspy.read(write(map, "las", tmp_path / "a.las"))
-    assert np.array_equal(las.room, map.room) and np.array_equal(las.storey, map.storey_of_cells())
+    assert np.array_equal(las.room, map.room) and np.array_equal(las.storey, map.find_cell_storeys())
     assert str(las.header.version) == "1.4"
 
 
 def test_unknown_formats():
-    assert formats(" GeoJSON,ros ") == ["geojson", "ros"]
+    assert parse_formats(" GeoJSON,ros ") == ["geojson", "ros"]
     for wrong, said in (("shp", "graphml, geojson"), ("", "names no format"), ("ply,ply", "twice"), (",", "names no format")):
         with pytest.raises(InputError, match=said):
-            formats(wrong)
+            parse_formats(wrong)
 
 
 def test_a_missing_package_is_named(tmp_path, monkeypatch):
@@ -224,7 +224,7 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch):
 
     monkeypatch.setitem(sys.modules, "laspy", None)
     with pytest.raises(InputError, match=r"laspy: pip install 'topomerge\[las\]'"):
-        outputs(building(1), "las", tmp_path / "a.las", False)
+        prepare_outputs(building(1), "las", tmp_path / "a.las", False)
 
 
 def test_from_python(tmp_path):

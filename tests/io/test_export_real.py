@@ -24,7 +24,7 @@ MAPS: dict[str, Callable[[Path], TopometricMap]] = {
     "robot grid (Freiburg 101)": lambda data: extract(read_points(data / IPA / "Freiburg101_scan.png", resolution=0.05)),
     "furnished grid (IPA)": lambda data: extract(read_points(data / IPA / "lab_ipa_furnitures.png", resolution=0.05)),
     "building model (duplex)": duplex_map,
-    "laser log (CARMEN)": lambda data: extract(dict(carmen.pairs(data / "carmen_logs"))["freiburg-101-first-last"]().a),
+    "laser log (CARMEN)": lambda data: extract(dict(carmen.iter_pairs(data / "carmen_logs"))["freiburg-101-first-last"]().a),
 }
 
 

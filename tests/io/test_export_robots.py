@@ -15,13 +15,13 @@ from tests.io.export_maps import AT, GRID, nothing, stair_scene, two_floors, wit
 from tests.scenes import Scene, corridor
 from tests.scenes_map import building
 from topomerge.errors import InputError
-from topomerge.io.exports import outputs
+from topomerge.io.exports import prepare_outputs
 from topomerge.io.points import read_points
 from topomerge.types import TopometricMap
 
 
 def write(map: TopometricMap, folder: Path, **options) -> dict[str, Path]:
-    files = outputs(map, "ros", folder, False, **options)
+    files = prepare_outputs(map, "ros", folder, False, **options)
     folder.mkdir(exist_ok=True)
     for path, save in files:
         save(path)
@@ -50,13 +50,13 @@ def test_walls_stand_where_they_were(tmp_path, at):
     assert sorted(files) == ["storey_0.pgm", "storey_0.yaml", "storey_0_route.geojson"]
     cloud = read_points(files["storey_0.yaml"])
     points = (cloud.points + cloud.shift).astype(np.float64)
-    height = map.grid.centroids()[:, 2] - map.storeys["floor"][0]
-    walls = map.grid.centroids()[(height > 0.5) & (height < 1.5)][:, :2]
+    height = map.grid.compute_centroids()[:, 2] - map.storeys["floor"][0]
+    walls = map.grid.compute_centroids()[(height > 0.5) & (height < 1.5)][:, :2]
     read = np.unique(np.round(points[points[:, 2] > 0.5][:, :2], 2), axis=0)
     expected = np.unique(np.round(walls, 2), axis=0)
     assert {tuple(p) for p in read.tolist()} == {tuple(p) for p in expected.tolist()}
     grid = Grid(files["storey_0.yaml"])
-    assert (grid.at(map.navigable.centroids()[:, :2]) == 254).all(), "all of the floor is free"
+    assert (grid.at(map.navigable.compute_centroids()[:, :2]) == 254).all(), "all of the floor is free"
     assert (grid.image == 205).any(), "what nobody saw is unknown"
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from topomerge.errors import InputError
 from topomerge.io import grid, read_points
-from topomerge.io.grid_doubts import is_inverted, outside_share
+from topomerge.io.grid import is_inverted, measure_outside_share
 
 CELL = 0.05  # m a pixel
 WALL, FLOOR, UNKNOWN = 0, 254, 205
@@ -169,14 +169,14 @@ def test_floor_outside_of_walls_is_told(tmp_path: Path, angle: int) -> None:
     (warning,) = read(write(tmp_path, np.asarray(turned)))[2]
     assert warning.startswith("map.pgm: ") and "% of the floor lies outside of every wall; " in warning
     inside = two_rooms()
-    assert outside_share(inside == WALL, inside == FLOOR) == 0
+    assert measure_outside_share(inside == WALL, inside == FLOOR) == 0
 
 
 def test_large_pictures_are_looked_at_in_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     picture = two_rooms(FLOOR)
-    whole = outside_share(picture == WALL, picture == FLOOR)
-    monkeypatch.setattr("topomerge.io.grid_doubts.PIXELS_LOOKED_AT", 6000)
-    assert outside_share(picture == WALL, picture == FLOOR) == pytest.approx(whole, abs=0.05)
+    whole = measure_outside_share(picture == WALL, picture == FLOOR)
+    monkeypatch.setattr("topomerge.io.grid.PIXELS_LOOKED_AT", 6000)
+    assert measure_outside_share(picture == WALL, picture == FLOOR) == pytest.approx(whole, abs=0.05)
 
 
 def outside_by_hand(occupied: np.ndarray, free: np.ndarray) -> float:
@@ -198,7 +198,7 @@ def test_directions_are_those_of_its_twin() -> None:
     for shape in ((13, 21), (17, 9)):
         values = rng.random(shape)
         occupied, free = values < 0.08, values > 0.4
-        assert outside_share(occupied, free) == pytest.approx(outside_by_hand(occupied, free))
+        assert measure_outside_share(occupied, free) == pytest.approx(outside_by_hand(occupied, free))
 
 
 @pytest.mark.parametrize("values", [(0, 205, 254), (0, 255, 255), (0, 127, 255)])

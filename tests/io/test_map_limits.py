@@ -10,7 +10,7 @@ import pytest
 
 from tests.scenes_map import building
 from topomerge.errors import InputError
-from topomerge.io.exports.occupancy import storey_occupancy
+from topomerge.io.exports.ros import rasterize_occupancy
 from topomerge.io.maps import load_map, save_map
 from topomerge.types import TopometricMap, VoxelGrid
 
@@ -54,8 +54,8 @@ def test_far_cells_of_no_room_are_no_harm(tmp_path: Path) -> None:
 
 def test_a_storey_that_no_grid_holds() -> None:
     with pytest.raises(InputError, match=r"storey 0 spans 800 by 800 m in cells of 0.1 m: .*extract with larger cells"):
-        storey_occupancy(strewn([(0, 0), (7_997, 7_997)], [0, 1]), 0)
-    assert storey_occupancy(strewn([(0, 0), (30, 30)], [0, 1]), 0).free.shape == (33, 33)
+        rasterize_occupancy(strewn([(0, 0), (7_997, 7_997)], [0, 1]), 0)
+    assert rasterize_occupancy(strewn([(0, 0), (30, 30)], [0, 1]), 0).free.shape == (33, 33)
 
 
 @pytest.mark.parametrize(

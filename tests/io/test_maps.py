@@ -15,7 +15,7 @@ import pytest
 from tests.scenes_map import building, same
 from topomerge.errors import InputError
 from topomerge.io import archive
-from topomerge.io.maps import OLDER_ROOMS, load_map, map_to_json, save_json, save_map, save_rooms_ply
+from topomerge.io.maps import OLDER_ROOMS, convert_map_to_json, load_map, save_json, save_map, save_rooms_ply
 from topomerge.types import EDGE_DTYPE, OLDER_EDGE_DTYPE, ROOM_DTYPE, ROOM_ODDS, STOREY_DTYPE, Array, TopometricMap, VoxelGrid
 
 
@@ -71,7 +71,7 @@ def test_numpy_opens_it_and_it_is_small(scene: TopometricMap, saved: Path) -> No
 
 
 def test_properties_must_be_numbers(scene: TopometricMap, tmp_path: Path) -> None:
-    odd = scene.grid.with_properties(name=np.array(["a"] * len(scene.grid), object))
+    odd = scene.grid.assign_properties(name=np.array(["a"] * len(scene.grid), object))
     with pytest.raises(ValueError, match="only numbers"):
         save_map(replace(scene, grid=odd), tmp_path / "odd.tmap")
     assert not list(tmp_path.iterdir())
@@ -155,7 +155,7 @@ def test_offsets_of_points_come_back_and_are_checked(saved: Path, tmp_path: Path
     map = load_map(saved)
     offset = np.random.default_rng(0).integers(0, 256, (len(map.grid), 3)).astype(np.uint8)
     path = tmp_path / "a.tmap"
-    save_map(replace(map, grid=map.grid.with_properties(offset=offset)), path)
+    save_map(replace(map, grid=map.grid.assign_properties(offset=offset)), path)
     assert (load_map(path).grid.properties["offset"] == offset).all()
     for name, wrong in (("flat", offset[:, 0]), ("float", offset.astype(float)), ("wide", np.hstack([offset, offset]))):
         refused(rewritten(path, tmp_path / name, **{"grid_property.offset": wrong}), "no proper offsets")
@@ -283,7 +283,7 @@ def test_json_fields_and_strictness(scene: TopometricMap, tmp_path: Path) -> Non
         raise AssertionError(f"{text} is not JSON")
 
     listing = json.loads((tmp_path / "a.json").read_text(), parse_constant=refuse)
-    assert listing == map_to_json(scene)
+    assert listing == convert_map_to_json(scene)
     assert [listing[k] for k in ("format", "source", "voxel_size")] == [1, "building.ply", 0.1]
     room = listing["rooms"][1]
     assert list(room) == [
@@ -348,7 +348,7 @@ def test_odds_that_are_none_are_refused(name: str, value: float, saved: Path, tm
 
 def test_json_of_odd_values(scene: TopometricMap, tmp_path: Path) -> None:
     odd = {"a": np.float32(0.5), "b": (1, np.int64(2)), "c": Path("x"), "d": {"e": np.inf}, "f": np.array([1, 2])}
-    listing = map_to_json(replace(scene, parameters=odd, source='q"\udcff.ply'))
+    listing = convert_map_to_json(replace(scene, parameters=odd, source='q"\udcff.ply'))
     assert listing["parameters"] == {"a": 0.5, "b": [1, 2], "c": "x", "d": {"e": None}, "f": [1, 2]}
     save_json(replace(scene, source="q\udcff.ply"), tmp_path / "odd.json")
     save_map(replace(scene, parameters=odd, source="q\udcff.ply"), tmp_path / "odd.tmap")
@@ -356,7 +356,7 @@ def test_json_of_odd_values(scene: TopometricMap, tmp_path: Path) -> None:
 
 
 def test_json_of_an_empty_map() -> None:
-    listing = map_to_json(nothing())
+    listing = convert_map_to_json(nothing())
     assert listing["rooms"] == listing["edges"] == listing["storeys"] == []
 
 
@@ -367,13 +367,13 @@ def test_ply_opens_elsewhere(far: float, tmp_path: Path) -> None:
     scene = building(1, 1, origin=(2.0 + far, -3.0, 0.5))
     path = tmp_path / "rooms.ply"
     save_rooms_ply(scene, path)
-    assert np.allclose(np.asarray(o3d.io.read_point_cloud(str(path)).points), scene.grid.centroids(), atol=1e-5)
+    assert np.allclose(np.asarray(o3d.io.read_point_cloud(str(path)).points), scene.grid.compute_centroids(), atol=1e-5)
     ply = plyfile.PlyData.read(path)
     assert not ply.text and ply.byte_order == "<"
     vertex = ply["vertex"]
     assert vertex["x"].dtype.itemsize == (8 if far else 4)
     assert (vertex["room"] == scene.room).all() and vertex["room"].min() == -1
-    assert (vertex["storey"] == scene.storey_of_cells()).all()
+    assert (vertex["storey"] == scene.find_cell_storeys()).all()
     colours = {tuple(v) for v in np.stack([vertex[c] for c in ("red", "green", "blue")], axis=1)[scene.room >= 0]}
     assert len(colours) == len(scene.rooms)
 

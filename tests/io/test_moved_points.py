@@ -11,9 +11,9 @@ import topomerge.io.ply as ply_reader
 from tests.io.octrees import room_tree, write_copc, write_potree
 from tests.samples import box_colors, box_points
 from topomerge.errors import InputError
-from topomerge.io import moved_points
-from topomerge.io.moved_points import LAS_STEP, moved_suffix, save_moved
+from topomerge.io import transformed_points
 from topomerge.io.points import read_points
+from topomerge.io.transformed_points import LAS_STEP, choose_suffix, save_transformed_points
 from topomerge.types import Array, Sim3
 
 GRID = np.array([482_113.25, 5_412_777.5, 311.0])  # m, a place in a national grid
@@ -48,12 +48,12 @@ FORMATS = ["little.ply", "ascii.ply", "big.ply", "binary.pcd", "table.csv", "arr
 def test_points_of_every_format_are_moved(samples: dict[str, Path], tmp_path: Path, name: str) -> None:
     source = samples[name]
     before = read_points(source)
-    target = tmp_path / f"a{moved_suffix(source)}"
-    done = save_moved(source, target, bow, POSE.apply(np.zeros((1, 3)))[0])
+    target = tmp_path / f"a{choose_suffix(source)}"
+    done = save_transformed_points(source, target, bow, POSE.apply(np.zeros((1, 3)))[0])
     after = read_points(target)
     assert (done.written, done.beyond) == (len(before), 0) and len(after) == len(before)
-    wanted = bow(before.points.astype(np.float64) + before.shift)
-    assert np.abs(exact(target) - wanted).max() < 1e-4
+    requested = bow(before.points.astype(np.float64) + before.shift)
+    assert np.abs(exact(target) - requested).max() < 1e-4
     assert np.array_equal(before.colors, after.colors) if before.colors is not None else after.colors is None
     assert [p.name for p in tmp_path.iterdir()] == [target.name]
 
@@ -64,8 +64,10 @@ def test_an_octree_is_moved_as_laz(tmp_path: Path) -> None:
 
     sources = [write_copc(tmp_path / "a.copc.laz", room_tree()), write_potree(tmp_path / "potree", room_tree())]
     for source, suffix in zip(sources, (".laz", ".ply"), strict=True):
-        target = tmp_path / f"moved{moved_suffix(source)}"
-        assert target.suffix == suffix and save_moved(source, target, bow, np.zeros(3)).written == len(room_tree().points)
+        target = tmp_path / f"moved{choose_suffix(source)}"
+        assert target.suffix == suffix and save_transformed_points(source, target, bow, np.zeros(3)).written == len(
+            room_tree().points
+        )
         assert np.abs(exact(target) - bow(read_points(source).points.astype(np.float64))).max() < 1e-3
     with laspy.open(tmp_path / "moved.laz") as reader:
         assert [record.user_id for record in reader.header.vlrs] == ["laszip encoded"] or not reader.header.vlrs
@@ -74,14 +76,14 @@ def test_an_octree_is_moved_as_laz(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", [".las", ".laz", ".npy"])
 def test_a_national_grid_keeps_its_millimetres(tmp_path: Path, suffix: str) -> None:
     points = box_points(2000).astype(np.float64) + GRID
-    source, target = tmp_path / f"a{suffix}", tmp_path / f"b{moved_suffix(f'a{suffix}')}"
+    source, target = tmp_path / f"a{suffix}", tmp_path / f"b{choose_suffix(f'a{suffix}')}"
     if suffix == ".npy":
         np.save(source, points)
     else:
         write_rich_las(source, points)
     move = Sim3(0.01, (0.25, 0.5, 0.125))
     about = Sim3(0, tuple(GRID.tolist())) @ move @ Sim3(0, tuple((-GRID).tolist()))
-    save_moved(source, target, about.apply, GRID)
+    save_transformed_points(source, target, about.apply, GRID)
     assert np.abs(exact(target) - about.apply(points)).max() < 5e-4
     assert np.abs(read_points(target).points + read_points(target).shift - about.apply(points)).max() < 1e-3
 
@@ -111,7 +113,7 @@ def test_las_keeps_its_dimensions(tmp_path: Path, suffix: str, same_frame: bool)
 
     source, target = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
     write_rich_las(source, box_points(900).astype(np.float64) + GRID)
-    save_moved(source, target, lambda p: p + [0, 0, 1], GRID, same_frame=same_frame)
+    save_transformed_points(source, target, lambda p: p + [0, 0, 1], GRID, same_frame=same_frame)
     a, b = laspy.read(source), laspy.read(target)
     for name in ("intensity", "classification", "ring", "gps_time", "red", "green", "blue"):
         assert np.array_equal(np.asarray(a[name]), np.asarray(b[name])), name
@@ -120,7 +122,7 @@ def test_las_keeps_its_dimensions(tmp_path: Path, suffix: str, same_frame: bool)
     users = [record.user_id for record in b.header.vlrs]
     assert "surveyor" in users and ("LASF_Projection" in users) == same_frame
     again = tmp_path / f"c{suffix}"
-    save_moved(source, again, lambda p: p + [0, 0, 1], GRID, same_frame=same_frame)
+    save_transformed_points(source, again, lambda p: p + [0, 0, 1], GRID, same_frame=same_frame)
     assert again.read_bytes() == target.read_bytes()
 
 
@@ -134,7 +136,7 @@ def test_points_beyond_the_reach_of_las_are_counted(tmp_path: Path) -> None:
     points[7] = 0
     las.x, las.y, las.z = points.T
     las.write(str(tmp_path / "a.las"))
-    done = save_moved(tmp_path / "a.las", tmp_path / "b.las", lambda p: p, GRID)
+    done = save_transformed_points(tmp_path / "a.las", tmp_path / "b.las", lambda p: p, GRID)
     assert (done.written, done.beyond) == (599, 1)
     assert np.abs(exact(tmp_path / "b.las") - np.delete(points, 7, axis=0)).max() < 0.006
 
@@ -144,7 +146,7 @@ def test_unit_and_axis_are_those_of_reading(tmp_path: Path) -> None:
     write_rich_las(tmp_path / "a.las", points * 1000)
     np.save(tmp_path / "a.npy", points * 1000)
     for name, target in (("a.las", "b.las"), ("a.npy", "b.ply")):
-        save_moved(tmp_path / name, tmp_path / target, lambda p: p, np.zeros(3), unit="mm", up="y", same_frame=True)
+        save_transformed_points(tmp_path / name, tmp_path / target, lambda p: p, np.zeros(3), unit="mm", up="y", same_frame=True)
         assert np.allclose(exact(tmp_path / target), points[:, (0, 2, 1)] * (1, -1, 1), atol=2e-4)
     import laspy
 
@@ -156,7 +158,7 @@ def test_points_are_moved_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
     write_rich_las(tmp_path / "a.las", box_points(950).astype(np.float64))
     np.save(tmp_path / "a.npy", box_points(950))
-    for module in (moved_points, las_reader, ply_reader):
+    for module in (transformed_points, las_reader, ply_reader):
         monkeypatch.setattr(module, "BLOCK_POINTS", 200)
     for name, target in (("a.las", "b.las"), ("a.npy", "b.ply")):
         sizes: list[int] = []
@@ -166,7 +168,9 @@ def test_points_are_moved_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPa
             return bow(points)
 
         shares: list[float] = []
-        save_moved(tmp_path / name, tmp_path / target, move, np.zeros(3), progress=lambda s, _, x=shares: x.append(s))
+        save_transformed_points(
+            tmp_path / name, tmp_path / target, move, np.zeros(3), progress=lambda s, _, x=shares: x.append(s)
+        )
         assert sizes == [200, 200, 200, 200, 150] and shares == sorted(shares) and shares[-1] == 1.0
         assert np.abs(exact(tmp_path / target) - bow(box_points(950))).max() < 2e-4
 
@@ -182,9 +186,9 @@ def test_colours_that_come_late(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         yield Piece(points[100:], colors[100:], done=1.0)
 
     monkeypatch.setattr(ply_reader, "read", pieces)
-    monkeypatch.setattr(moved_points, "BLOCK_POINTS", 100)
+    monkeypatch.setattr(transformed_points, "BLOCK_POINTS", 100)
     (tmp_path / "a.ply").write_bytes(b"ply")
-    assert save_moved(tmp_path / "a.ply", tmp_path / "b.ply", lambda p: p, np.zeros(3)).written == 300
+    assert save_transformed_points(tmp_path / "a.ply", tmp_path / "b.ply", lambda p: p, np.zeros(3)).written == 300
     monkeypatch.undo()
     cloud = read_points(tmp_path / "b.ply")
     assert np.array_equal(cloud.points, points) and not cloud.colors[:100].any()
@@ -195,5 +199,5 @@ def test_what_cannot_be_read_leaves_nothing(tmp_path: Path, samples: dict[str, P
     for name, suffix in (("cloud.las", ".las"), ("little.ply", ".ply")):
         (tmp_path / f"cut{suffix}").write_bytes(samples[name].read_bytes()[:-500])
         with pytest.raises(InputError, match="cut short"):
-            save_moved(tmp_path / f"cut{suffix}", tmp_path / f"b{suffix}", lambda p: p, np.zeros(3))
+            save_transformed_points(tmp_path / f"cut{suffix}", tmp_path / f"b{suffix}", lambda p: p, np.zeros(3))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.las", "cut.ply"]

@@ -58,16 +58,16 @@ def test_a_chunk_that_lies_about_its_size(tmp_path: Path, kind: str) -> None:
 
 def test_unpacking_is_limited_for_all_chunks_together() -> None:
     pytest.importorskip("rosbags")
-    from topomerge.io.bag_unpacking import MODEST_BAG, Unpacking, UnpackingError
+    from topomerge.io.bag_file import MODEST_BAG, UnpackingBudget, UnpackingError
 
     packed = bz2.compress(b"\0" * (30 << 20))
-    budget = Unpacking(0)
+    budget = UnpackingBudget(0)
     for _ in range(2):
         assert len(budget.unpack(bz2.BZ2Decompressor, packed)) == 30 << 20
     assert budget.left == MODEST_BAG - (60 << 20)
     with pytest.raises(UnpackingError, match="of all chunks"):
         budget.unpack(bz2.BZ2Decompressor, packed)
-    budget.restart()
+    budget.reset()
     assert budget.unpack(bz2.BZ2Decompressor, bz2.compress(b"ab") + bz2.compress(b"cd")) == b"abcd"
     with pytest.raises(EOFError):
         budget.unpack(bz2.BZ2Decompressor, packed[:-20])
@@ -89,8 +89,8 @@ def test_a_map_that_lies_is_refused_before_it_is_unpacked(tmp_path: Path, monkey
     padding = {"zz": np.frombuffer(np.random.default_rng(0).bytes(4_000_000), "u1")}  # else the ratio tells
     archive.write({**arrays, **change(arrays), **padding}, tmp_path / "b.tmap", effort=1)
     unpacked = []
-    whole = archive._array
-    monkeypatch.setattr(archive, "_array", lambda a, e: unpacked.append(e.filename) or whole(a, e))
+    whole = archive._read_array
+    monkeypatch.setattr(archive, "_read_array", lambda a, e: unpacked.append(e.filename) or whole(a, e))
     with pytest.raises(InputError, match=rf"b\.tmap: damaged \(.*{said}"):
         load_map(tmp_path / "b.tmap")
     assert unpacked == ["format.npy"]

@@ -173,7 +173,7 @@ def test_blocks_join_to_the_whole(samples: dict[str, Path], name: str, monkeypat
 
 
 def test_e57_range_and_angles() -> None:
-    from topomerge.io.e57 import _cartesian
+    from topomerge.io.e57 import _convert_to_cartesian
 
     spherical = np.array([[2, 0, 0], [2, np.pi / 2, 0], [2, 0, np.pi / 2]])
-    np.testing.assert_allclose(_cartesian(spherical), [[2, 0, 0], [0, 2, 0], [0, 0, 2]], atol=1e-12)
+    np.testing.assert_allclose(_convert_to_cartesian(spherical), [[2, 0, 0], [0, 2, 0], [0, 0, 2]], atol=1e-12)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from tests.io.walks import Walk, room_walk, write_kitti, write_scan, write_scans, write_tum
 from topomerge.errors import InputError
 from topomerge.io import read_chunks, read_points
-from topomerge.io.scan_folder import name_time
+from topomerge.io.scan_folder import parse_name_time
 from topomerge.io.trajectory import Trajectory, read_trajectory
 from topomerge.types import PointCloud
 
@@ -132,7 +132,7 @@ def test_returns_that_met_nothing_are_left_out(tmp_path: Path, walk: Walk) -> No
     ],
 )
 def test_times_in_names(stem: str, time: float | None) -> None:
-    assert name_time(stem) == (None if time is None else pytest.approx(time, abs=1e-6))
+    assert parse_name_time(stem) == (None if time is None else pytest.approx(time, abs=1e-6))
 
 
 @settings(max_examples=50, deadline=None)
@@ -149,12 +149,12 @@ def test_poses_between_two(values: list[float], share: float, beyond: float) -> 
         return out
 
     track = Trajectory(np.stack([pose(0.0), pose(1.0)]), np.array([10.0, 12.0]))
-    np.testing.assert_allclose(track.at(np.array([10 + 2 * share]))[0], pose(share), atol=1e-6)
-    np.testing.assert_allclose(track.at(np.array([10 + 2 * beyond]))[0], pose(float(np.clip(beyond, 0, 1))), atol=1e-6)
-    assert track.gap(np.array([10 + 2 * share]))[0] == pytest.approx(2 * min(share, 1 - share))
+    np.testing.assert_allclose(track.interpolate(np.array([10 + 2 * share]))[0], pose(share), atol=1e-6)
+    np.testing.assert_allclose(track.interpolate(np.array([10 + 2 * beyond]))[0], pose(float(np.clip(beyond, 0, 1))), atol=1e-6)
+    assert track.measure_gap(np.array([10 + 2 * share]))[0] == pytest.approx(2 * min(share, 1 - share))
     one = Trajectory(track.poses[:1], track.times[:1])  # type: ignore[index]
-    np.testing.assert_allclose(one.at(np.array([11.0]))[0], pose(0.0), atol=1e-9)
-    assert one.gap(np.array([11.0]))[0] == pytest.approx(1.0)
+    np.testing.assert_allclose(one.interpolate(np.array([11.0]))[0], pose(0.0), atol=1e-9)
+    assert one.measure_gap(np.array([11.0]))[0] == pytest.approx(1.0)
 
 
 TUM_LINE = "%.3f 0 0 0 0 0 0 1\n"

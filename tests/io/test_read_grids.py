@@ -164,7 +164,7 @@ def test_a_picture_starts_no_program(tmp_path: Path, monkeypatch: pytest.MonkeyP
     with pytest.raises(InputError, match=r"plan\.png: is not an image"):
         read_points(tmp_path / "plan.yaml")
     with pytest.raises(InputError, match=r"damaged image: plan\.png"):
-        plan_grid._image(path)
+        plan_grid._read_image(path)
     assert not started
 
 
@@ -210,7 +210,7 @@ def leaves_by_hand(data: bytes, keys: tuple[int, int, int], depth: int, at: list
 
 
 def test_the_compiled_walk_equals_its_twin() -> None:
-    from topomerge.kernels.codecs import octree_leaves
+    from topomerge.kernels.codecs import read_octree_leaves
 
     rng = np.random.default_rng(0)
 
@@ -223,7 +223,7 @@ def test_the_compiled_walk_equals_its_twin() -> None:
         return octomap_node(states) + b"".join(tree(depth + 1) for s in states if s == 3)
 
     data = tree(0)
-    keys, depths, states = octree_leaves(np.frombuffer(data, np.uint8)) or ([], [], [])
+    keys, depths, states = read_octree_leaves(np.frombuffer(data, np.uint8)) or ([], [], [])
     leaves = sorted((*k, d, s) for k, d, s in zip(np.asarray(keys).tolist(), depths, states, strict=True))
     assert leaves == sorted(leaves_by_hand(data, (0, 0, 0), 0, [0]))
 
@@ -237,7 +237,7 @@ def test_a_small_octomap(tmp_path: Path) -> None:
     cloud = read_points(tmp_path / "a.bt")
     np.testing.assert_allclose(sorted(cloud.points.tolist()), [[0.05, 0.05, 0.05], [0.15, 0.15, 0.15]], atol=1e-6)
     assert cloud.free is not None and cloud.free.edge == pytest.approx(0.1)
-    centres = {tuple(c) for c in np.round(cloud.free.centroids(), 3).tolist()}
+    centres = {tuple(c) for c in np.round(cloud.free.compute_centroids(), 3).tolist()}
     large = {
         (round(0.05 + 0.1 * i, 3), round(0.25 + 0.1 * j, 3), round(0.05 + 0.1 * k, 3))
         for i in (0, 1)

@@ -22,7 +22,7 @@ from tests.io.test_read_rtabmap import depth_nodes, scan_nodes
 from tests.io.test_read_valetudo import saved, two_rooms
 from tests.io.walks import room_walk
 from topomerge.io import read_points
-from topomerge.io.valetudo import robot_rooms
+from topomerge.io.valetudo import parse_robot_map
 
 
 def layers(*runs: list[int]) -> dict[str, object]:
@@ -35,7 +35,7 @@ def test_a_robots_map_that_paints_the_same_pixels_again_and_again(tmp_path: Path
 
 
 def test_many_layers_cost_what_their_pixels_do(tmp_path: Path) -> None:
-    drawn = robot_rooms(tmp_path, layers([0, 0, 9], [0, 900, 9], *[[5, 5, 1]] * 20_000))
+    drawn = parse_robot_map(tmp_path, layers([0, 0, 9], [0, 900, 9], *[[5, 5, 1]] * 20_000))
     assert drawn.free.sum() == 19 and drawn.rooms.max() == 20_002
 
 

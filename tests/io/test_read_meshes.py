@@ -10,8 +10,8 @@ import pytest
 from tests.samples import write_ifc
 from topomerge.errors import InputError
 from topomerge.io import read_points
-from topomerge.io.ifc import area, outline
-from topomerge.kernels.lattice import areas, points_on_triangles
+from topomerge.io.ifc import compute_signed_area, trace_outline
+from topomerge.kernels.meshes import compute_areas, sample_triangles
 
 MESHES = ["mesh.ply", "mesh.obj", "mesh.stl", "mesh.glb", "mesh.gltf"]
 SURFACE = 2 * (4 * 3 + 4 * 2.5 + 3 * 2.5)  # m2 of the box
@@ -23,9 +23,9 @@ def random_triangles(count: int, size: float = 1.0) -> np.ndarray:
 
 def test_lattice_density_and_place() -> None:
     triangles = random_triangles(300)
-    points, owner = points_on_triangles(triangles, 0.05)
-    assert len(points) == pytest.approx(areas(triangles).sum() / 0.05**2, rel=0.01)
-    np.testing.assert_allclose(np.bincount(owner, minlength=300), areas(triangles) / 0.05**2, atol=60)
+    points, owner = sample_triangles(triangles, 0.05)
+    assert len(points) == pytest.approx(compute_areas(triangles).sum() / 0.05**2, rel=0.01)
+    np.testing.assert_allclose(np.bincount(owner, minlength=300), compute_areas(triangles) / 0.05**2, atol=60)
     a, b, c = (triangles[owner, i] for i in range(3))
     basis = np.stack([b - a, c - a], axis=2)
     weights = np.stack([np.linalg.lstsq(m, p, rcond=None)[0] for m, p in zip(basis[:500], (points - a)[:500], strict=True)])
@@ -35,13 +35,13 @@ def test_lattice_density_and_place() -> None:
 
 def test_triangles_smaller_than_the_lattice_get_their_share() -> None:
     triangles = random_triangles(200_000, 0.01)
-    points, _ = points_on_triangles(triangles, 0.05)
-    assert len(points) == pytest.approx(areas(triangles).sum() / 0.05**2, rel=0.03)
+    points, _ = sample_triangles(triangles, 0.05)
+    assert len(points) == pytest.approx(compute_areas(triangles).sum() / 0.05**2, rel=0.03)
 
 
 def test_lattice_leaves_no_holes() -> None:
     square = np.array([[[0, 0, 0], [4, 0, 0], [4, 4, 0]], [[0, 0, 0], [4, 4, 0], [0, 4, 0]]], float)
-    points, _ = points_on_triangles(square, 0.05)
+    points, _ = sample_triangles(square, 0.05)
     filled = np.unique(np.floor(points[:, :2] / 0.1).astype(int), axis=0)
     assert len(filled) >= 0.995 * 40 * 40
 
@@ -50,7 +50,7 @@ def test_degenerate_triangles_give_nothing() -> None:
     flat = np.zeros((4, 3, 3))
     flat[1, 1] = flat[2, 2] = (1, 0, 0)
     flat[3] = np.nan
-    points, owner = points_on_triangles(flat, 0.05)
+    points, owner = sample_triangles(flat, 0.05)
     assert len(points) == len(owner) == 0
 
 
@@ -105,10 +105,10 @@ def test_outline_of_a_body_with_a_hole_and_of_one_without_floor() -> None:
     faces = [[i, (i + 1) % 4, 4 + i] for i in range(4)] + [[(i + 1) % 4, 4 + (i + 1) % 4, 4 + i] for i in range(4)]
     flat = np.column_stack([ring, np.zeros(8)])
     body = np.concatenate([flat, flat + np.array((0, 0, 3))])
-    polygon = outline(body, np.array([*faces, *(np.array(faces)[:, ::-1] + 8)]))
-    assert area(polygon) == pytest.approx(16)
+    polygon = trace_outline(body, np.array([*faces, *(np.array(faces)[:, ::-1] + 8)]))
+    assert compute_signed_area(polygon) == pytest.approx(16)
     walls = np.array([[0, 1, 8], [1, 9, 8], [1, 2, 9], [2, 10, 9]])
-    assert area(outline(body, walls)) == pytest.approx(16)
+    assert compute_signed_area(trace_outline(body, walls)) == pytest.approx(16)
 
 
 @pytest.mark.longer
@@ -124,7 +124,7 @@ def test_ifc_rooms_walls_and_doors(samples: dict[str, Path]) -> None:
     assert floors == pytest.approx([(12 + 9) / 0.1**2, 12 / 0.1**2], rel=0.1)
     rooms = [(r.name, r.kind, r.storey, round(r.floor, 3), round(r.ceiling, 3)) for r in cloud.rooms]
     assert rooms == [("1", "Office", 0, 0, 2.5), ("2", "Hall", 0, 0, 2.5), ("3", "Attic", 1, 2.8, 4.8)]
-    assert [area(r.polygon) for r in cloud.rooms] == pytest.approx([12, 9, 12], rel=1e-3)
+    assert [compute_signed_area(r.polygon) for r in cloud.rooms] == pytest.approx([12, 9, 12], rel=1e-3)
     assert len(cloud.rooms[1].polygon) == 6
     shut = read_points(samples["model.ifc"], spacing=0.1, doors=True)
     assert shut.points[:, 1].max() == pytest.approx(4.9, abs=1e-4)

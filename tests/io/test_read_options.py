@@ -14,7 +14,7 @@ import pytest
 from tests.samples import box_points
 from topomerge.errors import InputError
 from topomerge.io import frame, read_chunks, read_points
-from topomerge.io.checks import Sample, warn_about
+from topomerge.io.points import PointSample, warn_about
 from topomerge.types import VoxelGrid
 
 
@@ -39,7 +39,7 @@ def room(x: float, y: float, z: float, step: float = 0.1) -> np.ndarray:
 
 @pytest.mark.parametrize("up", list(frame.TURNS))
 def test_turns_are_rotations_that_bring_the_axis_up(tmp_path: Path, up: str) -> None:
-    rotation = frame.turn(up)
+    rotation = frame.get_axis_rotation(up)
     assert np.linalg.det(rotation) == pytest.approx(1)
     axis = np.zeros(3)
     axis["xyz".index(up[-1])] = -1 if up.startswith("-") else 1
@@ -60,13 +60,13 @@ def test_unit_and_scale_come_first(tmp_path: Path) -> None:
 def test_grids_and_poses_turn_with_the_points(up: str) -> None:
     cells = np.random.default_rng(0).integers(0, 9, (40, 3))
     grid = VoxelGrid.from_cells(cells, np.array([1.0, -2, 3]), 0.5)
-    turned = frame.place_grid(grid, frame.turn(up), 2.0)
-    expected = frame.place_points(grid.centroids(), frame.turn(up), 2.0)
+    turned = frame.transform_grid(grid, frame.get_axis_rotation(up), 2.0)
+    expected = frame.transform_points(grid.compute_centroids(), frame.get_axis_rotation(up), 2.0)
     assert turned.contains(turned.locate(expected)).all() and len(turned) == len(grid)
     pose = np.eye(4)[None].copy()
     pose[0, :3, 3] = (1, 2, 3)
-    placed = frame.place_poses(pose, frame.turn(up), 2.0)
-    np.testing.assert_allclose(placed[0, :3, 3], frame.place_points(pose[:, :3, 3], frame.turn(up), 2.0)[0])
+    placed = frame.transform_poses(pose, frame.get_axis_rotation(up), 2.0)
+    np.testing.assert_allclose(placed[0, :3, 3], frame.transform_points(pose[:, :3, 3], frame.get_axis_rotation(up), 2.0)[0])
 
 
 def test_points_that_are_not_finite_are_left_out_and_counted(tmp_path: Path) -> None:
@@ -120,7 +120,7 @@ def test_ordinary_rooms_raise_no_warning(size: tuple[float, float, float]) -> No
 
 @pytest.mark.parametrize("up", ["y", "x"])
 def test_a_lying_building_is_noticed(tmp_path: Path, up: str) -> None:
-    lying = room(12, 8, 2.7) @ frame.turn(up)
+    lying = room(12, 8, 2.7) @ frame.get_axis_rotation(up)
     path = save(tmp_path / "a.npy", lying)
     (warning,) = read_points(path).warnings
     assert f"give --up {up}" in warning
@@ -128,7 +128,7 @@ def test_a_lying_building_is_noticed(tmp_path: Path, up: str) -> None:
 
 
 def test_samples_stay_small() -> None:
-    sample = Sample(limit=1000)
+    sample = PointSample(limit=1000)
     for start in range(0, 100_000, 777):
         sample.add(np.arange(start, start + 777.0)[:, None] * np.ones(3))
     assert 400 <= len(sample.points) <= 1000

@@ -9,7 +9,7 @@ import pytest
 
 from tests.real_models import duplex
 from topomerge.io import read_chunks, read_points
-from topomerge.io.ifc import area
+from topomerge.io.ifc import compute_signed_area
 
 pytestmark = pytest.mark.data
 
@@ -72,6 +72,6 @@ def test_building_models(data_dir: Path, name: str, rooms: int, storeys: set[int
     assert len(cloud.rooms) == rooms
     assert {r.storey for r in cloud.rooms} == storeys
     np.testing.assert_allclose(np.ptp(cloud.points, axis=0), size, atol=0.1)
-    assert all(area(r.polygon) > 1 and r.ceiling > r.floor + 1.5 for r in cloud.rooms)
+    assert all(compute_signed_area(r.polygon) > 1 and r.ceiling > r.floor + 1.5 for r in cloud.rooms)
     if name == "duplex":
         assert {r.kind for r in cloud.rooms} >= {"Kitchen", "Living Room", "Foyer"}

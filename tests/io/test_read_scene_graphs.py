@@ -49,7 +49,7 @@ def test_two_scene_graphs_in_one_out(tmp_path: Path) -> None:
     dsg = pytest.importorskip("spark_dsg")
     points = Scene().shell(0, 0, 13, 9).wall((5, 0), (5, 9), doors=(2.0,)).wall((5, 5), (13, 5), doors=(4.0,)).points()
     for name, seen, frame in (("a", points, None), ("b", part(points, high=(11, 99)), MOVE)):
-        centres = grid_of(seen, frame).centroids()
+        centres = grid_of(seen, frame).compute_centroids()
         corners = np.array([(0.05, 0, 0), (-0.03, 0.04, 0), (-0.03, -0.04, 0.02)])
         vertices = (centres[:, None] + corners).reshape(-1, 3)
         faces = np.arange(len(vertices)).reshape(-1, 3)

@@ -16,7 +16,7 @@ from tests.io.bags import walk_messages, write_bag
 from tests.io.walks import room_walk
 from topomerge.errors import InputError
 from topomerge.io import read_points
-from topomerge.io.points import suffixes
+from topomerge.io.points import list_suffixes
 
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
 IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0\n"
@@ -32,7 +32,7 @@ def refusal_of(path: Path, **options: object) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize("suffix", suffixes())
+@pytest.mark.parametrize("suffix", list_suffixes())
 def test_pointers_of_git_lfs(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     path.write_bytes(POINTER)

@@ -12,7 +12,7 @@ import pytest
 import topomerge as tm
 from topomerge.errors import InputError
 from topomerge.io import read_points
-from topomerge.io.valetudo import robot_rooms
+from topomerge.io.valetudo import parse_robot_map
 
 LEFT, RIGHT = (110, 120), (131, 141)  # columns of two rooms of 1 m in pixels of 10 cm; a wall between, open at rows 103 to 106
 ROWS = (100, 110)
@@ -59,13 +59,13 @@ def test_walls_and_floor_stand_where_the_robot_drew_them(tmp_path: Path) -> None
 def test_y_points_up_as_in_the_app(tmp_path: Path) -> None:
     about = two_rooms()
     about["layers"][2]["compressedPixels"] = run((LEFT[1], RIGHT[0]), ROWS[0])  # a way along the upper rim of the picture
-    drawn = robot_rooms(tmp_path, about)
+    drawn = parse_robot_map(tmp_path, about)
     middle = drawn.free[:, (LEFT[1] + 3) - (LEFT[0] - 1)]
     assert np.flatnonzero(middle).tolist() == [len(middle) - 2]
 
 
 def test_the_robots_own_rooms(tmp_path: Path) -> None:
-    drawn = robot_rooms(tmp_path, two_rooms())
+    drawn = parse_robot_map(tmp_path, two_rooms())
     assert drawn.names == ("Bath", "") and drawn.resolution == 0.1
     assert np.bincount(drawn.rooms.ravel()).tolist()[1:] == [100, 100] and drawn.free.sum() >= 200
     assert not (drawn.walls & drawn.free).any()

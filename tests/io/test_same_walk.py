@@ -14,8 +14,8 @@ from topomerge.extraction import scan as scan_module
 from topomerge.extraction.extract import extract
 from topomerge.extraction.scan import read_scan
 from topomerge.io import read_chunks
+from topomerge.io.depth_images import PosedScan, iter_pieces
 from topomerge.io.piece import BLOCK_POINTS
-from topomerge.io.posed import PosedScan, pieces
 from topomerge.types import PointCloud, TopometricMap, VoxelGrid
 
 
@@ -88,7 +88,7 @@ def test_many_small_scans_come_in_few_pieces() -> None:
             yield PosedScan(np.ones((500, 3)), np.eye(4), done=number / 3000)
 
     handed = []
-    for piece in pieces(scans()):
+    for piece in iter_pieces(scans()):
         handed.append(len(piece.points))
         assert len(asked) * 500 - sum(handed) == 0, "no scan is read before it is wanted"
     assert len(handed) == 4 and max(handed) < BLOCK_POINTS + 500

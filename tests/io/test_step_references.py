@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from topomerge.errors import InputError
-from topomerge.io import read_points, step
+from topomerge.io import ifc, read_points
 
 
 def step_file(path: Path, *statements: str) -> Path:
@@ -28,7 +28,7 @@ def boundary(number: int, other: int) -> str:
 
 
 def test_a_chain_of_a_thousand_passes(tmp_path: Path) -> None:
-    step.check_references(step_file(tmp_path / "a.ifc", *chain(1000), "#1001=IFCNOTE('#1001')"))
+    ifc.check_references(step_file(tmp_path / "a.ifc", *chain(1000), "#1001=IFCNOTE('#1001')"))
 
 
 @pytest.mark.longer
@@ -48,7 +48,7 @@ def test_a_model_with_such_a_chain_is_read(samples: dict[str, Path], tmp_path: P
 
 
 def test_boundaries_of_spaces_may_name_each_other(tmp_path: Path) -> None:
-    step.check_references(step_file(tmp_path / "a.ifc", *chain(3), boundary(4, 5), boundary(5, 4)))
+    ifc.check_references(step_file(tmp_path / "a.ifc", *chain(3), boundary(4, 5), boundary(5, 4)))
 
 
 @pytest.mark.parametrize(
@@ -66,11 +66,11 @@ def test_boundaries_of_spaces_may_name_each_other(tmp_path: Path) -> None:
 def test_circles_are_refused(tmp_path: Path, statements: list[str], says: str) -> None:
     path = step_file(tmp_path / "a.ifc", *chain(3), *statements)
     with pytest.raises(InputError, match=says) as caught:
-        step.check_references(path)
+        ifc.check_references(path)
     assert str(caught.value).startswith(f"{path}: ") and "\n" not in str(caught.value)
 
 
 def test_what_could_end_the_library_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"nested deeper than 5,000") as caught:
-        step.check_references(step_file(tmp_path / "a.ifc", *chain(6000)))
+        ifc.check_references(step_file(tmp_path / "a.ifc", *chain(6000)))
     assert "themselves" not in str(caught.value)

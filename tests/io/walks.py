@@ -44,9 +44,9 @@ class Walk:
 def house_walk() -> Walk:
     """A house as a LiDAR on a walk sees it; no point lies within a millimetre of the edge of a cell."""
     from topomerge.datasets.buildings.procedural import make_building
-    from topomerge.datasets.simulation.scanner import scan
+    from topomerge.datasets.simulation.scanner import scan_building
 
-    cloud = scan(make_building("house", 3), "lidar", seed=1, spacing=0.06)
+    cloud = scan_building(make_building("house", 3), "lidar", seed=1, spacing=0.06)
     assert cloud.poses is not None and cloud.pose_of is not None
     return _walk(cloud.points.astype(float), cloud.poses, cloud.pose_of)
 

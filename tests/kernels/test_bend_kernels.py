@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from topomerge.kernels.bend import blended_moves, wall_gain
+from topomerge.kernels.bend import blend_moves, compute_wall_gain
 
 
 def test_gain_is_that_of_the_table_less_what_is_lost_where_something_is_known() -> None:
@@ -14,7 +14,7 @@ def test_gain_is_that_of_the_table_less_what_is_lost_where_something_is_known() 
     level, seen = rng.integers(0, 256, (3, 9, 7), np.uint8), rng.random((9, 7)) < 0.5
     table, lost = rng.normal(size=256).astype(np.float32), rng.random((9, 7)).astype(np.float32)
     expected = np.where(seen | (table[level] > 0), table[level] - lost, 0)
-    assert np.array_equal(wall_gain(level, table, lost, seen), expected)
+    assert np.array_equal(compute_wall_gain(level, table, lost, seen), expected)
 
 
 def test_blended_moves_are_means_weighed_by_nearness() -> None:
@@ -30,4 +30,4 @@ def test_blended_moves_are_means_weighed_by_nearness() -> None:
             shifts.append(anchors[k] + (x, y) + turned @ (point - anchors[k]) - point)
             weights.append(np.exp(-((point - anchors[k]) ** 2).sum() / (2 * reach**2)))
         slow[p] = np.average(shifts, axis=0, weights=weights)
-    assert blended_moves(points, distance, nearest, anchors, moves, reach) == pytest.approx(slow)
+    assert blend_moves(points, distance, nearest, anchors, moves, reach) == pytest.approx(slow)

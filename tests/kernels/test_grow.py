@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from topomerge.kernels.grow import steps_from
+from topomerge.kernels.rasters import count_steps
 
 
 def test_steps_lead_around_what_is_no_way():
@@ -13,7 +13,7 @@ def test_steps_lead_around_what_is_no_way():
     way[:2, 2] = False
     start = np.zeros((3, 5), bool)
     start[0, 0] = True
-    assert steps_from(start, way).tolist() == [[0, 1, -1, 4, 4], [1, 1, -1, 3, 4], [2, 2, 2, 3, 4]]
+    assert count_steps(start, way).tolist() == [[0, 1, -1, 4, 4], [1, 1, -1, 3, 4], [2, 2, 2, 3, 4]]
 
 
 def test_steps_are_those_of_growing_masks():
@@ -26,4 +26,4 @@ def test_steps_are_those_of_growing_masks():
         grown = ndimage.binary_dilation(reached, np.ones((3, 3)), mask=way) & ~reached
         expected[grown] = n
         reached |= grown
-    assert np.array_equal(steps_from(start, way), expected)
+    assert np.array_equal(count_steps(start, way), expected)

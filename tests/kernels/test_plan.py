@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from topomerge.kernels.plan import column_bits, on_lines
+from topomerge.kernels.rasters import compute_column_bits, find_line_columns
 
 
 def test_column_bits_equal_a_slow_twin():
@@ -17,7 +17,7 @@ def test_column_bits_equal_a_slow_twin():
         if 0 <= x < 6 and 0 <= y < 5 and not np.isnan(h):
             k = int(np.floor((h - base[x, y] + 0.5) / 0.25))
             slow[x, y] |= np.uint32(1 << k) if 0 <= k < 32 else np.uint32(0)
-    assert np.array_equal(column_bits(ix, iy, z, base, -0.5, 0.25), slow)
+    assert np.array_equal(compute_column_bits(ix, iy, z, base, -0.5, 0.25), slow)
 
 
 def test_on_lines_keeps_straight_runs_only():
@@ -28,6 +28,6 @@ def test_on_lines_keeps_straight_runs_only():
     for leg in legs:
         mask[leg] = True
     angles = np.pi * np.arange(24) / 24
-    kept = on_lines(mask, np.cos(angles), np.sin(angles), 12, 11, 3)
+    kept = find_line_columns(mask, np.cos(angles), np.sin(angles), 12, 11, 3)
     assert kept[5, 3:30].all() and kept[np.arange(10, 35), np.arange(10, 35)].all()
     assert not any(kept[leg] for leg in legs)

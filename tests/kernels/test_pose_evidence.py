@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from topomerge.kernels.poses import pose_evidence
+from topomerge.kernels.registration import measure_pose_evidence
 
 
 def test_kernel_is_its_slow_twin():
@@ -12,7 +12,7 @@ def test_kernel_is_its_slow_twin():
     distance, floor = rng.uniform(0, 1, (1, 9, 8)).astype(np.float32), rng.random((1, 9, 8)) < 0.5
     points, is_wall = rng.uniform(-0.2, 1.2, (50, 2)), rng.random(50) < 0.5
     poses = np.array([[1.0, 0.0, 0.0, 0.0], [0.6, 0.8, 0.3, -0.1]])
-    found = pose_evidence(
+    found = measure_pose_evidence(
         poses, np.zeros((2, 1), np.int64), points, np.zeros(50, np.int64), is_wall, distance, floor, np.zeros(2), 0.1, 0.2
     )
     for h, (a, b, x, y) in enumerate(poses):

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from topomerge.kernels.bend import shifted_sums
-from topomerge.registration.bend.graph import _factor, _inverse_of
+from topomerge.kernels.bend import sum_shifted_values
+from topomerge.registration.bend.graph import _factor, _invert_factor
 
 
 @pytest.mark.parametrize("count", [1, 5, 60, 300])
 def test_it_is_the_inverse_wherever_the_matrix_has_entries(count: int) -> None:
     half = sparse.random(count, count, 0.02, random_state=count)
     matrix = half @ half.T + 0.5 * sparse.eye(count)
-    inverse = _inverse_of(_factor(matrix)).toarray()
+    inverse = _invert_factor(_factor(matrix)).toarray()
     there = inverse != 0
     assert (there >= (matrix.toarray() != 0)).all() and (inverse == inverse.T).all()
     np.testing.assert_allclose(inverse[there], np.linalg.inv(matrix.toarray())[there], atol=1e-12)
@@ -25,7 +25,7 @@ def test_sums_of_moved_points() -> None:
     rng = np.random.default_rng(0)
     points, weights, owner = rng.uniform(-1, 5, (200, 2)), rng.uniform(0, 1, 200), rng.integers(0, 3, 200)
     values, shifts = rng.uniform(0, 1, (40, 30)), rng.uniform(-1, 1, (4, 2))
-    sums = shifted_sums(points, weights, owner, 3, shifts, values, np.array([0.2, 0.1]), 0.1)
+    sums = sum_shifted_values(points, weights, owner, 3, shifts, values, np.array([0.2, 0.1]), 0.1)
     for shift, row in zip(shifts, sums, strict=True):
         cells = np.floor((points + shift - (0.2, 0.1)) / 0.1).astype(int)
         inside = ((cells >= 0) & (cells < values.shape)).all(axis=1)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topomerge.kernels.hough import strongest
-from topomerge.kernels.strips import fill_strips
+from topomerge.kernels.images import fill_strips
+from topomerge.kernels.rasters import find_strongest_line
 
 STEP = np.array([0.05, 0.025, 0.2])
 
@@ -63,5 +63,5 @@ def test_the_line_with_most_weight_is_voted_for():
     wall = np.column_stack([t * np.cos(0.3), t * np.sin(0.3)]) + 0.7 * np.array([-np.sin(0.3), np.cos(0.3)])
     points = np.concatenate([wall, rng.uniform(-3, 3, (60, 2))])
     angles = np.linspace(0, np.pi, 60, endpoint=False)
-    angle, offset = strongest(points, np.ones(len(points)), angles, 0.04)
+    angle, offset = find_strongest_line(points, np.ones(len(points)), angles, 0.04)
     assert angle == pytest.approx(0.3, abs=0.06) and offset == pytest.approx(0.7, abs=0.06)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from tests.scenes_map import building
-from topomerge.matching.growing import align, grow
+from topomerge.matching.assignment import align, grow
 from topomerge.types import Sim3
 
 

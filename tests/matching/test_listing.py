@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from tests.scenes_map import building
-from topomerge.matching.listing import matching_to_json, matching_to_text
+from topomerge.matching.match import Matching, format_matching, serialise_matching
 from topomerge.matching.poses import PoseHypothesis
-from topomerge.matching.result import Matching
 from topomerge.types import Sim3
 
 POSE = Sim3(np.pi / 2, (1.0, -2.0, 0.5), 1.25)
@@ -17,7 +16,7 @@ MATCHING = Matching(np.array([[0, 2], [3, 1]]), np.array([0.91239, 0.5]), POSE, 
 
 
 def test_the_listing_holds_rooms_probabilities_and_transforms():
-    listing = matching_to_json(MATCHING, building(2), building(1))
+    listing = serialise_matching(MATCHING, building(2), building(1))
     assert [m["rooms"] for m in listing["maps"]] == [5, 3] and listing["statistics"] == {"rooms_a": 5.0}
     assert listing["matches"] == [{"rooms": [0, 2], "probability": 0.9124}, {"rooms": [3, 1], "probability": 0.5}]
     first = listing["hypotheses"][0]
@@ -27,9 +26,9 @@ def test_the_listing_holds_rooms_probabilities_and_transforms():
 
 
 def test_the_table_names_matches_and_the_first_hypotheses():
-    lines = matching_to_text(MATCHING, building(2), building(1)).splitlines()
+    lines = format_matching(MATCHING, building(2), building(1)).splitlines()
     assert lines[0] == "2 matches of 5 and 3 rooms"
     assert lines[3].split() == ["0", "20.0", "2", "7.2", "0.91"] and lines[4].split() == ["3", "20.0", "1", "20.0", "0.50"]
     assert lines[7].split() == ["0", "0.88", "2", "90.0", "1.00", "-2.00", "0.50", "1.250"]
     assert len(lines) == 12  # five of seven hypotheses
-    assert matching_to_text(Matching(), building(2), building(1)) == "0 matches of 5 and 3 rooms"
+    assert format_matching(Matching(), building(2), building(1)) == "0 matches of 5 and 3 rooms"

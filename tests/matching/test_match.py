@@ -11,9 +11,8 @@ from tests.embedding.test_descriptors import permuted
 from tests.matching.turned_maps import turned, uneven
 from tests.scenes_map import building
 from topomerge.errors import InputError
-from topomerge.matching.consistency import voted_pose
-from topomerge.matching.match import GrowingLimits, marginal, match
-from topomerge.matching.odds import match_probability
+from topomerge.matching.consistency import compute_match_probability, find_voted_pose
+from topomerge.matching.match import GrowingLimits, match, select_marginal_matches
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3
 
@@ -53,7 +52,7 @@ def test_attention_at_unknown_scale():
 
 
 def test_attention_without_a_likely_match_gives_no_pose():
-    assert voted_pose(uneven(), building(2), np.zeros((4, 5))) is None
+    assert find_voted_pose(uneven(), building(2), np.zeros((4, 5))) is None
 
 
 def test_unknown_scale():
@@ -126,10 +125,10 @@ def test_probabilities_of_matches_sum_over_hypotheses():
         PoseHypothesis(Sim3(), probability=p, rooms=np.array(r), fit=np.ones(len(r)))
         for p, r in zip((0.4, 0.35, 0.25), sets, strict=True)
     )
-    rooms, probability = marginal(a, b, ranked)
-    one = match_probability(a, b, np.array([[0, 0]]), np.ones(1))[0]  # alike for all: rooms of one size that fit
+    rooms, probability = select_marginal_matches(a, b, ranked)
+    one = compute_match_probability(a, b, np.array([[0, 0]]), np.ones(1))[0]  # alike for all: rooms of one size that fit
     assert rooms.tolist() == [[0, 0], [1, 1]] and probability == pytest.approx([0.75 * one, 0.6 * one], rel=0.02)
-    assert marginal(a, b, ())[0].shape == (0, 2)
+    assert select_marginal_matches(a, b, ())[0].shape == (0, 2)
 
 
 def test_bad_input():

@@ -13,9 +13,9 @@ import torch
 from topomerge.models.export import read_weights, run_with_torch
 from topomerge.models.room_matcher import MatcherStage, RoomMatcher, build_stages
 
-from topomerge.embedding.turns import FACTS, room_facts
+from topomerge.embedding.quarter_turns import FACTS, compute_room_features
 from topomerge.errors import InputError
-from topomerge.io.weight_files import VARIABLE, weights_file
+from topomerge.io.archive import VARIABLE, find_weights_file
 from topomerge.matching import room_matcher
 from topomerge.matching.room_matcher import (
     AGREEMENT,
@@ -24,11 +24,11 @@ from topomerge.matching.room_matcher import (
     VOTERS,
     Matcher,
     RoomsSeen,
-    agreement,
     build_signature,
-    certainty_of_turns,
-    matcher_weights,
-    odds_of,
+    combine_turn_certainties,
+    compute_agreement,
+    load_matcher_weights,
+    run_network,
 )
 from topomerge.networks.network import WEIGHTS_PACKAGE, Network, read_card
 
@@ -77,7 +77,7 @@ def test_stage_by_stage_is_all_at_once() -> None:
     b = seen_again(a, 4)
     with torch.no_grad():
         partners = net(a, b)[-1]
-    odds = odds_of(a, b, matcher_of(net))
+    odds = run_network(a, b, matcher_of(net))
     assert odds.rows == pytest.approx(partners.rows.exp().numpy(), abs=1e-5)
     assert odds.columns == pytest.approx(partners.columns.exp().numpy(), abs=1e-5)
     assert odds.rows.sum(axis=1) == pytest.approx(1.0) and odds.columns.shape == (10, 7)
@@ -86,18 +86,18 @@ def test_stage_by_stage_is_all_at_once() -> None:
 def test_order_of_rooms_order_of_maps_and_places_of_frames_do_not_matter() -> None:
     a, w = rooms(7, 1), network()
     b = seen_again(a, 3)
-    odds, order = odds_of(a, b, w), np.random.default_rng(1).permutation(10)
-    shuffled = odds_of(a, some(b, order), w)
+    odds, order = run_network(a, b, w), np.random.default_rng(1).permutation(10)
+    shuffled = run_network(a, some(b, order), w)
     assert shuffled.certainty == pytest.approx(odds.certainty[:, order], abs=1e-6)
-    assert odds_of(b, a, w).certainty == pytest.approx(odds.certainty.T, abs=1e-6)
-    moved = odds_of(a, replace(b, places=b.places + (100.0, -40.0), heights=b.heights), w)
+    assert run_network(b, a, w).certainty == pytest.approx(odds.certainty.T, abs=1e-6)
+    moved = run_network(a, replace(b, places=b.places + (100.0, -40.0), heights=b.heights), w)
     assert moved.certainty == pytest.approx(odds.certainty, abs=1e-6)  # single precision
 
 
 @pytest.mark.parametrize(("few", "more"), [(1, 0), (1, 1), (7, 4), (40, 31)])
 def test_the_network_that_ships_is_as_its_module_of_torch(few: int, more: int) -> None:
     pytest.importorskip("onnx")
-    shipped = matcher_weights()
+    shipped = load_matcher_weights()
     assert isinstance(shipped.run, Network)
     numbers = int(shipped.run.signature.inputs["rows_a"].shape[1])
     net = RoomMatcher(numbers, shipped.width, shipped.stages - 1)
@@ -111,7 +111,7 @@ def test_the_network_that_ships_is_as_its_module_of_torch(few: int, more: int) -
         )
     with torch.no_grad():
         partners = net.eval()(*maps)[-1]
-    odds = odds_of(*maps, shipped)
+    odds = run_network(*maps, shipped)
     assert odds.rows == pytest.approx(partners.rows.exp().numpy(), abs=1e-5)
     assert odds.columns == pytest.approx(partners.columns.exp().numpy(), abs=1e-5)
 
@@ -120,10 +120,10 @@ def test_pairs_that_are_moved_alike_agree_and_those_of_another_storey_do_not() -
     places = np.array([[0.0, 0], [5, 0], [5, 6], [12, 6]])
     a = RoomsSeen(np.zeros((4, 1)), places, np.array([0.0, 0, 0, 3]), np.zeros((4, FACTS)))
     b = replace(a, places=places + (2.0, 1.0), heights=np.zeros(4))
-    votes = agreement(np.eye(4), a, b)
+    votes = compute_agreement(np.eye(4), a, b)
     assert votes[0, 0, 0] == pytest.approx(np.log1p(3 * 2)) and votes[3, 3, 0] == 0.0  # two others say the same way
     assert votes[0, 1, 0] == 0.0 and votes[1, 0].max() == 0.0
-    off = agreement(np.eye(4), a, replace(b, places=b.places + np.array([[0.75, 0], [0, 0], [0, 0], [0, 0]])))
+    off = compute_agreement(np.eye(4), a, replace(b, places=b.places + np.array([[0.75, 0], [0, 0], [0, 0], [0, 0]])))
     assert off[0, 0, 0] == pytest.approx(np.log1p(3 * 2 * 0.75**2)) and off[1, 1, 0] == pytest.approx(np.log1p(3 * (1 + 0.75**2)))
 
 
@@ -142,7 +142,7 @@ def test_votes_are_sums_over_all_pairs_of_pairs() -> None:
             level = abs((a.heights[i] - b.heights[j]) - (a.heights[u] - b.heights[v])) < LEVEL_GAP
             if i != u and j != v and level:
                 expected[i, j] += [max(1 - (apart / width) ** 2, 0) ** 2 * likely[u, v] for width in AGREEMENT]
-    assert expected.max() > 0 and np.allclose(agreement(likely, a, b), np.log1p(VOTE_UNIT * expected))
+    assert expected.max() > 0 and np.allclose(compute_agreement(likely, a, b), np.log1p(VOTE_UNIT * expected))
 
 
 def without(*parts: str) -> RoomMatcher:
@@ -166,7 +166,7 @@ def test_what_is_left_out_tells_nothing(parts: tuple[str, ...], changed: str) ->
     other = replace(b, **{changed: np.random.default_rng(8).normal(size=getattr(b, changed).shape)})
     for names, same in ((parts, True), ((), False)):
         net = matcher_of(without(*names))
-        rows = [odds_of(a, one, net).rows for one in (b, other)]
+        rows = [run_network(a, one, net).rows for one in (b, other)]
         assert (np.abs(rows[0] - rows[1]).max() < 1e-9) == same
 
 
@@ -178,20 +178,20 @@ def test_a_part_that_does_not_exist_can_not_be_left_out() -> None:
 def test_turns_are_as_likely_as_they_are_sure() -> None:
     sure = room_matcher.RoomOdds(np.array([[1.0, 0.0]]), np.array([[1.0, 0.0]]), 2)
     none = room_matcher.RoomOdds(np.array([[0.0, 1.0]]), np.array([[0.0, 1.0]]), 0)
-    assert sure.sureness == 1.0 and none.sureness == 0.0
-    assert certainty_of_turns([none, sure]) == pytest.approx(np.e / (1 + np.e))
+    assert sure.confidence == 1.0 and none.confidence == 0.0
+    assert combine_turn_certainties([none, sure]) == pytest.approx(np.e / (1 + np.e))
 
 
 def test_the_network_that_ships_is_that_of_the_embedder_that_ships() -> None:
     from topomerge.embedding.learned import load_embedder
 
-    shipped = matcher_weights()
+    shipped = load_matcher_weights()
     assert isinstance(shipped.run, Network) and shipped.embedder == load_embedder().embedder
     assert shipped.run.signature.inputs["rows_a"].shape[1] == 4 * load_embedder().network.size
 
 
 def test_facts_of_rooms_are_logarithms_their_dustbin_and_their_height() -> None:
-    facts = room_facts(np.array([[np.e - 1, -np.e + 1, 0.0]]), np.array([0.5]), np.array([3.0]))
+    facts = compute_room_features(np.array([[np.e - 1, -np.e + 1, 0.0]]), np.array([0.5]), np.array([3.0]))
     assert facts == pytest.approx(np.array([[1, -1, 0, 0.5, 3]]))
 
 
@@ -206,9 +206,9 @@ def test_facts_of_rooms_are_logarithms_their_dustbin_and_their_height() -> None:
     ],
 )
 def test_files_whose_card_is_of_no_matcher_are_refused(change, tmp_path, monkeypatch) -> None:
-    shipped = weights_file(WEIGHTS_PACKAGE, room_matcher.MATCHER_FILE)
+    shipped = find_weights_file(WEIGHTS_PACKAGE, room_matcher.MATCHER_FILE)
     shutil.copy(shipped, tmp_path)
     (tmp_path / "room_matcher.card.json").write_text(json.dumps({**read_card(shipped), **change}))
     monkeypatch.setenv(VARIABLE, str(tmp_path))
     with pytest.raises(InputError, match=r"^[^\n]*room_matcher\.onnx: [^\n]*$"):
-        matcher_weights()
+        load_matcher_weights()

@@ -8,31 +8,31 @@ import numpy as np
 import pytest
 
 from tests.scenes_map import building
-from topomerge.matching.consistency import matches_under
-from topomerge.matching.room_plans import RoomPlans, room_plans
+from topomerge.matching.consistency import find_matches
+from topomerge.matching.room_plans import RoomPlans, build_room_plans
 from topomerge.types import Sim3
 
 
 def test_rooms_lie_on_one_raster_with_the_walls():
     map = building(2)
-    plans = room_plans(map)
+    plans = build_room_plans(map)
     assert plans.walls.shape == plans.label.shape == (len(map.storeys), *map.grid.shape[:2])
     assert plans.walls.any() and np.allclose(plans.floors, map.storeys["floor"]) and len(plans.areas) == len(map.rooms)
     assert (plans.distance[plans.walls] == 0).all() and len(plans.fields) == len(plans.plans)
-    places, storey, is_wall, each = plans.samples(50)
+    places, storey, is_wall, each = plans.sample_columns(50)
     assert len(places) == len(storey) <= 100 and is_wall.sum() == 50 and (each >= 1).all()
 
 
 def test_a_map_on_itself_has_all_rooms_in_common():
-    plans = room_plans(building(2))
-    rooms, fit = matches_under(Sim3(), (plans, plans))
+    plans = build_room_plans(building(2))
+    rooms, fit = find_matches(Sim3(), (plans, plans))
     assert rooms.tolist() == [[k, k] for k in range(len(plans.areas))] and np.allclose(fit, 1.0)
-    assert not len(matches_under(Sim3(0.0, (0.0, 0.0, 20.0)), (plans, plans))[0])
+    assert not len(find_matches(Sim3(0.0, (0.0, 0.0, 20.0)), (plans, plans))[0])
 
 
 def test_each_room_has_the_area_of_its_columns():
     map = building(2)
-    plans = room_plans(map)
+    plans = build_room_plans(map)
     assert plans.areas[:4] == pytest.approx(map.rooms["area"][:4]) and plans.areas[4] == pytest.approx(
         map.rooms["area"][4] + 4 * 0.1
     )
@@ -43,16 +43,16 @@ def test_each_room_has_the_area_of_its_columns():
 def test_the_middle_is_that_of_the_columns_on_the_lowest_floor():
     map = building(2)
     low, high = map.rooms["lo"].min(axis=0), map.rooms["hi"].max(axis=0)
-    assert room_plans(map).middle == pytest.approx([*(low + high)[:2] / 2, map.storeys["floor"][0]], abs=0.01)
+    assert build_room_plans(map).middle == pytest.approx([*(low + high)[:2] / 2, map.storeys["floor"][0]], abs=0.01)
 
 
 def test_samples_spread_over_all_walls_and_stand_for_their_share():
-    plans = room_plans(building(1))
-    places, _, is_wall, each = plans.samples(100)
+    plans = build_room_plans(building(1))
+    places, _, is_wall, each = plans.sample_columns(100)
     walls = (np.argwhere(plans.walls[0]) + 0.5) * 0.1 + plans.origin
     assert np.allclose(places[is_wall][[0, -1]], walls[[0, -1]])
     assert is_wall.sum() * each[0] == pytest.approx(len(walls)) and (~is_wall).sum() * each[1] == pytest.approx(plans.floor.sum())
-    every, _, is_wall, each = plans.samples(10**6)
+    every, _, is_wall, each = plans.sample_columns(10**6)
     assert np.allclose(every[is_wall], walls) and each.tolist() == [1, 1]
 
 

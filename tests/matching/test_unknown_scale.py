@@ -10,7 +10,7 @@ from tests.scenes_map import building
 from topomerge import load_embedder
 from topomerge.fusion.pipeline import merge
 from topomerge.matching.match import match
-from topomerge.matching.unknown_scale import COARSE_SCALES, odds_at_best_scale
+from topomerge.matching.room_matcher import COARSE_SCALES, find_best_scale
 
 
 @pytest.mark.parametrize("true", [0.6, 0.8, 1.0, 1.5])
@@ -23,7 +23,7 @@ def test_rooms_are_surest_at_the_true_scale(true: float) -> None:
         asked.append(scale)
         return rows_at(scale / true)
 
-    scale, odds = odds_at_best_scale(describe(a), describe(a), rows)
+    scale, odds = find_best_scale(describe(a), describe(a), rows)
     assert scale == pytest.approx(true, rel=0.11) and len(odds) == 4
     assert set(COARSE_SCALES) <= set(asked) and len(asked) == len(COARSE_SCALES) + 2
 
@@ -38,7 +38,7 @@ def test_matching_at_unknown_scale_says_which_it_took() -> None:
 
 
 def test_an_embedder_without_a_matcher_has_no_say() -> None:
-    assert odds_at_best_scale(np.eye(3), np.eye(3), lambda scale: np.eye(3)) == (1.0, ())
+    assert find_best_scale(np.eye(3), np.eye(3), lambda scale: np.eye(3)) == (1.0, ())
 
 
 @pytest.mark.longer

@@ -9,22 +9,19 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 import torch
-from topomerge.models.embedder import Embedder, match_scores, quarter_turned
-from topomerge.models.layers import Standardise
-from topomerge.models.nodes import bumps
-from topomerge.models.pointnet import farthest, nearest
-from topomerge.models.voxelcnn import crop
-from topomerge.models.weights import learned, read_embedder, save_state
-from topomerge.models.yaw import turn
+from topomerge.models.embedder import Embedder, match_scores, rotate_quarter_turns
+from topomerge.models.geometry import find_nearest, rotate_yaw, sample_farthest, voxelize_crop
+from topomerge.models.nodes import Standardizer, compute_rbf
+from topomerge.models.weights import read_embedder, save_state, wrap_network
 
 from tests.graphs import graph, shuffled, turned
 from tests.scenes_map import building
-from topomerge.embedding.door_layout import LAYOUT_REACH, door_layout
-from topomerge.embedding.graph import graph_arrays
-from topomerge.embedding.network import GEOMETRY_PARTS, TABLE_PARTS, Geometry, Network, Node, check, network_from
-from topomerge.embedding.rooms_around import through_doors, with_rooms_around
+from topomerge.embedding.engineered import LAYOUT_REACH, compute_door_layout
+from topomerge.embedding.graph import build_graph_arrays
+from topomerge.embedding.learned import add_proximity_edges, is_door_edge
+from topomerge.embedding.network import GEOMETRY_PARTS, TABLE_PARTS, Geometry, Network, Node, build_network, check
+from topomerge.embedding.quarter_turns import rotate_graph as numpy_quarter_turned
 from topomerge.embedding.surroundings import CROP_SHAPES
-from topomerge.embedding.turns import quarter_turned as numpy_quarter_turned
 from topomerge.errors import InputError
 
 NODES = [
@@ -67,19 +64,19 @@ def test_a_turned_map_has_the_same_rows_one_place_further():
     net = network("scalars", *CROP_SHAPES, node=Node("gat", 2, around=10.0, ways=True))
     one = graph()
     with torch.no_grad():
-        (rows, bins), (other, other_bins) = net.turned(one), net.turned(quarter_turned(one, 1))
+        (rows, bins), (other, other_bins) = net.embed_rotations(one), net.embed_rotations(rotate_quarter_turns(one, 1))
         assert torch.allclose(rows.roll(-1, dims=1), other, atol=1e-5) and torch.allclose(bins, other_bins, atol=1e-5)
         assert (rows[:, 0] - rows[:, 1]).abs().max() > 1e-3
-        assert network().turned(one)[0].ndim == 2
+        assert network().embed_rotations(one)[0].ndim == 2
 
 
 def test_four_quarter_turns_are_none_and_numpy_turns_alike():
     one = {name: tensor for name, tensor in graph().items() if name in (*CROP_SHAPES, "edge_way")}
     arrays = {name: tensor.numpy() for name, tensor in one.items()}
     for turns in range(5):
-        ours, theirs = quarter_turned(one, turns), numpy_quarter_turned(arrays, turns)
+        ours, theirs = rotate_quarter_turns(one, turns), numpy_quarter_turned(arrays, turns)
         assert all(np.allclose(ours[name].numpy(), theirs[name], atol=1e-5) for name in one)
-    assert all(torch.equal(quarter_turned(one, 4)[name], one[name]) for name in one)
+    assert all(torch.equal(rotate_quarter_turns(one, 4)[name], one[name]) for name in one)
 
 
 @pytest.mark.parametrize("part", [part for part in GEOMETRY_PARTS if part not in CROP_SHAPES])
@@ -130,18 +127,18 @@ def test_rooms_without_doors_and_maps_without_rooms():
 
 
 def test_standardise_by_hand():
-    scale = Standardise(2)
+    scale = Standardizer(2)
     scale.fit(torch.tensor([[0.0, 5.0], [math.e - 1, 5.0], [1 - math.e, 5.0]]))
     assert torch.allclose(scale(torch.tensor([[math.e - 1, 5.0]])), torch.tensor([[1 / math.sqrt(2 / 3), 0.0]]), atol=1e-6)
 
 
 def test_grouping_and_crop_by_hand():
     line = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [5, 0, 0]]])
-    assert farthest(line, 3).tolist() == [[3, 0, 2]]
-    assert sorted(nearest(line, line[:, 3:], 2)[0, 0].tolist()) == [2, 3]
-    grid = crop(torch.tensor([[[0.01, 0.01, 0.01], [0.02, 0.01, 0.01], [100.0, 0, 0]]]))
+    assert sample_farthest(line, 3).tolist() == [[3, 0, 2]]
+    assert sorted(find_nearest(line, line[:, 3:], 2)[0, 0].tolist()) == [2, 3]
+    grid = voxelize_crop(torch.tensor([[[0.01, 0.01, 0.01], [0.02, 0.01, 0.01], [100.0, 0, 0]]]))
     assert grid.sum() == 1 and grid[0, 0, 16, 16, 4] == 1
-    assert torch.allclose(turn(line, torch.tensor([math.pi / 2]))[0, 3], torch.tensor([0.0, 5, 0]), atol=1e-6)
+    assert torch.allclose(rotate_yaw(line, torch.tensor([math.pi / 2]))[0, 3], torch.tensor([0.0, 5, 0]), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -164,7 +161,7 @@ def test_grouping_and_crop_by_hand():
 )
 def test_bad_networks_name_their_key(table, message):
     with pytest.raises(InputError, match=message):
-        network_from(table)
+        build_network(table)
 
 
 @pytest.mark.parametrize("part", ["pointnet", "pointnet_local", "voxelcnn"])
@@ -232,12 +229,14 @@ def test_a_pickle_under_another_name_is_not_run(tmp_path):
 @pytest.mark.longer
 def test_an_embedder_of_maps():
     map = building(2, 2)
-    describe = learned(network("scalars", "engineered", "shapedna", "pointnet", node=Node("gat", doors=1, near=True)))
+    describe = wrap_network(network("scalars", "engineered", "shapedna", "pointnet", node=Node("gat", doors=1, near=True)))
     rows = describe(map)
     assert rows.shape == (len(map.rooms), 64) and rows.dtype == np.float64 and np.array_equal(rows, describe(map))
-    assert np.array_equal(rows, describe.graph(graph_arrays(map))[0]) and describe.matchability(map).shape == (len(map.rooms),)
+    assert np.array_equal(rows, describe.embed_graph(build_graph_arrays(map))[0]) and describe.compute_matchability(
+        map
+    ).shape == (len(map.rooms),)
     assert describe(building(1, 1)).shape == (len(building(1, 1).rooms), 64)
-    ours, theirs = describe.probabilities(map, map)
+    ours, theirs = describe.compute_probabilities(map, map)
     assert np.allclose(ours.sum(axis=1), 1) and ours.shape == (len(map.rooms), len(map.rooms) + 1) and np.allclose(ours, theirs)
 
 
@@ -249,15 +248,15 @@ def test_rooms_around_by_hand():
         "edge_attr": np.tile(np.array([0.9, 2, 1, 0, 0, 4, 0.5, 2, 2, 0, 1], np.float32), (2, 1)),
         "edge_pos": np.array([[2, 0, 1], [2, 0, 1]], float),
     }
-    near = with_rooms_around(map, 7.5)
+    near = add_proximity_edges(map, 7.5)
     assert near["edge_index"].T.tolist() == [[0, 1], [0, 1], [0, 2], [1, 0], [1, 0], [2, 0]]  # 1 and 2 are 8.1 m apart
-    assert through_doors(near).tolist() == [True, False, False] * 2
+    assert is_door_edge(near).tolist() == [True, False, False] * 2
     assert np.allclose(near["edge_attr"][[1, 4]], [[0, 0, 0, 0, 0, 4, s, 0, 0, 0, 1] for s in (0.5, -0.5)])
     assert np.allclose(near["edge_pos"][[1, 4]], [2, 0, 1.25]) and np.allclose(near["edge_pos"][[0, 3]], [2, 0, 1])
-    assert with_rooms_around(map, 1.0)["edge_index"].tolist() == map["edge_index"].tolist()
-    assert bumps(torch.tensor([0.0, 3.5]))[:, 3].tolist() == pytest.approx([math.exp(-9), math.exp(-0.25)])
+    assert add_proximity_edges(map, 1.0)["edge_index"].tolist() == map["edge_index"].tolist()
+    assert compute_rbf(torch.tensor([0.0, 3.5]))[:, 3].tolist() == pytest.approx([math.exp(-9), math.exp(-0.25)])
     built = building(2, 2)
-    describe = learned(network("scalars", node=Node("gat", around=10.0)))
+    describe = wrap_network(network("scalars", node=Node("gat", around=10.0)))
     assert describe(built).shape == (len(built.rooms), 64)
 
 
@@ -266,7 +265,7 @@ def test_layout_of_doors_by_hand():
     index = np.array([[0, 0, 2, 1, 2, 3], [1, 2, 3, 0, 0, 2]])
     middle = np.array([[0, 0, 1], [4, 0, 1], [0, 4, 1], [0, 40, 1]], float)
     door = np.array([[2, 0, 1], [0, 2, 1], [0, 30, 1]] * 2, float)
-    pairs, features = door_layout(index, middle, door)
+    pairs, features = compute_door_layout(index, middle, door)
     by_pair = {(int(e), int(f)): row for (e, f), row in zip(pairs.T, features, strict=True)}
     assert sorted(by_pair) == [
         (0, 1),
@@ -284,9 +283,9 @@ def test_layout_of_doors_by_hand():
     assert np.allclose(by_pair[0, 4][:4], by_pair[0, 1][:4]) and by_pair[0, 4][4] == 0  # the same door, left from room 2
     c, s = np.cos(1.1), np.sin(1.1)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    again = door_layout(index, middle @ turn.T + 7, door @ turn.T + 7)
+    again = compute_door_layout(index, middle @ turn.T + 7, door @ turn.T + 7)
     assert np.array_equal(again[0], pairs) and np.allclose(again[1], features, atol=1e-6) and features[:, 0].max() <= LAYOUT_REACH
-    assert door_layout(np.zeros((2, 0), int), middle, np.zeros((0, 3)))[1].shape == (0, 5)
+    assert compute_door_layout(np.zeros((2, 0), int), middle, np.zeros((0, 3)))[1].shape == (0, 5)
 
 
 def test_check_takes_the_defaults():

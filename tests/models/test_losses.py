@@ -8,7 +8,16 @@ from dataclasses import replace
 import pytest
 import torch
 from topomerge.models.embedder import Embedder
-from topomerge.models.losses import LossSettings, Objective, Truth, check, dustbin_loss, info_nce, matching_loss, triplet
+from topomerge.models.losses import (
+    LossSettings,
+    Objective,
+    Truth,
+    check,
+    compute_dustbin_loss,
+    compute_info_nce,
+    compute_matching_loss,
+    compute_triplet_loss,
+)
 
 from tests.graphs import graph
 from topomerge.embedding.network import Geometry, Network, Node
@@ -34,7 +43,7 @@ ONE = truth([(0, 2)], [0, 0, 0, 0], [0, 0, 1, 1])
 
 
 def test_info_nce_with_negatives_of_both_maps():
-    loss, has = info_nce(FLAT, torch.tensor(1.0), ONE)
+    loss, has = compute_info_nce(FLAT, torch.tensor(1.0), ONE)
     assert has.tolist() == [True, False, True, False]
     # Room 0: its partner has cosine 1, room 1 of its own map and room 3 of the other have 0.
     assert loss.tolist() == pytest.approx([math.log((E(1) + 2) / E(1)), 0, math.log((E(1) + 2) / E(1)), 0])
@@ -43,7 +52,7 @@ def test_info_nce_with_negatives_of_both_maps():
 def test_a_room_in_two_pieces():
     """Both pieces are partners, and no negatives of each other."""
     embedding = torch.tensor([[1.0, 0], [1, 0], [0, 1]])  # a: room 0; b: its pieces 1 and 2
-    loss, has = info_nce(embedding, torch.tensor(1.0), truth([(0, 1), (0, 2)], [0, 0, 0], [0, 1, 1], [0, 5, 5]))
+    loss, has = compute_info_nce(embedding, torch.tensor(1.0), truth([(0, 1), (0, 2)], [0, 0, 0], [0, 1, 1], [0, 5, 5]))
     assert has.all() and loss.tolist() == pytest.approx([0, 0, 0], abs=1e-6)
 
 
@@ -51,7 +60,7 @@ def test_easy_negatives_count_less():
     embedding = torch.tensor([[1.0, 0], [1, 0], [0, 1]])
     other = truth([(0, 1)], [0, 0, 1], [0, 1, 0])
     for easy in (0.0, 0.3, 1.0):
-        loss, _ = info_nce(embedding, torch.tensor(0.5), other, easy)
+        loss, _ = compute_info_nce(embedding, torch.tensor(0.5), other, easy)
         assert loss[0].item() == pytest.approx(math.log((E(2) + easy * E(0)) / E(2)), abs=1e-6)
 
 
@@ -60,8 +69,8 @@ def test_rooms_of_two_pairs_of_one_building_are_no_negatives():
     embedding = torch.tensor([[1.0, 0], [1, 0], [1, 0], [0, 1]])
     other = truth([(0, 1)], [0, 0, 1, 2], [0, 1, 0, 0])
     one_building = replace(other, building=torch.tensor([7, 7, 7, 8]))
-    apart, _ = info_nce(embedding, torch.tensor(1.0), other, 0.5)
-    together, _ = info_nce(embedding, torch.tensor(1.0), one_building, 0.5)
+    apart, _ = compute_info_nce(embedding, torch.tensor(1.0), other, 0.5)
+    together, _ = compute_info_nce(embedding, torch.tensor(1.0), one_building, 0.5)
     assert apart[0].item() == pytest.approx(math.log((E(1) + 0.5 * E(1) + 0.5) / E(1)), abs=1e-6)
     assert together[0].item() == pytest.approx(math.log((E(1) + 0.5) / E(1)), abs=1e-6)
 
@@ -87,37 +96,37 @@ def test_the_mean_loss_of_two_processes_is_that_of_one_with_all_pairs(kind):
     matches, pairs = [(0, 2), (4, 6), (8, 10), (9, 11)], [0] * 4 + [1] * 4 + [2] * 4
     whole = replace(truth(matches, pairs, [0, 0, 1, 1] * 3), building=torch.tensor(pairs).clamp(max=1))
     settings = LossSettings(kind, dustbin=0.0)
-    expected = matching_loss(settings, rows, bins, hot, whole)["loss"]
+    expected = compute_matching_loss(settings, rows, bins, hot, whole)["loss"]
     halves = []
     for mine, other in ((slice(0, 8), slice(8, 12)), (slice(8, 12), slice(0, 8))):
         square = {name: getattr(whole, name)[mine, mine] for name in ("same", "piece")}
         part = Truth(**{name: getattr(whole, name)[mine] for name in ("pair", "side", "clear", "building")}, **square)
         others = _Recorded(rows[other], whole.building[other], 4.0)  # rooms with a partner: four in each
-        halves.append(matching_loss(settings, rows[mine], bins[mine], hot, part, others)["loss"])
+        halves.append(compute_matching_loss(settings, rows[mine], bins[mine], hot, part, others)["loss"])
     assert sum(halves) / 2 == pytest.approx(expected.item(), rel=1e-5)
 
 
 def test_the_dustbin():
-    loss = dustbin_loss(FLAT, torch.tensor([0.0, 1.0, 0.0, 1.0]), torch.tensor(1.0), ONE)
+    loss = compute_dustbin_loss(FLAT, torch.tensor([0.0, 1.0, 0.0, 1.0]), torch.tensor(1.0), ONE)
     # Room 0 sees 2 (cosine 1), 3 (0) and its dustbin (0); room 1, that has no partner, sees 2 (0), 3 (1) and its dustbin (1).
     assert loss[0].item() == pytest.approx(math.log((E(1) + 2) / E(1)))
     assert loss[1].item() == pytest.approx(math.log((1 + E(1) + E(1)) / E(1)))
 
 
 def test_triplets():
-    loss, has = triplet(FLAT, ONE, 0.3)
+    loss, has = compute_triplet_loss(FLAT, ONE, 0.3)
     assert has.tolist() == [True, False, True, False] and loss[0].item() == 0  # both negatives are sqrt 2 away, the partner 0
     swapped = torch.tensor([[1.0, 0], [1, 0], [0, 1], [0, 1]])
     # Room 0: its partner is sqrt 2 away, room 1 is 0 and room 3 sqrt 2; room 2 sees 3 at 0 and 1 at sqrt 2.
     expected = ((math.sqrt(2) + 0.3) + 0.3) / 2
-    assert triplet(swapped, ONE, 0.3)[0].tolist() == pytest.approx([expected, 0, expected, 0], abs=2e-3)
+    assert compute_triplet_loss(swapped, ONE, 0.3)[0].tolist() == pytest.approx([expected, 0, expected, 0], abs=2e-3)
 
 
 def test_triplets_that_are_met_do_not_count():
     """a: rooms 0 and 1; b: its pieces 2 and 3 of room 0, and room 4."""
     embedding = torch.tensor([[1.0, 0], [-1, 0], [1, 0], [0, 1], [0, 1]])
     what = truth([(0, 2), (0, 3)], [0] * 5, [0, 0, 1, 1, 1], [0, 1, 0, 0, 2])
-    loss, has = triplet(embedding, what, 0.3)
+    loss, has = compute_triplet_loss(embedding, what, 0.3)
     # Room 0: from piece 2 (0 away) nothing is wrong with 1 (2 away) or 4 (sqrt 2); from piece 3 (sqrt 2) only 4 is too near.
     assert has.tolist() == [True, False, True, True, False]
     assert loss[0].item() == pytest.approx((0 + 0.3) / 2, abs=2e-3)
@@ -128,7 +137,7 @@ def test_triplets_part_rooms_that_are_at_one_point():
     rows = torch.nn.Parameter(torch.tensor([[1.0, 0, 0]]).repeat(4, 1) + 0.01 * torch.randn(4, 3, generator=torch.manual_seed(0)))
     optimizer = torch.optim.Adam([rows], 0.05)
     for _ in range(100):
-        loss = triplet(torch.nn.functional.normalize(rows, dim=1), ONE, 0.3)[0].sum()
+        loss = compute_triplet_loss(torch.nn.functional.normalize(rows, dim=1), ONE, 0.3)[0].sum()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -144,7 +153,7 @@ def test_each_kind_learns_and_stays_finite(kind):
     optimizer = torch.optim.Adam([rows, bins], 0.05)
     losses = []
     for _ in range(60):
-        parts = matching_loss(LossSettings(kind), torch.nn.functional.normalize(rows, dim=1), bins, hot, what)
+        parts = compute_matching_loss(LossSettings(kind), torch.nn.functional.normalize(rows, dim=1), bins, hot, what)
         optimizer.zero_grad()
         parts["loss"].backward()
         assert all(torch.isfinite(p.grad).all() for p in (rows, bins, hot))
@@ -152,7 +161,7 @@ def test_each_kind_learns_and_stays_finite(kind):
         losses.append(parts["loss"].item())
     assert losses[-1] < 0.5 * losses[0]
     nothing = truth([], [0, 0], [0, 1])
-    alone = matching_loss(LossSettings(kind), torch.eye(2), torch.zeros(2), hot, nothing)
+    alone = compute_matching_loss(LossSettings(kind), torch.eye(2), torch.zeros(2), hot, nothing)
     assert torch.isfinite(alone["loss"])
 
 
@@ -160,8 +169,8 @@ def test_faint_rooms_count_less():
     clear = torch.tensor([False, False, True, True])
     faint = replace(ONE, clear=clear)
     embedding, bins = torch.nn.functional.normalize(torch.tensor([[1.0, 0.5], [0, 1], [1, 0], [0.3, 1]]), dim=1), torch.zeros(4)
-    single, _ = info_nce(embedding, torch.tensor(1.0), ONE, 0.3)
-    losses = matching_loss(LossSettings(faint=0.25, dustbin=0.0), embedding, bins, torch.tensor(1.0), faint)
+    single, _ = compute_info_nce(embedding, torch.tensor(1.0), ONE, 0.3)
+    losses = compute_matching_loss(LossSettings(faint=0.25, dustbin=0.0), embedding, bins, torch.tensor(1.0), faint)
     assert losses["loss"].item() == pytest.approx(((0.25 * single[0] + single[2]) / 1.25).item())
 
 

@@ -14,12 +14,11 @@ import numpy as np
 import pytest
 
 from topomerge.errors import InputError
-from topomerge.extraction.elevations.elevation import WALL_SIGNATURE, place_probabilities
+from topomerge.extraction.elevations.elevation import WALL_SIGNATURE, compute_place_probabilities
 from topomerge.extraction.plans.plan_network import GRID_NETWORK_FILE, PLAN_NETWORK_FILE, PLAN_SIGNATURE
-from topomerge.io.weight_files import weights_file
-from topomerge.networks.network import WEIGHTS_PACKAGE, load_network, load_shipped_network, read_card
-from topomerge.networks.signature import Signature, Tensor
-from topomerge.registration.evidence.network import PLACE_SIGNATURE
+from topomerge.io.archive import find_weights_file
+from topomerge.networks.network import WEIGHTS_PACKAGE, Signature, Tensor, load_network, load_shipped_network, read_card
+from topomerge.registration.evidence.places import PLACE_SIGNATURE
 from topomerge.training.tasks import TASKS
 from topomerge.types import Array
 
@@ -32,7 +31,7 @@ SHIPPED = {
 
 
 def file_of(name: str) -> Path:
-    return weights_file(WEIGHTS_PACKAGE, name)
+    return find_weights_file(WEIGHTS_PACKAGE, name)
 
 
 def copied(name: str, folder: Path) -> Path:
@@ -56,9 +55,14 @@ def random(*shape: int) -> Array:
 
 def module_of(name: str):
     """The module of torch that a network was exported from, without its weights."""
-    from topomerge.models.place_network import PlaceLogOdds, PlaceNetwork
-    from topomerge.models.plan_unet import PlanProbabilities, PlanUNet
-    from topomerge.models.wall_network import WallNetwork, WallProbabilities
+    from topomerge.models.convolutional import (
+        PlaceLogOdds,
+        PlaceNetwork,
+        PlanProbabilities,
+        PlanUNet,
+        WallNetwork,
+        WallProbabilities,
+    )
 
     widths = read_card(file_of(name))["settings"]["widths"]
     made = {"plan_network": (PlanUNet, PlanProbabilities), "grid_network": (PlanUNet, PlanProbabilities)}
@@ -87,8 +91,8 @@ def test_what_ships_is_as_its_module_of_torch(name: str) -> None:
 @pytest.mark.longer
 def test_a_network_that_was_trained_is_exported_as_it_is_and_always_to_the_same_bytes(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
+    from topomerge.models.convolutional import WallNetwork, WallProbabilities
     from topomerge.models.export import export_network, run_with_torch
-    from topomerge.models.wall_network import WallNetwork, WallProbabilities
 
     torch.manual_seed(0)
     net = WallNetwork([4, 6, 8, 8])
@@ -121,9 +125,11 @@ def test_a_card_tells_what_the_network_does(name: str) -> None:
 
 
 def test_strips_of_no_length_have_no_places() -> None:
-    assert place_probabilities(np.zeros((0, 32, 17))).shape == (0, 7)
-    assert place_probabilities(np.zeros((2, 0, 32, 17))).shape == (2, 0, 7)
-    assert np.array_equal(place_probabilities(random(46, 32, 17)), place_probabilities(random(46, 32, 17)[None])[0])
+    assert compute_place_probabilities(np.zeros((0, 32, 17))).shape == (0, 7)
+    assert compute_place_probabilities(np.zeros((2, 0, 32, 17))).shape == (2, 0, 7)
+    assert np.array_equal(
+        compute_place_probabilities(random(46, 32, 17)), compute_place_probabilities(random(46, 32, 17)[None])[0]
+    )
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,9 @@ import pytest
 from tests.fusion.plans_of import MOVE, grid_of, off, office
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.registration.judge import Judge
-from topomerge.registration.pipeline import CLOSELY, candidate, candidates, register, repeats, rivals
+from topomerge.registration.pipeline import CLOSELY, build_candidate, build_candidates, count_repeats, register, select_rivals
 from topomerge.registration.prepared import prepare
-from topomerge.registration.verify import MARGIN_CAP, plausibility, rank
+from topomerge.registration.verify import MARGIN_CAP, rank, score_plausibility
 from topomerge.types import Sim3
 
 
@@ -38,25 +38,25 @@ def drifted(points):
 
 def test_bending_takes_away_what_drift_speaks_against(drifted):
     a, b, hypothesis = drifted
-    bent = candidate(a, b, hypothesis, scaled=False)
-    assert plausibility(bent.features) > hypothesis.score + 1
+    bent = build_candidate(a, b, hypothesis, scaled=False)
+    assert score_plausibility(bent.features) > hypothesis.score + 1
     assert bent.features["conflict_share"] < 0.5 * hypothesis.features["conflict_share"]
     assert len(bent.places) > 5 and bent.features["place_area"] == pytest.approx(bent.places.crops.area.sum())
-    assert {"moved_walls", "strain", "place_mean"} <= set(bent.closely())
+    assert {"moved_walls", "strain", "place_mean"} <= set(bent.compute_all_features())
 
 
 def test_a_right_pose_that_drift_put_second_comes_first(drifted):
     a, b, hypothesis = drifted
     shifted = rank([PoseHypothesis(Sim3(0.0, (6.0, 0.0, 0.0)) @ MOVE.inverse())], Judge(a.storeys, b.storeys))[0]
     wrong = replace(shifted, score=hypothesis.score + 0.5)  # as if walls had met by chance
-    found = candidates(a, b, [wrong, hypothesis], scaled=False)
+    found = build_candidates(a, b, [wrong, hypothesis], scaled=False)
     assert found[0].hypothesis is hypothesis and found[0].score > found[-1].score + 1 and len(found) == 2
 
 
 def test_those_that_end_in_one_pose_are_one(drifted):
     a, b, hypothesis = drifted
     near = replace(hypothesis, transform=Sim3(0.0, (0.2, 0.0, 0.0)) @ hypothesis.transform, score=hypothesis.score - 0.1)
-    assert len(candidates(a, b, [hypothesis, near], scaled=False)) == 1
+    assert len(build_candidates(a, b, [hypothesis, near], scaled=False)) == 1
 
 
 FEATURES = {
@@ -71,15 +71,15 @@ def ranked(*given: tuple[float, dict[str, float]]) -> list[PoseHypothesis]:
 
 def test_what_is_looked_at_closely():
     one = ranked((5.0, {}), (4.0, {"conflict_share": 0.4}), (5.0 - MARGIN_CAP - 0.1, {}), (-9.0, {"walls": 8.0}), (-9.5, {}))
-    assert rivals(one) == [0, 1, 2]  # the third is far behind, but no ratio speaks against it
+    assert select_rivals(one) == [0, 1, 2]  # the third is far behind, but no ratio speaks against it
     many = ranked(*((5.0 - k, {"conflict_share": 0.1 + 0.05 * k}) for k in range(CLOSELY + 2)), (-4.0, {"walls": 7.0}))
-    assert rivals(many) == [*range(CLOSELY), CLOSELY + 2]  # explains less, and nothing speaks against it
-    assert rivals(one[:1]) == [0]
+    assert select_rivals(many) == [*range(CLOSELY), CLOSELY + 2]  # explains less, and nothing speaks against it
+    assert select_rivals(one[:1]) == [0]
 
 
 def test_a_building_that_repeats_itself_is_counted():
-    assert repeats(ranked((5.0, {}), (3.0, {}), (2.0, {"walls": 8.0}), (1.0, {"walls": 3.0}))) == 2
-    assert repeats(ranked((5.0, {}), (3.0, {"conflict_share": 0.6, "worst_conflict": 0.7, "ratio": 0.2}))) == 0
+    assert count_repeats(ranked((5.0, {}), (3.0, {}), (2.0, {"walls": 8.0}), (1.0, {"walls": 3.0}))) == 2
+    assert count_repeats(ranked((5.0, {}), (3.0, {"conflict_share": 0.6, "worst_conflict": 0.7, "ratio": 0.2}))) == 0
 
 
 @pytest.mark.longer

@@ -7,15 +7,15 @@ import pytest
 
 from tests.fusion.plans_of import grid_of
 from tests.scenes import Scene
-from topomerge.matching.plan_fields import PlanFields
-from topomerge.registration.judge import Judge, _features, _smooth
-from topomerge.registration.storeys import plans
+from topomerge.matching.poses import PlanFields
+from topomerge.registration.judge import Judge, _features, _smooth_blocks
+from topomerge.registration.storeys import build_plans
 from topomerge.types import Sim3
 
 
 def test_free_space_speaks_against_a_wall():
     hall, cut = Scene().shell(0, 0, 10, 8), Scene().shell(0, 0, 10, 8).wall((5, 0), (5, 8), doors=(3.0,))
-    a, b = ([PlanFields(p) for p in plans(grid_of(s.points()))] for s in (hall, cut))
+    a, b = ([PlanFields(p) for p in build_plans(grid_of(s.points()))] for s in (hall, cut))
     judged = Judge(a, b)(Sim3())
     assert judged["conflict"] > 0.3 and judged["conflict_share"] > 0.1
     assert Judge(a, a)(Sim3())["conflict"] == 0 and Judge(a, a)(Sim3())["ratio"] > 0.95
@@ -36,11 +36,11 @@ def test_features_are_sums_and_shares_of_what_columns_meet():
 
 def test_ceilings_are_smoothed_by_the_median_of_their_block():
     columns = np.array([[0, 0], [1, 3], [11, 11], [12, 0], [0, 12]])
-    assert _smooth(np.array([1.0, 9.0, 2.0, 5.0, 7.0]), columns).tolist() == [2.0, 2.0, 2.0, 5.0, 7.0]
+    assert _smooth_blocks(np.array([1.0, 9.0, 2.0, 5.0, 7.0]), columns).tolist() == [2.0, 2.0, 2.0, 5.0, 7.0]
 
 
 def fields(points, edge: float = 0.1) -> list[PlanFields]:
-    return [PlanFields(p) for p in plans(grid_of(points, edge=edge))]
+    return [PlanFields(p) for p in build_plans(grid_of(points, edge=edge))]
 
 
 @pytest.fixture(scope="module")
@@ -78,5 +78,5 @@ def test_ceilings_are_compared_where_both_maps_saw_free_floor(room):
 
 def test_a_map_without_floor_is_lifted_to_the_ceiling(room):
     a, b = fields(room), fields(room[room[:, 2] > 1.0])
-    assert Judge(a, b).lifted(Sim3(0.0, (0.0, 0.0, 0.4))).translation[2] == pytest.approx(0.0, abs=0.06)
-    assert Judge(a, a).lifted(Sim3(0.0, (0.0, 0.0, 0.1))).translation[2] == 0.1  # floors tell the height
+    assert Judge(a, b).lift_pose(Sim3(0.0, (0.0, 0.0, 0.4))).translation[2] == pytest.approx(0.0, abs=0.06)
+    assert Judge(a, a).lift_pose(Sim3(0.0, (0.0, 0.0, 0.1))).translation[2] == 0.1  # floors tell the height

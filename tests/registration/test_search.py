@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from topomerge.matching.plan_fields import DIRECTION_STEP, direction_profile
-from topomerge.matching.poses import PoseHypothesis
-from topomerge.matching.refinement import storeys_at
-from topomerge.registration.search import SEARCH, height_offsets, scale_candidates, strongest
+from topomerge.matching.poses import DIRECTION_STEP, PoseHypothesis, compute_direction_profile, pair_storeys
+from topomerge.registration.search import SEARCH, find_height_offsets, find_scale_candidates, select_strongest
 from topomerge.types import Sim3
 
 NAN = float("nan")
@@ -23,14 +21,14 @@ def storey(floor: float, ceiling: float = NAN, guess: float | None = None, slice
 
 
 def test_every_storey_is_brought_to_every_other_one_once():
-    assert height_offsets([storey(0.0), storey(3.0)], [storey(1.0), storey(4.1)]) == pytest.approx([-1.0, -4.1, 2.0])
-    assert height_offsets([storey(3.0)], [storey(2.0)], 0.5) == [2.0]
+    assert find_height_offsets([storey(0.0), storey(3.0)], [storey(1.0), storey(4.1)]) == pytest.approx([-1.0, -4.1, 2.0])
+    assert find_height_offsets([storey(3.0)], [storey(2.0)], 0.5) == [2.0]
 
 
 def test_ceilings_tell_the_height_where_a_floor_was_not_seen_and_guesses_where_neither_was():
-    assert height_offsets([storey(0.0, 2.7)], [storey(NAN, 5.0, 2.0)]) == pytest.approx([-2.3])
-    assert height_offsets([storey(0.0)], [storey(NAN, 5.0, 2.0)]) == [-2.0]
-    assert height_offsets([storey(NAN, 2.7, 0.2)], [storey(NAN, 5.0, 2.6)], 0.5) == pytest.approx([0.2])
+    assert find_height_offsets([storey(0.0, 2.7)], [storey(NAN, 5.0, 2.0)]) == pytest.approx([-2.3])
+    assert find_height_offsets([storey(0.0)], [storey(NAN, 5.0, 2.0)]) == [-2.0]
+    assert find_height_offsets([storey(NAN, 2.7, 0.2)], [storey(NAN, 5.0, 2.6)], 0.5) == pytest.approx([0.2])
 
 
 @pytest.mark.parametrize(("gap", "meets", "guessed_meets"), [(0.45, True, True), (0.55, False, True), (1.25, False, False)])
@@ -38,18 +36,18 @@ def test_storeys_lie_on_one_level_or_not(gap, meets, guessed_meets):
     """Guesses of floors that were not seen, or were seen by a slice, may be off by more."""
 
     def on_level(plan: Any, other: Any, scale: float = 1.0) -> bool:
-        return bool(storeys_at([SimpleNamespace(plan=plan)], [SimpleNamespace(plan=other)], -2.0 + gap, scale))
+        return bool(pair_storeys([SimpleNamespace(plan=plan)], [SimpleNamespace(plan=other)], -2.0 + gap, scale))
 
     assert on_level(storey(0.0), storey(2.0)) == meets and on_level(storey(0.0), storey(4.0), 0.5) == meets
     for unseen in (storey(NAN, 5.0, 2.0), storey(2.0, sliced=True)):
         assert on_level(storey(0.0), unseen) == guessed_meets
-        assert bool(storeys_at([SimpleNamespace(plan=unseen)], [SimpleNamespace(plan=storey(0.0))], 2.0 + gap)) == guessed_meets
+        assert bool(pair_storeys([SimpleNamespace(plan=unseen)], [SimpleNamespace(plan=storey(0.0))], 2.0 + gap)) == guessed_meets
 
 
 def test_hypotheses_of_rooms_never_push_out_those_of_the_correlation():
     rooms = [PoseHypothesis(Sim3(), 0.0, from_rooms=True) for _ in range(3)]
     others = [PoseHypothesis(Sim3(), float(k)) for k in range(SEARCH.hypotheses + 20)]
-    chosen = strongest([*others, *rooms])
+    chosen = select_strongest([*others, *rooms])
     assert chosen[:3] == rooms and [h.score for h in chosen[3:]] == [float(k) for k in range(SEARCH.hypotheses + 19, 19, -1)]
 
 
@@ -61,7 +59,7 @@ def walls_of(corridors: tuple[float, ...], rows: tuple[float, ...], scale: float
     parts += [np.column_stack([along, np.full(len(along), y)]) for y in rows]
     c, s = np.cos(turn), np.sin(turn)
     walls = np.concatenate(parts) @ np.array([[c, s], [-s, c]]) * scale
-    profile = direction_profile(walls, 0.1)
+    profile = compute_direction_profile(walls, 0.1)
     return SimpleNamespace(walls=walls, profile=profile, main_direction=np.radians(profile.argmax() * DIRECTION_STEP))
 
 
@@ -70,6 +68,6 @@ def test_the_scale_brings_walls_as_far_apart_as_those_of_the_other_map(scale):
     """b is the same plan in other units, turned by 40 degrees: the best scale undoes that, and none beside it is as good."""
     plan = (0.0, 4.2, 7.1, 13.4, 15.5), (0.0, 5.3, 7.2, 11.8)
     a, b = walls_of(*plan), walls_of(*plan, 1 / scale, np.radians(40.0))
-    best = scale_candidates(a, b, [np.radians(-40.0), 0.1])[0]
+    best = find_scale_candidates(a, b, [np.radians(-40.0), 0.1])[0]
     assert best[1] == pytest.approx(np.radians(-40.0)) and best[2] == pytest.approx(scale, rel=0.02)
     assert best[0] == pytest.approx(2.0, abs=0.3)  # each direction correlates by 1 at most

@@ -14,10 +14,18 @@ from tests.fusion.plans_of import MOVE, office, part
 from topomerge.cli.main import main as cli
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.store import add, read_atlas
-from topomerge.fusion.result import merge_to_json
+from topomerge.fusion.result import serialise_merge
 from topomerge.io import archive
-from topomerge.io.exports.tf2 import frame_poses
-from topomerge.types import LEVELLED, Sim3, between_files, between_maps, checked_levelling, levelling_of, transformed
+from topomerge.io.exports.tf2 import read_frame_poses
+from topomerge.types import (
+    LEVELLED,
+    Sim3,
+    convert_pose_to_files,
+    convert_pose_to_maps,
+    parse_levelling,
+    read_levelling,
+    transform_points,
+)
 
 WITHIN = 0.15  # m
 
@@ -49,7 +57,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     halves = part(points, high=(16, 99)), MOVE.apply(part(points, low=(5, -99)))
     paths = [folder / "west.npy", folder / "east.npy"]
     for path, half, turn in zip(paths, halves, TILTS, strict=True):
-        np.save(path, transformed(turn, half).astype(np.float32))
+        np.save(path, transform_points(turn, half).astype(np.float32))
     return paths
 
 
@@ -75,13 +83,13 @@ def test_the_file_is_named(files, maps) -> None:
 
 def test_transforms_apply_to_the_files(files, merged) -> None:
     assert merged.merged
-    listing = json.loads(json.dumps(merge_to_json(merged)))
+    listing = json.loads(json.dumps(serialise_merge(merged)))
     points = np.load(files[1]).astype(np.float64)
     matrix = np.array(listing["transforms"]["1"]["matrix"])
-    assert np.abs(transformed(matrix, points) - transformed(truth(), points)).max() < WITHIN
+    assert np.abs(transform_points(matrix, points) - transform_points(truth(), points)).max() < WITHIN
     assert np.array_equal(matrix, merged.file_transforms[1])
     into = np.array(listing["maps"][0][LEVELLED])
-    there = transformed(into @ matrix, points)  # in the frame of the joined map
+    there = transform_points(into @ matrix, points)  # in the frame of the joined map
     low, high = merged.map.grid.bounds
     assert (there.min(axis=0) > low - WITHIN).all() and (there.max(axis=0) < high + WITHIN).all()
     assert np.array_equal(merged.map.levelling, into)
@@ -91,9 +99,9 @@ def test_a_level_map_has_no_levelling(maps) -> None:
     level = tm.extract(office().points())
     assert np.array_equal(level.levelling, np.eye(4)) and LEVELLED not in level.parameters
     pose = Sim3(0.3, (1.0, 2.0, 0.0))
-    assert between_files(pose, np.eye(4), np.eye(4)).tolist() == pose.matrix.tolist()
+    assert convert_pose_to_files(pose, np.eye(4), np.eye(4)).tolist() == pose.matrix.tolist()
     one, other = (m.levelling for m in maps)
-    assert np.allclose(between_maps(between_files(pose, one, other), one, other), pose.matrix)
+    assert np.allclose(convert_pose_to_maps(convert_pose_to_files(pose, one, other), one, other), pose.matrix)
 
 
 def test_maps_keep_it_and_damaged_ones_are_refused(maps, tmp_path: Path) -> None:
@@ -109,13 +117,13 @@ def test_maps_keep_it_and_damaged_ones_are_refused(maps, tmp_path: Path) -> None
             tm.load_map(path)
     for wrong in (np.full((4, 4), np.nan), np.zeros((4, 4))):
         with pytest.raises(ValueError, match="levelling"):
-            checked_levelling(wrong)
-    assert np.array_equal(levelling_of({}), np.eye(4))
+            parse_levelling(wrong)
+    assert np.array_equal(read_levelling({}), np.eye(4))
 
 
 def test_frames_of_ros_are_those_of_the_files(merged, tmp_path: Path) -> None:
     merged.save(tmp_path / "m")
-    (pose,) = frame_poses(tmp_path / "m")
+    (pose,) = read_frame_poses(tmp_path / "m")
     assert pose.tilted is not None
     (path,) = tm.save_export(merged.map, "tf2", tmp_path / "a.launch.xml", transforms=[pose])
     words = path.read_text().replace('"', " ").split()
@@ -127,15 +135,18 @@ def test_frames_of_ros_are_those_of_the_files(merged, tmp_path: Path) -> None:
 
 def test_an_atlas_keeps_it(maps, tmp_path: Path) -> None:
     folder = tmp_path / "atlas"
-    add(folder, list(zip(("west", "east"), maps, strict=True)), tm.atlas_html)
+    add(folder, list(zip(("west", "east"), maps, strict=True)), tm.render_atlas_html)
     listing = json.loads((folder / "atlas.json").read_text())
     matrix = np.array(listing["transforms"]["1"]["matrix"])
     place = np.array([[8.0, 4.0, 1.0]])
-    assert np.abs(transformed(matrix, transformed(TILTS[1], MOVE.apply(place))) - transformed(TILTS[0], place)).max() < WITHIN
+    assert (
+        np.abs(transform_points(matrix, transform_points(TILTS[1], MOVE.apply(place))) - transform_points(TILTS[0], place)).max()
+        < WITHIN
+    )
     stored = read_atlas(folder)
-    component, pose = stored.poses()["east"]
-    assert component == 0 and np.allclose(between_files(pose, maps[1].levelling, maps[0].levelling), matrix)
-    assert stored.lying()
+    component, pose = stored.get_poses()["east"]
+    assert component == 0 and np.allclose(convert_pose_to_files(pose, maps[1].levelling, maps[0].levelling), matrix)
+    assert stored.compute_relative_poses()
 
 
 def test_points_are_levelled_and_placed(files, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -150,7 +161,7 @@ def test_points_are_levelled_and_placed(files, tmp_path: Path, capsys: pytest.Ca
         assert np.ptp(cloud[:, 2]) < 2.9
     matrix = np.array(json.loads((tmp_path / "m" / "merge.json").read_text())["transforms"]["1"]["matrix"])
     level = np.array(json.loads((tmp_path / "m" / "merge.json").read_text())["maps"][0][LEVELLED])
-    assert np.abs(transformed(level @ matrix, np.load(files[1])) - clouds[1]).max() < WITHIN
+    assert np.abs(transform_points(level @ matrix, np.load(files[1])) - clouds[1]).max() < WITHIN
 
 
 @pytest.mark.data
@@ -166,7 +177,7 @@ def test_the_case(case_dir: Path, tmp_path: Path) -> None:
     level = tm.extract(points)
     for degrees in (2.0, 5.0, 12.0):
         turn = tilt(degrees, 0.0)
-        a = tm.extract(transformed(turn, points).astype(np.float32))
+        a = tm.extract(transform_points(turn, points).astype(np.float32))
         assert a.warnings == (f"tilted by {degrees:.1f} degrees: levelled",)
         assert len(a.storeys) == 1 and set(a.edges["kind"]) <= {"door", "opening"}
         assert abs(len(a.rooms) - len(level.rooms)) <= 1  # a corner of 1 m2 comes and goes with the lattice of cells
@@ -175,4 +186,4 @@ def test_the_case(case_dir: Path, tmp_path: Path) -> None:
         assert result.merged and result.probability > 0.99
         place = b.rooms["centroid"]
         straight = tm.merge([level, b]).transforms[1].apply(place)
-        assert np.abs(transformed(np.linalg.inv(turn) @ result.file_transforms[1], place) - straight).max() < 0.1
+        assert np.abs(transform_points(np.linalg.inv(turn) @ result.file_transforms[1], place) - straight).max() < 0.1

@@ -18,18 +18,18 @@ from topomerge.registration.verify import (
     PLAN_VECTOR,
     POSE_VECTOR,
     WINNER_VECTOR,
-    bent_pose_vector,
-    bent_score,
-    furniture_log_odds,
-    lead,
-    model,
-    plan_odds,
-    plan_vector,
-    plausibility,
-    quality_lag,
-    vector,
-    verdict,
-    winner_vector,
+    compute_bent_pose_vector,
+    compute_furniture_log_odds,
+    compute_lead,
+    compute_plan_odds,
+    compute_plan_vector,
+    compute_pose_vector,
+    compute_quality_lag,
+    compute_verdict,
+    compute_winner_vector,
+    load_model,
+    score_bent,
+    score_plausibility,
 )
 from topomerge.types import Sim3
 
@@ -40,7 +40,7 @@ def points():
 
 
 def test_the_calibration_fits_its_features():
-    found = model()
+    found = load_model()
     assert tuple(found["names"]) == BELIEF_VECTOR
     for kind in ("solid", "flat"):
         sizes = {"pose": len(POSE_VECTOR), "bent": len(BENT_POSE_VECTOR), "winner": len(BELIEF_VECTOR)}
@@ -55,7 +55,7 @@ def test_the_calibration_fits_its_features():
 def test_nothing_at_all_gives_numbers():
     known = dict.fromkeys(("tall_conflict", "crossing", "squares", "bad_squares", "in_place", "pieces", "by_chance"), 0.0)
     known |= {"moved_walls": 0.0, "worst_ratio": 0.5, "hanging": 0.0, "hanging_met": 0.0, "free": 0.0}
-    assert np.isfinite(winner_vector(known)).all() and len(winner_vector(known)) == len(WINNER_VECTOR)
+    assert np.isfinite(compute_winner_vector(known)).all() and len(compute_winner_vector(known)) == len(WINNER_VECTOR)
 
 
 def test_amounts_grow_no_more_on_large_floors():
@@ -64,9 +64,9 @@ def test_amounts_grow_no_more_on_large_floors():
     shares = {"crossing": 20.0, "squares": 20.0, "bad_squares": 0.1, "moved_walls": 0.02, "worst_ratio": 0.7}
     names = [WINNER_VECTOR.index(n) for n in ("tall", "in_place", "out_of_place", "hanging", "fallen")]
     floors = [{**shares, **{k: m * v for k, v in amounts.items()}, "free": m * 2000.0} for m in (1.0, 10.0)]
-    one, ten = (winner_vector(f)[names] for f in floors)
+    one, ten = (compute_winner_vector(f)[names] for f in floors)
     assert np.allclose(one, ten, atol=0.1)
-    small = winner_vector({**floors[0], "free": 20.0})[names]
+    small = compute_winner_vector({**floors[0], "free": 20.0})[names]
     assert (small > one + 0.5).all()
 
 
@@ -108,7 +108,7 @@ GOOD = {
 
 def seen(**changes: float) -> dict[str, float]:
     """The vector of features by name."""
-    return dict(zip(POSE_VECTOR, vector({**FEATURES, **changes}).tolist(), strict=True))
+    return dict(zip(POSE_VECTOR, compute_pose_vector({**FEATURES, **changes}).tolist(), strict=True))
 
 
 def test_the_vector_of_a_pose_by_hand():
@@ -131,7 +131,7 @@ def test_shares_of_little_are_drawn_to_what_is_usual():
 
 
 def test_places_count_by_their_mean_their_number_and_the_worst():
-    by_name = dict(zip(BENT_POSE_VECTOR, bent_pose_vector({**FEATURES, **PLACES}).tolist(), strict=True))
+    by_name = dict(zip(BENT_POSE_VECTOR, compute_bent_pose_vector({**FEATURES, **PLACES}).tolist(), strict=True))
     assert by_name["place_mean"] == 1.5 and by_name["place_worst"] == 0.5
     assert by_name["place_total"] == pytest.approx(1.5 * np.log1p(100 / 20))
 
@@ -139,8 +139,8 @@ def test_places_count_by_their_mean_their_number_and_the_worst():
 def test_the_lead_over_rivals_by_hand():
     scores, one = np.array([5.0, 4.0, 1.0]), np.ones(len(BENT_POSE_VECTOR))
     features = [{**FEATURES, **PLACES, **more} for more in ({}, {"walls": 7.0}, {"walls": 5.0, "ratio": 0.9})]
-    vectors = np.array([bent_pose_vector(f) for f in features])
-    margin, ahead, alone, share = lead(scores, vectors, one, 2 * one)
+    vectors = np.array([compute_bent_pose_vector(f) for f in features])
+    margin, ahead, alone, share = compute_lead(scores, vectors, one, 2 * one)
     of_odds = 1 / (1 + np.exp(-1) + np.exp(-4))
     assert margin == 1.0 and alone == pytest.approx(np.log(of_odds / (1 - of_odds + 1e-3)))
     names = ("ratio", "conflict", "worst", "opposed", "lift", "sliced_conflict", "level", "ceilings", "place_mean", "place_worst")
@@ -149,24 +149,24 @@ def test_the_lead_over_rivals_by_hand():
     # The amounts of the second count in part. The third explains too little, and counts as it scores.
     near = AMOUNT_COUNTS * -1.0 + (1 - AMOUNT_COUNTS) * min(quality[1] - quality[0], 0.0)
     assert share == pytest.approx(1 / (1 + np.exp(max(near, -1.0)) + np.exp(-4))) and share < of_odds
-    assert lead(scores[:1], vectors[:1], one, one)[:3] == (MARGIN_CAP, MARGIN_CAP, pytest.approx(MARGIN_CAP))
+    assert compute_lead(scores[:1], vectors[:1], one, one)[:3] == (MARGIN_CAP, MARGIN_CAP, pytest.approx(MARGIN_CAP))
 
 
 def test_a_rival_explains_enough_and_ratios_speak_for_it():
     ranked = [PoseHypothesis(Sim3(), 0.0, features={**FEATURES, **m}) for m in ({}, {"ratio": 0.7}, {"walls": 5.0, "ratio": 0.9})]
-    lag = quality_lag(ranked)
+    lag = compute_quality_lag(ranked)
     assert lag[0] == 0 and 0 <= lag[1] < np.inf and lag[2] == np.inf
 
 
 def test_the_probability_is_at_most_the_share_of_the_odds():
     """A second pose that is as good halves what the first may be believed; the rest share as their odds do."""
-    alone = verdict([GOOD], {**GOOD, **QUIET})
+    alone = compute_verdict([GOOD], {**GOOD, **QUIET})
     assert alone.each[0] > 0.8 and len(alone.each) == 1 and sum(alone.posterior.values()) == pytest.approx(1.0)
     worse = {**GOOD, "walls": 60.0, "free": 300.0}
-    halved = verdict([GOOD, GOOD, worse], {**GOOD, **QUIET})
-    behind = np.exp(bent_score(worse) - bent_score(GOOD))
+    halved = compute_verdict([GOOD, GOOD, worse], {**GOOD, **QUIET})
+    behind = np.exp(score_bent(worse) - score_bent(GOOD))
     for same in ("building", "storey"):  # whatever is known of the maps, two places are as good
-        assert verdict([GOOD, GOOD, worse], {**GOOD, **QUIET}, same).each[0] <= 1 / (2 + behind) + 1e-12
+        assert compute_verdict([GOOD, GOOD, worse], {**GOOD, **QUIET}, same).each[0] <= 1 / (2 + behind) + 1e-12
     assert halved.each[0] <= 1 / (2 + behind) and halved.each[1] == pytest.approx(halved.each[0])
     assert halved.each[2] == pytest.approx(halved.each[0] * behind)
     assert tuple(halved.posterior) == POSTERIOR and halved.posterior["here"] == halved.each[0]
@@ -175,7 +175,7 @@ def test_the_probability_is_at_most_the_share_of_the_odds():
 def test_what_the_user_knows_never_lowers_a_merge():
     for first in (GOOD, {**GOOD, "walls": 9.0, "free": 30.0}):
         each = [
-            verdict([first], {**first, **QUIET, "moved_walls": 0.02}, known).each[0]
+            compute_verdict([first], {**first, **QUIET, "moved_walls": 0.02}, known).each[0]
             for known in ("nothing", "building", "storey")
         ]
         assert each == sorted(each) and each[0] < each[2]
@@ -186,27 +186,29 @@ def test_more_evidence_for_the_same_place_never_lowers_it():
     few = {**GOOD, "walls": 12.0, "free": 60.0, "place_area": 60.0}
     more = {**few, "walls": 20.0, "free": 90.0, "place_area": 90.0, "place_worst": 0.6, "share": 0.75}
     winners = {**QUIET, "squares": 12.0, "crossing": 5.0}, {**QUIET, "squares": 16.0, "crossing": 8.0}
-    one, two = (verdict([f], {**f, **w}).each[0] for f, w in zip((few, more), winners, strict=True))
+    one, two = (compute_verdict([f], {**f, **w}).each[0] for f, w in zip((few, more), winners, strict=True))
     assert two >= one
 
 
 def test_one_square_metre_abstains():
     little = {**GOOD, "walls": 0.9, "free": 400.0}
-    assert verdict([little], {**little, **QUIET}).each[0] <= FEW
-    assert verdict([{**GOOD, "free": 3.0}], {**GOOD, **QUIET, "free": 3.0}).posterior["here"] <= FEW
+    assert compute_verdict([little], {**little, **QUIET}).each[0] <= FEW
+    assert compute_verdict([{**GOOD, "free": 3.0}], {**GOOD, **QUIET, "free": 3.0}).posterior["here"] <= FEW
 
 
 @pytest.mark.parametrize(
     "change", [{"conflict_share": 0.3, "worst_conflict": 0.3, "conflict": 8.0}, {"met": 0.2}, {"free": 10.0}]
 )
 def test_what_speaks_against_a_pose_makes_it_less_plausible(change):
-    assert plausibility({**FEATURES, **change}) < plausibility(FEATURES)
-    assert plausibility({**FEATURES, "sliced": 1.0}) != plausibility(FEATURES)  # slices are judged by models of their own
+    assert score_plausibility({**FEATURES, **change}) < score_plausibility(FEATURES)
+    assert score_plausibility({**FEATURES, "sliced": 1.0}) != score_plausibility(
+        FEATURES
+    )  # slices are judged by models of their own
 
 
 def test_furniture_tells_places_of_one_plan_and_nothing_does_where_none_is_seen():
     def odds(pieces: float, in_place: float, by_chance: float) -> float:
-        return furniture_log_odds({"pieces": pieces, "in_place": in_place, "by_chance": by_chance})
+        return compute_furniture_log_odds({"pieces": pieces, "in_place": in_place, "by_chance": by_chance})
 
     assert odds(0.0, 0.0, 0.0) == pytest.approx(0.0)
     assert odds(10.0, 1.0, 1.0) < -1 < 1 < odds(10.0, 8.0, 1.0)
@@ -218,20 +220,20 @@ def test_furniture_tells_places_of_one_plan_and_nothing_does_where_none_is_seen(
 
 def test_a_place_of_the_same_plan_gains_by_what_speaks_for_it_alone():
     fitted = {"mean": [0.0, 0.0], "scale": [1.0, 1.0], "weight": [2.0, 1.0], "bias": 1.0}
-    nothing, against, in_favour = plan_odds(fitted, np.array([[0.0, 0.0], [-1.0, 0.0], [1.5, 0.0]]))
+    nothing, against, in_favour = compute_plan_odds(fitted, np.array([[0.0, 0.0], [-1.0, 0.0], [1.5, 0.0]]))
     assert nothing == in_favour == 0 and against == pytest.approx(np.exp(1.0) - np.exp(-1.0))
     solid = {"pieces": 10.0, "in_place": 1.0, "by_chance": 1.0, "sliced": 0.0}
-    told, sliced = plan_vector(solid), plan_vector({**solid, "sliced": 1.0})
+    told, sliced = compute_plan_vector(solid), compute_plan_vector({**solid, "sliced": 1.0})
     assert told[1] == sliced[0] == 0 and told[0] == sliced[1] < -1
 
 
 def test_furniture_that_stands_elsewhere_on_both_sides_is_refused_however_much_walls_agree():
     same = {**GOOD, **QUIET, "pieces": 12.0, "in_place": 9.0, "by_chance": 1.0}
     other = {**same, "in_place": 1.2}
-    believed, refused = (verdict([f], f) for f in (same, other))
+    believed, refused = (compute_verdict([f], f) for f in (same, other))
     assert believed.posterior["here"] > 0.9 and refused.posterior["here"] < 0.4
     assert refused.posterior["storey"] + refused.posterior["half"] > 0.5
-    known = verdict([other], other, "storey")
+    known = compute_verdict([other], other, "storey")
     assert known.posterior["storey"] == 0 and known.posterior["here"] > refused.posterior["here"]
 
 
@@ -239,5 +241,5 @@ def test_furniture_that_stands_elsewhere_on_both_sides_is_refused_however_much_w
     ("pieces", "in_place", "by_chance"), [(10.0, 10.0, 10.0), (0.3, 0.4, 0.9), (50.0, 0.0, 50.0), (1e-9, 0.0, 0.0)]
 )
 def test_odds_of_furniture_are_numbers_however_crowded_a_room_is(pieces, in_place, by_chance):
-    odds = furniture_log_odds({"pieces": pieces, "in_place": in_place, "by_chance": by_chance})
+    odds = compute_furniture_log_odds({"pieces": pieces, "in_place": in_place, "by_chance": by_chance})
     assert np.isfinite(odds) and abs(odds) < 30

@@ -7,21 +7,21 @@ import pytest
 
 from tests.fusion.plans_of import MOVE, grid_of, office, part
 from tests.scenes import Scene
-from topomerge.matching.plan_fields import PlanFields
-from topomerge.registration.judge import Judge, winner_features
+from topomerge.matching.poses import PlanFields
+from topomerge.registration.judge import Judge, compute_winner_features
 from topomerge.registration.pipeline import register
-from topomerge.registration.storeys import plans
+from topomerge.registration.storeys import build_plans
 from topomerge.types import Sim3
 
 
 def storeys(points):
-    return tuple(PlanFields(p) for p in plans(grid_of(points)))
+    return tuple(PlanFields(p) for p in build_plans(grid_of(points)))
 
 
 def seen(a, b, pose=None):
     """Features of points, or of the storeys of points, upon others."""
     fields = (points if isinstance(points, tuple) else storeys(points) for points in (a, b))
-    return winner_features(Judge(*fields), pose or Sim3())
+    return compute_winner_features(Judge(*fields), pose or Sim3())
 
 
 def stretched(points, beyond=14.0, by=1.6):

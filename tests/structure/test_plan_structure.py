@@ -12,8 +12,8 @@ import shapely
 import topomerge
 from tests.io.export_maps import flat, nothing, stair_scene, two_floors
 from tests.scenes import HEIGHT, THICK, Scene, corridor, rectangle, two_rooms
-from topomerge.structure.plan_structure import PlanStructure, plan_structure
-from topomerge.structure.walls import wall_part
+from topomerge.structure.plan_structure import PlanStructure, build_plan_structure
+from topomerge.structure.walls import build_wall_polygon
 from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, WINDOW_DTYPE, TopometricMap, VoxelGrid
 
 OFF = np.array([0.013, 0.017])  # by which scenes are moved off the lattice
@@ -23,7 +23,7 @@ NEAR = 0.03  # m
 def structure(scene: Scene, turn: float = 0.0, noise: float = 0.0) -> PlanStructure:
     c, s = np.cos(turn), np.sin(turn)
     points = scene.points(noise) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-    return plan_structure(topomerge.extract(points.astype(np.float32)))
+    return build_plan_structure(topomerge.extract(points.astype(np.float32)))
 
 
 def expected(*corners: tuple[float, float], turn: float = 0.0) -> shapely.Polygon:
@@ -50,9 +50,11 @@ def test_a_room_whose_walls_are_seen_from_inside(turn, noise):
     assert is_room(outline, box(0, 0, 5, 4, turn))
     assert len(plan.walls) == 4 and (plan.walls["faces"] == 1).all() and (plan.walls["rooms"] == (0, -1)).all()
     for wall in plan.walls:
-        assert wall_part(wall).intersection(outline).area < NEAR * 5 and wall_part(wall).distance(outline) < NEAR
+        assert (
+            build_wall_polygon(wall).intersection(outline).area < NEAR * 5 and build_wall_polygon(wall).distance(outline) < NEAR
+        )
         assert [wall["low"], wall["high"]] == pytest.approx([0.02, HEIGHT], abs=0.1)
-    ring = shapely.union_all([wall_part(wall) for wall in plan.walls])
+    ring = shapely.union_all([build_wall_polygon(wall) for wall in plan.walls])
     assert len(ring.interiors) == 1, "walls meet at the corners"
 
 
@@ -64,8 +66,8 @@ def test_two_rooms_share_a_wall_with_a_door(turn):
     assert is_room(rooms[0], box(4.1, 0, 7, 5, turn)) and is_room(rooms[1], box(0, 0, 3.9, 5, turn))
     (shared,) = plan.walls[plan.walls["faces"] == 2]
     assert shared["thickness"] == pytest.approx(0.2, abs=0.02) and sorted(shared["rooms"]) == [0, 1]
-    assert wall_part(shared).intersection(box(3.9, 0, 4.1, 5, turn)).area == pytest.approx(1.0, abs=0.1)
-    assert all(room.distance(wall_part(shared)) < 0.005 for room in rooms), "a room ends at the face"
+    assert build_wall_polygon(shared).intersection(box(3.9, 0, 4.1, 5, turn)).area == pytest.approx(1.0, abs=0.1)
+    assert all(room.distance(build_wall_polygon(shared)) < 0.005 for room in rooms), "a room ends at the face"
     (opening,) = plan.openings
     assert plan.walls[opening["wall"]] == shared and opening["kind"] == "door"
     door = shapely.affinity.rotate(shapely.Point(np.array([4.0, 2.0]) + OFF), np.degrees(turn), origin=(0, 0))
@@ -117,14 +119,14 @@ def test_a_round_wall_is_several_straight_ones():
     assert len(plan.walls) >= 8
     length = shapely.length([shapely.LineString([w["start"], w["end"]]) for w in plan.walls]).sum()
     assert length > 0.8 * 2 * np.pi * 3
-    assert all(wall_part(wall).difference(around).area < 0.1 * wall_part(wall).area for wall in plan.walls)
+    assert all(build_wall_polygon(wall).difference(around).area < 0.1 * build_wall_polygon(wall).area for wall in plan.walls)
 
 
 def same(a: PlanStructure, b: PlanStructure, moved) -> None:
     """Is the second the first one, moved?"""
     assert len(a.walls) == len(b.walls) and len(a.openings) == len(b.openings)
-    walls = [shapely.transform(wall_part(wall), moved) for wall in a.walls]
-    others = shapely.STRtree([wall_part(wall) for wall in b.walls])
+    walls = [shapely.transform(build_wall_polygon(wall), moved) for wall in a.walls]
+    others = shapely.STRtree([build_wall_polygon(wall) for wall in b.walls])
     for wall, shape in zip(a.walls, walls, strict=True):
         near = others.geometries[others.nearest(shape.centroid)]
         twin = max(others.geometries, key=lambda other: other.intersection(shape).area, default=near)
@@ -146,8 +148,8 @@ def test_a_moved_map_has_the_same_walls_moved():
         storeys[name] += shift[2]
     grids = {name: replace(getattr(map, name), origin=getattr(map, name).origin + shift) for name in ("grid", "navigable")}
     same(
-        plan_structure(map),
-        plan_structure(replace(map, rooms=rooms, edges=edges, storeys=storeys, **grids)),
+        build_plan_structure(map),
+        build_plan_structure(replace(map, rooms=rooms, edges=edges, storeys=storeys, **grids)),
         lambda p: p + shift[:2],
     )
 
@@ -177,12 +179,12 @@ def test_a_turned_map_has_the_same_walls_turned():
     tables = {"rooms": rooms, "edges": edges, "room": map.room[rows], "navigable_room": map.navigable_room[walked]}
     areas = {"navigable_area": map.navigable_area[walked]}
     turned = replace(map, grid=grid, navigable=navigable, **tables, **areas)
-    same(plan_structure(map), plan_structure(turned), lambda p: p[:, ::-1] * (-1, 1))
+    same(build_plan_structure(map), build_plan_structure(turned), lambda p: p[:, ::-1] * (-1, 1))
 
 
 @pytest.mark.longer
 def test_storeys_have_walls_of_their_own():
-    plan = plan_structure(topomerge.extract(stair_scene().points()))
+    plan = build_plan_structure(topomerge.extract(stair_scene().points()))
     for storey, floor in enumerate((0.0, 3.0)):
         walls = plan.walls[plan.walls["storey"] == storey]
         assert len(walls) >= 7 and walls["low"] == pytest.approx(floor, abs=0.15)
@@ -194,7 +196,7 @@ def test_a_neighbours_face_is_not_taken_for_ones_own():
     scene = Scene().shell(0, 0, 7, 5).wall((4, 0), (4, 5), doors=(2.0,))
     points = scene.points()
     hidden = (np.abs(points[:, 0] - 4 - THICK / 2 - OFF[0]) < 0.01) & (points[:, 1] > 2.6) & (points[:, 1] < 4.9)
-    plan = plan_structure(topomerge.extract(points[~hidden]))
+    plan = build_plan_structure(topomerge.extract(points[~hidden]))
     right = min(plan.rooms, key=lambda room: room.area)
     assert right.symmetric_difference(box(4 + THICK / 2, 0, 7, 5)).area < 0.4
     left = max(plan.rooms, key=lambda room: room.area)
@@ -204,25 +206,25 @@ def test_a_neighbours_face_is_not_taken_for_ones_own():
 @pytest.mark.longer
 def test_openings_lie_in_walls_that_part_their_rooms():
     map = topomerge.extract(corridor().points())
-    plan = plan_structure(map)
+    plan = build_plan_structure(map)
     assert len(plan.openings) == 8 and (plan.openings["wall"] >= 0).all()
     for opening in plan.openings:
         wall = plan.walls[opening["wall"]]
         assert sorted(wall["rooms"]) == sorted(map.edges["rooms"][opening["edge"]])
-        assert wall_part(wall, opening).difference(wall_part(wall).buffer(1e-6)).is_empty
+        assert build_wall_polygon(wall, opening).difference(build_wall_polygon(wall).buffer(1e-6)).is_empty
 
 
 def test_without_means_of_points_outlines_are_floors():
     map = two_floors()
-    plan = plan_structure(map)
+    plan = build_plan_structure(map)
     assert (plan.walls["faces"] == 2).sum() == 4 and (plan.openings["wall"] >= 0).all()
     assert plan.walls["thickness"][plan.walls["faces"] == 2] == pytest.approx(0.1, abs=0.05)
 
 
 def test_maps_without_walls():
-    assert len(plan_structure(nothing()).walls) == len(plan_structure(nothing()).openings) == 0
+    assert len(build_plan_structure(nothing()).walls) == len(build_plan_structure(nothing()).openings) == 0
     bare = flat(np.ones((40, 50), bool))
-    plan = plan_structure(bare)
+    plan = build_plan_structure(bare)
     assert len(plan.walls) == 0 and plan.rooms[0].area == pytest.approx(20.0)
 
 
@@ -243,7 +245,7 @@ def test_noise_gives_valid_walls_and_rooms(seed):
     edges["width"], edges["direction"] = 2 * rng.random(2), 3 * rng.random(2)
     labels = rng.integers(-1, 3, len(grid)).astype(np.int32), rng.integers(0, 3, len(navigable)).astype(np.int32)
     storey = np.array([(0.1, 2.5, 1.0)], STOREY_DTYPE)
-    plan = plan_structure(TopometricMap(grid, labels[0], navigable, labels[1], rooms, edges, storey))
+    plan = build_plan_structure(TopometricMap(grid, labels[0], navigable, labels[1], rooms, edges, storey))
     assert all(room.is_valid for room in plan.rooms) and len(plan.openings) == 2
     assert all(a.intersection(b).area < 1e-6 for a, b in combinations(plan.rooms, 2))
     assert (plan.walls["high"] > plan.walls["low"]).all() and (plan.walls["thickness"] > 0).all()
@@ -261,7 +263,7 @@ def test_a_storey_without_rooms():
     labels = {"room": number[map.room], "navigable_room": number[map.navigable_room]}
     half: TopometricMap = replace(map, rooms=map.rooms[below], edges=kept_edges, **labels, **no_areas)
     assert half.rooms.dtype == ROOM_DTYPE and len(half.storeys) == 2
-    plan = plan_structure(half)
+    plan = build_plan_structure(half)
     assert (plan.walls["storey"] == 0).all() and len(plan.walls)
 
 
@@ -277,6 +279,6 @@ def test_windows_below_the_floor_are_drawn_above_it() -> None:
     windows = np.zeros(4, WINDOW_DTYPE)
     windows["rooms"], windows["centre"], windows["width"] = (0, -1), map.rooms["centroid"][0], 1.0
     windows["sill"], windows["head"] = [-3.0, np.nan, -0.5, 0.9], [-2.0, -2.0, np.nan, 1.1]
-    panes = plan_structure(replace(map, windows=windows)).windows
+    panes = build_plan_structure(replace(map, windows=windows)).windows
     assert (panes["sill"] >= 0).all() and (panes["head"] > panes["sill"]).all()
     assert panes["sill"][3] == pytest.approx(0.9) and panes["head"][3] == pytest.approx(1.1)  # what was seen stays

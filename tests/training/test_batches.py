@@ -12,14 +12,13 @@ from torch_geometric.data import Batch
 from torch_geometric.loader import DataLoader
 
 from tests.graphs import pair
+from topomerge.embedding.graph import find_column
 from topomerge.embedding.network import Geometry, Network, Node
-from topomerge.embedding.schema import column
 from topomerge.embedding.surroundings import CROP_SHAPES
-from topomerge.training import other_sensors, turned_views
-from topomerge.training.batches import ChangedPairs, MapPair, make_batch, map_pair
-from topomerge.training.packed import Graph, GraphPair
+from topomerge.training import batches
+from topomerge.training.batches import AugmentedPairs, MapPair, add_views, augment_sheet, build_map_pair, make_batch, mirror_graph
+from topomerge.training.packed_pairs import Graph, GraphPair
 from topomerge.training.settings import Augment
-from topomerge.training.turned_views import changed_sheet, mirrored, with_views
 
 
 @pytest.mark.parametrize(
@@ -50,7 +49,7 @@ def test_matches_lead_to_rooms_of_the_batch():
 
 def test_the_loader_of_torch_geometric_makes_the_same_batches():
     pairs, names = [pair(k, 6) for k in range(4)], ("x", "edge_index", "edge_attr", "near_index", "near_attr")
-    loader = DataLoader([map_pair(p, names) for p in pairs], batch_size=2)
+    loader = DataLoader([build_map_pair(p, names) for p in pairs], batch_size=2)
     for batch, start in zip(loader, (0, 2), strict=True):
         again = make_batch(pairs[start : start + 2], names)
         assert all(torch.equal(batch[name], again[name]) for name in (*names, "match_index", "clear", "batch"))
@@ -66,7 +65,9 @@ def test_rooms_that_are_left_out_take_their_matches_along():
 
 def test_changes_of_a_pair_depend_on_its_seed_only():
     pairs, names = [pair(k, 8) for k in range(4)], ("x", "edge_index", "edge_attr")
-    first, again, later = (ChangedPairs(pairs, names, Augment(), seed_of) for seed_of in (int, int, lambda number: number + 100))
+    first, again, later = (
+        AugmentedPairs(pairs, names, Augment(), seed_of) for seed_of in (int, int, lambda number: number + 100)
+    )
     together = next(iter(DataLoader(first, batch_sampler=[[3, 1]])))
     alone = Batch.from_data_list([again[3], again[1]])
     assert len(first) == 4 and torch.equal(together.x, alone.x) and torch.equal(together.edge_index, alone.edge_index)
@@ -92,12 +93,12 @@ def turned_pair(seed: int, quarters: int) -> GraphPair:
 @pytest.mark.parametrize("quarters", range(4))
 def test_maps_are_trained_on_as_they_truly_stand(quarters, monkeypatch):
     """Both maps have the same crops, turned alike; b comes once more, turned otherwise, with no partner."""
-    monkeypatch.setattr(other_sensors, "SEEN_AS", (((), 1.0),))
-    monkeypatch.setattr(other_sensors, "PATCHES", 0)
+    monkeypatch.setattr(batches, "SEEN_AS", (((), 1.0),))
+    monkeypatch.setattr(batches, "PATCHES", 0)
     nothing = Augment(0.0, 0.0, 0.0, noise=0.0, shift=0.0, walks=0.0, slices=0.0, rough=0.0, tilt=0.0, zoom=0.0, bend=0.0)
     one = turned_pair(3, quarters)
-    assert turned_views.quarters_between(one) == quarters
-    batch = map_pair(one, ORIENTED_NAMES, nothing, torch.Generator().manual_seed(1))
+    assert batches.compute_quarter_turns(one) == quarters
+    batch = build_map_pair(one, ORIENTED_NAMES, nothing, torch.Generator().manual_seed(1))
     count = len(one.a["x"])
     first, second, wrong = batch.surroundings.split(count)
     assert torch.equal(first, second) and not torch.equal(first, wrong)
@@ -107,14 +108,14 @@ def test_maps_are_trained_on_as_they_truly_stand(quarters, monkeypatch):
 
 
 def test_a_mirrored_map_has_mirrored_crops_ways_and_turns():
-    seen = with_views(pair(1).a, ORIENTED_NAMES)
-    other = mirrored(seen)
+    seen = add_views(pair(1).a, ORIENTED_NAMES)
+    other = mirror_graph(seen)
     assert torch.equal(other["surroundings"], seen["surroundings"].flip(2))
     assert torch.equal(other["edge_way"], seen["edge_way"] * torch.tensor([1.0, -1.0, 1.0, -1.0]))
-    sine, cosine = column("edge_attr", "turn_sin"), column("edge_attr", "turn_cos")
+    sine, cosine = find_column("edge_attr", "turn_sin"), find_column("edge_attr", "turn_cos")
     assert torch.equal(other["edge_attr"][:, sine], -seen["edge_attr"][:, sine])
     assert torch.equal(other["edge_attr"][:, cosine], seen["edge_attr"][:, cosine])
-    assert all(torch.equal(mirrored(other)[name], seen[name]) for name in ORIENTED_NAMES)
+    assert all(torch.equal(mirror_graph(other)[name], seen[name]) for name in ORIENTED_NAMES)
 
 
 def mirrored_sheet(graph: Graph) -> Graph:
@@ -131,18 +132,18 @@ def mirrored_sheet(graph: Graph) -> Graph:
 @pytest.mark.parametrize("part", [*CROP_SHAPES, "edge_way"])
 def test_crops_and_ways_of_a_mirrored_sheet_are_the_mirrored_ones(part):
     one = pair(1).a
-    seen = with_views(mirrored_sheet(one), [part])[part]
-    assert torch.equal(seen, mirrored(with_views(one, [part]))[part])
-    assert not torch.equal(seen, with_views(one, [part])[part])
+    seen = add_views(mirrored_sheet(one), [part])[part]
+    assert torch.equal(seen, mirror_graph(add_views(one, [part]))[part])
+    assert not torch.equal(seen, add_views(one, [part])[part])
 
 
 def test_what_another_sensor_saw_has_the_same_walls_but_in_patches():
     one, alone = pair(2).a, Augment(walks=0.0, slices=0.0, rough=0.0, tilt=0.0, zoom=0.0, bend=0.0)
-    seen = changed_sheet(one, alone, torch.Generator().manual_seed(0))
+    seen = augment_sheet(one, alone, torch.Generator().manual_seed(0))
     assert seen["sheet"].shape == one["sheet"].shape and not torch.equal(seen["anchor"], one["anchor"])
     lost = (seen["sheet"][..., 0] != one["sheet"][..., 0]).float().mean()
     assert lost < 0.35 and (seen["sheet"][..., 0][seen["sheet_room"] == -1] == 0).all()
-    same, other = (changed_sheet(one, Augment(), torch.Generator().manual_seed(seed)) for seed in (0, 1))
-    again = changed_sheet(one, Augment(), torch.Generator().manual_seed(0))
+    same, other = (augment_sheet(one, Augment(), torch.Generator().manual_seed(seed)) for seed in (0, 1))
+    again = augment_sheet(one, Augment(), torch.Generator().manual_seed(0))
     assert torch.equal(same["sheet"], again["sheet"]) and torch.equal(same["anchor"], again["anchor"])
     assert same["sheet"].shape != other["sheet"].shape or not torch.equal(same["sheet"], other["sheet"])

@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 from topomerge.datasets.pairs.grid_pairs import GridPair
 
-from topomerge.training.belief_hypotheses import error, fair, kind_of, right, together
+from topomerge.training.belief_hypotheses import (
+    classify_pair,
+    compute_pose_error,
+    is_distinguishable,
+    is_hypothesis_right,
+    pair_different_buildings,
+)
 from topomerge.types import Sim3
 
 TRUTH = Sim3(3.1, (5.0, -2.0, 1.0))
@@ -21,18 +27,20 @@ def pair(anchor: tuple[float, float, float] = (0.0, 0.0, 0.0), kind: str = "over
 
 def test_errors_are_measured_in_the_middle_of_what_both_maps_saw():
     aside = Sim3(TRUTH.yaw, (5.3, -1.6, 0.75))
-    assert error(aside, pair()) == pytest.approx([0.5, -0.25, 0.0])
+    assert compute_pose_error(aside, pair()) == pytest.approx([0.5, -0.25, 0.0])
     turned = Sim3(-3.1, TRUTH.translation)  # 4.77 degrees, across half a turn
     degrees = np.degrees(2 * np.pi - 6.2)
-    assert error(turned, pair()) == pytest.approx([0.0, 0.0, degrees])
-    assert error(turned, pair((10.0, 0.0, 0.0))) == pytest.approx([20 * np.sin(np.radians(degrees) / 2), 0.0, degrees])
+    assert compute_pose_error(turned, pair()) == pytest.approx([0.0, 0.0, degrees])
+    assert compute_pose_error(turned, pair((10.0, 0.0, 0.0))) == pytest.approx(
+        [20 * np.sin(np.radians(degrees) / 2), 0.0, degrees]
+    )
 
 
 def test_of_maps_of_two_places_no_pose_is_right():
     assert (
-        error(TRUTH, pair(kind="twin-wing")) is None
-        and error(TRUTH, pair(truth=None)) is None
-        and not right(None, ("tls", "tls"))
+        compute_pose_error(TRUTH, pair(kind="twin-wing")) is None
+        and compute_pose_error(TRUTH, pair(truth=None)) is None
+        and not is_hypothesis_right(None, ("tls", "tls"))
     )
 
 
@@ -47,8 +55,8 @@ def test_of_maps_of_two_places_no_pose_is_right():
     ],
 )
 def test_a_pose_is_right_within_half_a_metre_and_5_degrees(err, is_right):
-    assert right(err, ("tls", "depth")) == is_right
-    assert right([0.12, 0.0, 0.5], ("tls", "depth"), (0.1, 1.0)) is False
+    assert is_hypothesis_right(err, ("tls", "depth")) == is_right
+    assert is_hypothesis_right([0.12, 0.0, 0.5], ("tls", "depth"), (0.1, 1.0)) is False
 
 
 def test_strangers_are_map_a_of_one_pair_and_map_b_of_another():
@@ -59,11 +67,11 @@ def test_strangers_are_map_a_of_one_pair_and_map_b_of_another():
         return GridPair(name, *grids, free, TRUTH, 60.0, about)  # type: ignore[arg-type]
 
     first, second = made("p", "house-1", ["tls", "depth"]), made("q", "office-2", ["lidar", "laser2d"])
-    mixed = together(first, second)
+    mixed = pair_different_buildings(first, second)
     assert (mixed.a, mixed.b) == (first.a, second.b) and mixed.free == (first.free[0], second.free[1])
     assert mixed.truth is None and mixed.common == 0.0 and mixed.about["sensors"] == ["tls", "laser2d"]
     assert mixed.about["building"] == "house-1 + office-2" and mixed.about["kind"] == "strangers"
-    assert together(first, made("r", "house-1", ["tls", "tls"])).about["kind"] == "same"
+    assert pair_different_buildings(first, made("r", "house-1", ["tls", "tls"])).about["kind"] == "same"
 
 
 ROW = {"kind": "overlap", "common": 60.0, "sensors": ["tls", "depth"], "overlap": 0.5}
@@ -85,16 +93,16 @@ ROW = {"kind": "overlap", "common": 60.0, "sensors": ["tls", "depth"], "overlap"
     ],
 )
 def test_pairs_that_anybody_could_tell(change, is_fair):
-    assert fair({**ROW, **change}) == is_fair
+    assert is_distinguishable({**ROW, **change}) == is_fair
 
 
 def test_bins_of_the_area_in_common():
-    assert [kind_of({**ROW, "common": m2}) for m2 in (1.0, 40.0, 79.9, 80.0, 200.0)] == [
+    assert [classify_pair({**ROW, "common": m2}) for m2 in (1.0, 40.0, 79.9, 80.0, 200.0)] == [
         "<40",
         "40-80",
         "40-80",
         "80-200",
         ">200",
     ]
-    assert kind_of({**ROW, "common": 0.9}) == kind_of({**ROW, "overlap": 0}) == "none (overlap)"
-    assert kind_of({**ROW, "kind": "strangers"}) == "none (strangers)"
+    assert classify_pair({**ROW, "common": 0.9}) == classify_pair({**ROW, "overlap": 0}) == "none (overlap)"
+    assert classify_pair({**ROW, "kind": "strangers"}) == "none (strangers)"

@@ -5,20 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from topomerge.models.embedder import quarter_turned
+from topomerge.models.embedder import rotate_quarter_turns
 
 from tests.graphs import pair, write_set
 from tests.training.test_batches import turned_pair
+from topomerge.embedding.graph import find_columns_of_power
 from topomerge.embedding.network import Geometry, Network, Node
-from topomerge.embedding.schema import columns_of_power
 from topomerge.embedding.surroundings import CROP_SHAPES
 from topomerge.errors import InputError
 from topomerge.training import device_batches
-from topomerge.training.batches import make_batch
-from topomerge.training.device_batches import DevicePairs, concatenate_ranges, draw_normal, draw_uniform, draw_uniforms
+from topomerge.training.batches import make_batch, mirror_graph
+from topomerge.training.device_batches import DevicePairs, concatenate_ranges
 from topomerge.training.embedding import EmbeddingJob, fit
+from topomerge.training.hashed_random import draw_normal, draw_uniform, draw_uniforms
 from topomerge.training.settings import Augment, Training
-from topomerge.training.turned_views import mirrored
 
 NAMES = ("x", "edge_index", "edge_attr", "edge_way", *CROP_SHAPES)
 TRUTH = ("side", "true", "clear", "building", "match_index", "batch", "room_counts")
@@ -53,7 +53,7 @@ def test_maps_stand_as_they_truly_do_and_b_comes_once_more_turned_wrongly(quarte
         dict(zip(CROP_SHAPES, crops, strict=True)) for crops in zip(*(batch[p].split(count) for p in CROP_SHAPES), strict=True)
     ]
     assert torch.equal(seen[0]["surroundings"], seen[1]["surroundings"])
-    wrong = [k for k in range(4) if all(torch.equal(quarter_turned(seen[1], k)[p], seen[2][p]) for p in CROP_SHAPES)]
+    wrong = [k for k in range(4) if all(torch.equal(rotate_quarter_turns(seen[1], k)[p], seen[2][p]) for p in CROP_SHAPES)]
     assert len(wrong) == 1 and wrong != [0]
     assert (batch.true[2 * count :] == -1).all() and not batch["clear"][2 * count :].any()
 
@@ -66,7 +66,7 @@ def test_crops_and_ways_of_a_map_are_turned_and_mirrored_alike(whole):
     for seed in range(12):
         batch = DevicePairs([pair(1)], NAMES, STILL, CPU).make_batch([0], lambda number, seed=seed: seed)
         views = {
-            (k, flip): mirrored(quarter_turned(plain, k)) if flip else quarter_turned(plain, k)
+            (k, flip): mirror_graph(rotate_quarter_turns(plain, k)) if flip else rotate_quarter_turns(plain, k)
             for k in range(4)
             for flip in (False, True)
         }
@@ -112,7 +112,7 @@ def test_lost_rooms_take_their_edges_and_matches_along():
 def test_sizes_are_jittered_and_nothing_else():
     batch = DevicePairs([pair(0, 9)], NAMES, Augment(rooms=0.0, edges=0.0, jitter=0.1), CPU).make_batch([0], int)
     plain, count = make_batch([pair(0, 9)], NAMES), len(pair(0, 9).a["x"])
-    lengths = [column for power in (1, 2, 3) for column in columns_of_power("x", power)]
+    lengths = [column for power in (1, 2, 3) for column in find_columns_of_power("x", power)]
     others = [column for column in range(batch.x.shape[1]) if column not in lengths]
     assert torch.equal(batch.x[:count, others], plain.x[:count, others])
     ratio = (batch.x[:count, lengths] / plain.x[:count, lengths]).log()

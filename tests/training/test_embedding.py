@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from topomerge.datasets.pairs.plan_examples import example_arrays
-from topomerge.datasets.pairs.scan_items import PlanItem
+from topomerge.datasets.pairs.plan_examples import PlanItem, build_example_arrays
 from topomerge.models.embedder import Embedder
 from topomerge.models.weights import read_embedder
 
@@ -27,14 +26,13 @@ from topomerge.errors import InputError
 from topomerge.io import archive
 from topomerge.training import embedding
 from topomerge.training.__main__ import main
-from topomerge.training.batches import changed, make_batch
+from topomerge.training.batches import augment_graph, make_batch
 from topomerge.training.embedding import EmbeddingJob, fit, start_fabric
-from topomerge.training.loop import State, group_parameters, pace
-from topomerge.training.packed import load_pairs
-from topomerge.training.settings import Augment, Training, from_dict, from_file, to_dict
-from topomerge.training.splits import hold_out, mark_watched, read_scan_building
+from topomerge.training.loop import State, group_parameters, warmup_cosine
+from topomerge.training.packed_pairs import hold_out, load_pairs, mark_watched, read_scan_building
+from topomerge.training.settings import Augment, Training, convert_to_dict, load_settings, parse_settings
 from topomerge.training.table import write_table
-from topomerge.training.tasks import settings_of as from_words
+from topomerge.training.tasks import compose_settings as from_words
 from topomerge.training.validate import embed, validate
 
 ROOT = Path(__file__).parent.parent.parent
@@ -104,7 +102,7 @@ def test_lost_rooms_take_their_doors_and_matches_along():
     one = pair(0, rooms=9)
     some = {name: one.a[name] for name in NAMES}
     generator = torch.Generator().manual_seed(1)
-    out, rooms_left = changed(some, 9, Augment(rooms=0.9, edges=0.5, jitter=0.0, points=16), generator)
+    out, rooms_left = augment_graph(some, 9, Augment(rooms=0.9, edges=0.5, jitter=0.0, points=16), generator)
     assert 2 <= len(rooms_left) < 9 and torch.equal(out["x"], some["x"][rooms_left])
     assert out["room_points"].shape == (len(rooms_left), 16, 3)
     assert out["edge_index"].max() < len(rooms_left) and len(out["edge_attr"]) == out["edge_index"].shape[1]
@@ -168,8 +166,8 @@ def test_a_run_is_a_folder(settings, tmp_path):
     rows = [json.loads(line) for line in (tmp_path / "a" / "metrics.jsonl").read_text().splitlines()]
     assert [row["epoch"] for row in rows] == [0, 1, 2] and best["val/recall@1"] == max(r["val/recall@1"] for r in rows)
     assert (
-        from_file(tmp_path / "a" / "config.json")
-        == from_file(tmp_path / "a" / "config.yaml")
+        load_settings(tmp_path / "a" / "config.json")
+        == load_settings(tmp_path / "a" / "config.yaml")
         == replace(settings, name="a", tensorboard=True)
     )
     assert any((tmp_path / "a" / "tb").rglob("events*")) and list((tmp_path / "a" / "tb").rglob("tensors.tsv"))
@@ -188,7 +186,7 @@ def weights(folder: Path) -> bytes:
 def test_resumed_equals_uninterrupted(settings, tmp_path, monkeypatch, parts):
     settings.network = replace(SMALL, geometry=Geometry(list(parts), width=16))
     fit(replace(settings, name="whole"), quiet)
-    step, done = EmbeddingJob.step, []
+    step, done = EmbeddingJob.train_step, []
 
     def interrupted(self, batch, state):
         done.append(1)
@@ -196,13 +194,13 @@ def test_resumed_equals_uninterrupted(settings, tmp_path, monkeypatch, parts):
             os.kill(os.getpid(), signal.SIGINT)
         return step(self, batch, state)
 
-    monkeypatch.setattr(EmbeddingJob, "step", interrupted)
+    monkeypatch.setattr(EmbeddingJob, "train_step", interrupted)
     with pytest.raises(KeyboardInterrupt):
         fit(replace(settings, name="cut"), quiet)
     assert {path.name for path in (tmp_path / "cut" / "best").iterdir()} == {"embedder.json", "embedder.safetensors"}
     state = json.loads((tmp_path / "cut" / "last" / "state.json").read_text())["progress"]
     assert (state["epoch"], state["step"]) == (1, 2)
-    monkeypatch.setattr(EmbeddingJob, "step", step)
+    monkeypatch.setattr(EmbeddingJob, "train_step", step)
     fit(replace(settings, name="cut", resume=True), quiet)
     for folder in ("best", "last"):
         assert weights(tmp_path / "cut" / folder) == weights(tmp_path / "whole" / folder), folder
@@ -269,7 +267,11 @@ def test_bad_states_are_refused(settings, tmp_path):
 
 
 def test_pace_and_holding_out():
-    assert pace(0.0, 0.1) < 0.02 and pace(0.1, 0.1) == pytest.approx(1) and pace(1.0, 0.1) == pytest.approx(0)
+    assert (
+        warmup_cosine(0.0, 0.1) < 0.02
+        and warmup_cosine(0.1, 0.1) == pytest.approx(1)
+        and warmup_cosine(1.0, 0.1) == pytest.approx(0)
+    )
     train, held = hold_out([pair(k, 3) for k in range(60)])
     assert len(train) + len(held) == 60 and 0 < len(held) < 20
 
@@ -291,8 +293,8 @@ def test_storeys_of_a_building_are_on_one_side():
 
 def test_scans_of_a_building_are_watched_together(tmp_path):
     assert mark_watched(["a", "b", "a", "c", "b", "d"], 2).tolist() == [True, False, True, True, False, False]
-    archive.write(example_arrays(PlanItem(7, "r2v", 3, "house/first", ""), []), tmp_path / "real.npz")
-    archive.write(example_arrays(PlanItem(7, "procedural", 0, "", ""), []), tmp_path / "made.npz")
+    archive.write(build_example_arrays(PlanItem(7, "r2v", 3, "house/first", ""), []), tmp_path / "real.npz")
+    archive.write(build_example_arrays(PlanItem(7, "procedural", 0, "", ""), []), tmp_path / "made.npz")
     assert (
         read_scan_building(tmp_path / "real.npz") == "r2v/house" and read_scan_building(tmp_path / "made.npz") == "procedural/7"
     )
@@ -351,17 +353,17 @@ def test_a_weight_is_not_touched_by_a_gradient_that_is_no_number(settings, fused
     optimizer = torch.optim.AdamW(group_parameters(network, 0.1), 0.1, fused=fused)
     pairs = [pair(k) for k in range(4)]
     job = EmbeddingJob(settings, fabric, network, optimizer, (pairs, pairs))
-    batch = next(job.batches(State()))
+    batch = next(job.iter_batches(State()))
     before = [p.detach().clone() for p in network.parameters()]
     bad = batch.clone()
     bad["x"] = bad["x"] * float("nan")
     if fused:
-        assert not job.step(bad, State())["norm"].isfinite()
+        assert not job.train_step(bad, State())["norm"].isfinite()
     else:
         with pytest.raises(InputError, match="diverged"):
-            job.step(bad, State())
+            job.train_step(bad, State())
     assert all(torch.equal(a, b) for a, b in zip(before, network.parameters(), strict=True))
-    job.step(batch, State())
+    job.train_step(batch, State())
     assert all(p.isfinite().all() for p in network.parameters()) and not torch.equal(before[1], list(network.parameters())[1])
 
 
@@ -415,7 +417,7 @@ GROUPS += [(group, p.stem) for group in ("node", "loss", "experiment") for p in 
 def test_every_config_composes_and_builds(group, name):
     config = from_words([f"{group}={name}"])
     assert sum(p.numel() for p in Embedder(config.network).parameters()) > 1000
-    assert from_dict(to_dict(config)) == config
+    assert parse_settings(convert_to_dict(config)) == config
     if group == "experiment":
         assert config.name == name
 
@@ -437,7 +439,7 @@ def test_typos_name_their_key(tmp_path):
     ):
         path.write_text(text)
         with pytest.raises(InputError, match=said):
-            from_file(path)
+            load_settings(path)
 
 
 def run(words: list[str]) -> subprocess.CompletedProcess:
@@ -448,7 +450,7 @@ def run(words: list[str]) -> subprocess.CompletedProcess:
 @pytest.mark.longer
 def test_without_hydra(settings, tmp_path, capsys):
     """On a machine with no Hydra and no Open3D, and without importing the extraction."""
-    (tmp_path / "run.json").write_text(json.dumps({**to_dict(settings), "epochs": 1}))
+    (tmp_path / "run.json").write_text(json.dumps({**convert_to_dict(settings), "epochs": 1}))
     code = (
         "import atexit, re, runpy, sys; "
         "bad = lambda: [m for m in sys.modules if re.match(r'(hydra|omegaconf|open3d|topomerge.extraction)(\\.|$)', m)]; "
@@ -495,7 +497,7 @@ def test_launchers(settings, tmp_path, launcher):
 @pytest.mark.slow
 def test_two_processes(settings, tmp_path):
     """torchrun with gloo: both processes end with the same weights as each other, written once."""
-    (tmp_path / "run.json").write_text(json.dumps(to_dict(replace(settings, batch=2))))
+    (tmp_path / "run.json").write_text(json.dumps(convert_to_dict(replace(settings, batch=2))))
     words = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "topomerge.training"]
     done = run([sys.executable, *words, str(tmp_path / "run.json"), "name=two"])
     assert done.returncode == 0, done.stderr

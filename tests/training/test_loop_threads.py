@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from topomerge.training.loop import made_by_threads
+from topomerge.training.loop import prefetch_by_threads
 
 
 def test_pieces_come_in_the_order_of_their_keys():
@@ -14,12 +14,12 @@ def test_pieces_come_in_the_order_of_their_keys():
         time.sleep(0.01 * (key % 3))  # later ones are done first
         return key * key
 
-    assert list(made_by_threads(make, range(20), 4)) == [k * k for k in range(20)]
+    assert list(prefetch_by_threads(make, range(20), 4)) == [k * k for k in range(20)]
 
 
 def test_only_what_is_needed_soon_is_made():
     made: list[int] = []
-    pieces = made_by_threads(lambda key: made.append(key) or key, range(100), 3)
+    pieces = prefetch_by_threads(lambda key: made.append(key) or key, range(100), 3)
     assert next(pieces) == 0
     pieces.close()
     assert len(made) <= 5
@@ -31,7 +31,7 @@ def test_an_error_comes_where_its_piece_would():
             raise ValueError("two")
         return key
 
-    pieces = made_by_threads(make, range(5), 2)
+    pieces = prefetch_by_threads(make, range(5), 2)
     assert [next(pieces), next(pieces)] == [0, 1]
     with pytest.raises(ValueError, match="two"):
         next(pieces)

@@ -24,9 +24,9 @@ from topomerge.statistics import estimate_mean
 from topomerge.training.__main__ import main
 from topomerge.training.embedding import fit
 from topomerge.training.provenance import compare_settings, describe_provenance, read_run
-from topomerge.training.settings import Training, to_dict
+from topomerge.training.settings import Training, convert_to_dict
 from topomerge.training.table import write_table
-from topomerge.training.tasks import settings_of, train
+from topomerge.training.tasks import compose_settings, train
 
 ROOT = Path(__file__).parent.parent.parent
 SMALL = Network(Geometry(["scalars"], width=8), Node("none"), size=8)
@@ -102,14 +102,14 @@ def test_tasks_keep_their_runs_too(tmp_path, monkeypatch):
     from tests.training import tiny
     from topomerge.training import match_odds
 
-    monkeypatch.setattr(match_odds, "pair_evidence", tiny.evidence)
+    monkeypatch.setattr(match_odds, "build_pair_evidence", tiny.evidence)
     words = ["task=match_odds", f"runs={tmp_path}", "tensorboard=false"]
-    train(settings_of(words), quiet)
-    monkeypatch.setattr(match_odds, "pair_evidence", lambda *_: pytest.fail("data was made"))
+    train(compose_settings(words), quiet)
+    monkeypatch.setattr(match_odds, "build_pair_evidence", lambda *_: pytest.fail("data was made"))
     with pytest.raises(InputError, match="holds a run"):
-        train(settings_of(words), quiet)
+        train(compose_settings(words), quiet)
     with pytest.raises(InputError, match=r"pull \(was 0.05, now 0.1\)"):
-        train(settings_of([*words, "resume=true", "pull=0.1"]), quiet)
+        train(compose_settings([*words, "resume=true", "pull=0.1"]), quiet)
 
 
 def test_a_run_and_what_it_exports_say_where_they_come_from(settings, tmp_path, cache):
@@ -200,7 +200,7 @@ def test_two_processes_take_the_step_of_one_with_all_pairs(settings, tmp_path):
     """torchrun with gloo: rooms of the other process are negatives, with gradients; weights end as those of one process."""
     same = replace(settings, epochs=2, batch=2, augment=replace(settings.augment, rooms=0.0, edges=0.0, jitter=0.0))
     same = replace(same, network=replace(SMALL, dropout=0.0))
-    (tmp_path / "run.json").write_text(json.dumps(to_dict(same)))
+    (tmp_path / "run.json").write_text(json.dumps(convert_to_dict(same)))
     words = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "topomerge.training"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     given = [sys.executable, *words, str(tmp_path / "run.json"), "name=two"]

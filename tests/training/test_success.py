@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topomerge.training.success import merged_right, pose_of_matches
+from topomerge.training.success import estimate_pose, is_pose_right
 from topomerge.types import Array, Sim3
 
 ROOMS = 8
@@ -39,14 +39,14 @@ def truth_of(b: Side) -> Array:
 def test_true_matches_give_the_true_pose(yaw):
     pose = Sim3(yaw, (12.0, -5.0, 3.0))
     a, b = maps(pose)
-    estimate = pose_of_matches(a, b, truth_of(b))
+    estimate = estimate_pose(a, b, truth_of(b))
     assert estimate is not None and np.allclose(estimate.matrix, pose.matrix, atol=1e-6)
     at = b["pos"].mean(axis=0)
-    assert merged_right(estimate, pose.matrix, at)
+    assert is_pose_right(estimate, pose.matrix, at)
     far = Sim3(yaw, (12.0, -4.4, 3.0))
-    assert not merged_right(far, pose.matrix, at) and not merged_right(None, pose.matrix, at)
-    assert not merged_right(Sim3(yaw + 0.1, pose.translation), pose.matrix, np.zeros(3))
-    assert merged_right(Sim3(yaw + 2 * np.pi, pose.translation), pose.matrix, at)
+    assert not is_pose_right(far, pose.matrix, at) and not is_pose_right(None, pose.matrix, at)
+    assert not is_pose_right(Sim3(yaw + 0.1, pose.translation), pose.matrix, np.zeros(3))
+    assert is_pose_right(Sim3(yaw + 2 * np.pi, pose.translation), pose.matrix, at)
 
 
 def test_wrong_matches_are_outvoted_and_partial_rooms_are_off():
@@ -58,8 +58,8 @@ def test_wrong_matches_are_outvoted_and_partial_rooms_are_off():
     rng = np.random.default_rng(2)
     b["pos"] = b["pos"] + rng.normal(0, 0.4, b["pos"].shape) * [1, 1, 0]
     b["edge_pos"] = b["edge_pos"] + np.tile(rng.normal(0, 0.05, (9, 3)), (2, 1))
-    estimate = pose_of_matches(a, b, certain)
-    assert merged_right(estimate, pose.matrix, b["pos"].mean(axis=0))
+    estimate = estimate_pose(a, b, certain)
+    assert is_pose_right(estimate, pose.matrix, b["pos"].mean(axis=0))
 
 
 def test_wrong_matches_give_no_true_pose():
@@ -67,14 +67,14 @@ def test_wrong_matches_give_no_true_pose():
     for seed in range(10):
         a, b = maps(pose, seed)
         certain = np.roll(truth_of(b), 2, axis=0)  # of a room two doors further, which has no door in common with the right one
-        assert not merged_right(pose_of_matches(a, b, certain), pose.matrix, b["pos"].mean(axis=0))
+        assert not is_pose_right(estimate_pose(a, b, certain), pose.matrix, b["pos"].mean(axis=0))
 
 
 def test_without_matches_there_is_no_pose():
     a, b = maps(Sim3())
-    assert pose_of_matches(a, b, np.zeros((ROOMS, ROOMS))) is None
+    assert estimate_pose(a, b, np.zeros((ROOMS, ROOMS))) is None
     one = np.zeros((ROOMS, ROOMS))
     one[0, 0] = 0.9
     bare = {"edge_pos": np.zeros((0, 3)), "edge_index": np.zeros((2, 0), int)}
-    assert pose_of_matches({**a, **bare}, {**b, **bare}, one) is None
-    assert pose_of_matches({**a, **bare, "pos": a["pos"][:0]}, b, one[:0]) is None
+    assert estimate_pose({**a, **bare}, {**b, **bare}, one) is None
+    assert estimate_pose({**a, **bare, "pos": a["pos"][:0]}, b, one[:0]) is None

@@ -16,28 +16,28 @@ import numpy as np
 import pytest
 
 from tests.training import tiny
-from topomerge.embedding.engineered import scaled
+from topomerge.embedding.engineered import scale_features
 from topomerge.errors import InputError
-from topomerge.extraction.elevations.elevation import place_probabilities
+from topomerge.extraction.elevations.elevation import compute_place_probabilities
 from topomerge.extraction.elevations.wall_doors import (
     SOURCES,
     WALL_DOOR_FEATURES,
     WALL_DOORS_FILE,
     DoorCandidates,
-    door_chance,
+    compute_door_probability,
 )
-from topomerge.extraction.passages import choose_scorer
-from topomerge.extraction.plans.passages import door_probability
-from topomerge.extraction.plans.plan_network import column_probabilities
-from topomerge.extraction.plans.plan_network import weights as plan_weights
-from topomerge.extraction.room_odds import room_weights
-from topomerge.fusion.match_belief import belief_weights
-from topomerge.io.weight_files import VARIABLE, read_weights_json, weights_file
-from topomerge.matching.odds import odds_weights
-from topomerge.matching.room_matcher import matcher_weights
+from topomerge.extraction.extract import choose_scorer
+from topomerge.extraction.plans.passages import predict_door
+from topomerge.extraction.plans.plan_network import compute_column_probabilities
+from topomerge.extraction.plans.plan_network import load_weights as plan_weights
+from topomerge.extraction.room_odds import load_room_weights
+from topomerge.fusion.match_belief import load_belief_weights
+from topomerge.io.archive import VARIABLE, find_weights_file, read_weights_json
+from topomerge.matching.consistency import load_odds_weights
+from topomerge.matching.room_matcher import load_matcher_weights
 from topomerge.networks.network import Network
-from topomerge.registration.evidence.network import weights as place_weights
-from topomerge.registration.verify import model
+from topomerge.registration.evidence.places import load_weights as place_weights
+from topomerge.registration.verify import load_model
 from topomerge.training import (
     door_classification,
     passages,
@@ -47,12 +47,10 @@ from topomerge.training import (
     wall_doors,
     wall_segmentation,
 )
-from topomerge.training.door_classification import door_scores
-from topomerge.training.judging import judge_task
-from topomerge.training.loop import State, made_beside
-from topomerge.training.networks import device_of
-from topomerge.training.plan_segmentation import class_scores
-from topomerge.training.tasks import SCORES, TASKS, settings_of, train, weights_of
+from topomerge.training.door_classification import score_doors
+from topomerge.training.loop import State, prefetch_batches, select_device
+from topomerge.training.plan_segmentation import score_classes
+from topomerge.training.tasks import SCORES, TASKS, compose_settings, evaluate_task, find_weights, train
 from topomerge.types import EDGE_DTYPE, Array
 
 ROOT = Path(__file__).parent.parent.parent
@@ -77,20 +75,20 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Words of a task whose data is tiny."""
     paths = tiny.plan_files(tmp_path / "plans", 4)
     monkeypatch.setattr(plan_segmentation, "build_plans", lambda *_: (paths, None))
-    monkeypatch.setattr(door_classification, "door_examples", lambda *_: tiny.door_tables(320))
+    monkeypatch.setattr(door_classification, "build_door_examples", lambda *_: tiny.door_tables(320))
     walls = tiny.wall_files(tmp_path / "walls", 6)
     monkeypatch.setattr(wall_segmentation, "build_walls", lambda *_: (walls, None))
     monkeypatch.setattr(wall_doors, "build_walls", lambda *_: (walls, None))
     monkeypatch.setattr(passages, "read_scans", lambda *_: tiny.passage_scans(10))
     places = tiny.place_files(tmp_path / "places")
-    monkeypatch.setattr(place_evidence, "hypothesis_files", lambda *_: places)
+    monkeypatch.setattr(place_evidence, "build_hypothesis_files", lambda *_: places)
     monkeypatch.setattr(room_matcher, "read_examples", lambda *_: tiny.room_examples(4))
     for task, name, make in (
-        ("merge_belief", "belief_rows", tiny.belief_rows),
-        ("room_odds", "room_scans", tiny.room_scans),
-        ("match_odds", "pair_evidence", tiny.evidence),
-        ("match_belief", "match_rows", tiny.match_rows),
-        ("feature_scale", "pair_features", tiny.feature_pairs),
+        ("merge_belief", "build_belief_rows", tiny.belief_rows),
+        ("room_odds", "build_room_scans", tiny.room_scans),
+        ("match_odds", "build_pair_evidence", tiny.evidence),
+        ("match_belief", "build_match_rows", tiny.match_rows),
+        ("feature_scale", "build_pair_features", tiny.feature_pairs),
     ):
         monkeypatch.setattr(importlib.import_module(f"topomerge.training.{task}"), name, make)
 
@@ -109,7 +107,7 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 def matched_rows() -> Array:
     """What the matcher's first stage makes of rooms that are all alike."""
-    run = matcher_weights().run
+    run = load_matcher_weights().run
     assert isinstance(run, Network)
     inputs = {n: np.ones([3 if isinstance(s, str) else s for s in t.shape]) for n, t in run.signature.inputs.items()}
     inputs["stage"][1:] = 0
@@ -120,19 +118,19 @@ def read(task: str) -> Any:
     """What the product does with a task's file."""
     plan, signs = tiny.two_rooms(0).plan, np.ones((4, len(WALL_DOOR_FEATURES)))
     return {
-        "plan_segmentation": lambda: column_probabilities(plan),
-        "grid_segmentation": lambda: column_probabilities(plan, plan_weights(raised=True)),
-        "door_classification": lambda: door_probability(np.zeros((3, 17))),
+        "plan_segmentation": lambda: compute_column_probabilities(plan),
+        "grid_segmentation": lambda: compute_column_probabilities(plan, plan_weights(raised=True)),
+        "door_classification": lambda: predict_door(np.zeros((3, 17))),
         "place_evidence": lambda: place_weights()(planes=np.ones((1, 16, 16, 22)))[0],
         "room_matcher": matched_rows,
-        "wall_segmentation": lambda: place_probabilities(tiny.two_doors(0)[2] / np.float32(255)),
+        "wall_segmentation": lambda: compute_place_probabilities(tiny.two_doors(0)[2] / np.float32(255)),
         "passages": lambda: choose_scorer(True)(np.ones((2, 17)), tiny.passages(2)),
-        "wall_doors": lambda: door_chance(DoorCandidates(np.zeros(4, EDGE_DTYPE), signs, np.arange(4))),
-        "merge_belief": lambda: np.array(model()["solid"]["pose"]["weight"]),
-        "room_odds": lambda: np.array(room_weights()["entered"]),
-        "match_odds": lambda: odds_weights("match"),
-        "match_belief": lambda: belief_weights("attention"),
-        "feature_scale": lambda: scaled(np.ones((2, 18)), "matched"),
+        "wall_doors": lambda: compute_door_probability(DoorCandidates(np.zeros(4, EDGE_DTYPE), signs, np.arange(4))),
+        "merge_belief": lambda: np.array(load_model()["solid"]["pose"]["weight"]),
+        "room_odds": lambda: np.array(load_room_weights()["entered"]),
+        "match_odds": lambda: load_odds_weights("match"),
+        "match_belief": lambda: load_belief_weights("attention"),
+        "feature_scale": lambda: scale_features(np.ones((2, 18)), "matched"),
     }[task]()
 
 
@@ -140,7 +138,7 @@ def read(task: str) -> Any:
 @pytest.mark.parametrize("task", [*NETWORKS, *FITS])
 def test_a_task_is_trained_exported_read_and_judged(task, words, tmp_path, monkeypatch) -> None:
     shipped = read(task)
-    scores = train(settings_of(words(task, f"export={tmp_path / 'exported'}")), quiet)
+    scores = train(compose_settings(words(task, f"export={tmp_path / 'exported'}")), quiet)
     run = tmp_path / "runs" / task
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert len(rows) == (2 if task in NETWORKS else 1) and all(np.isfinite(value) for value in scores.values())
@@ -153,14 +151,14 @@ def test_a_task_is_trained_exported_read_and_judged(task, words, tmp_path, monke
         "validation" if task == "match_belief" else "train"
     )  # it weighs what others were trained for
     monkeypatch.setenv(VARIABLE, str(tmp_path / "exported"))
-    assert weights_file(TASKS[task].package, TASKS[task].file).parent == tmp_path / "exported"
+    assert find_weights_file(TASKS[task].package, TASKS[task].file).parent == tmp_path / "exported"
     trained = read(task)
     assert np.isfinite(trained).all() and not np.array_equal(trained, shipped)
     monkeypatch.delenv(VARIABLE)
     assert np.array_equal(read(task), shipped)
-    judged = judge_task(task, words(task, f"run={run}", f"folder={tmp_path / 'eval'}"), quiet)
+    judged = evaluate_task(task, words(task, f"run={run}", f"folder={tmp_path / 'eval'}"), quiet)
     assert f"| {next(iter(judged.scores))} |" in judged.summary and (judged.folder / "scores.json").exists()
-    assert weights_of(task, "").is_file() and judge_task(task, words(task, f"folder={tmp_path / 'eval'}"), quiet).scores
+    assert find_weights(task, "").is_file() and evaluate_task(task, words(task, f"folder={tmp_path / 'eval'}"), quiet).scores
 
 
 @pytest.mark.longer
@@ -170,7 +168,7 @@ def test_resumed_equals_uninterrupted(task, words, tmp_path, monkeypatch) -> Non
     jobs |= {"door_classification": door_classification.DoorJob}
     jobs |= {"wall_segmentation": wall_segmentation.WallJob}
     kind = {**jobs, "place_evidence": place_evidence.PlaceJob, "room_matcher": room_matcher.MatcherJob}[task]
-    train(settings_of(words(task, "name=whole")), quiet)
+    train(compose_settings(words(task, "name=whole")), quiet)
     step, seen = kind.step, []
 
     def cut(self, batch: Any, state: State) -> dict[str, float]:
@@ -179,35 +177,35 @@ def test_resumed_equals_uninterrupted(task, words, tmp_path, monkeypatch) -> Non
             os.kill(os.getpid(), 2)
         return step(self, batch, state)
 
-    monkeypatch.setattr(kind, "step", cut)
+    monkeypatch.setattr(kind, "run_mcl_step", cut)
     with pytest.raises(KeyboardInterrupt):
-        train(settings_of(words(task, "name=cut")), quiet)
-    monkeypatch.setattr(kind, "step", step)
-    train(settings_of(words(task, "name=cut", "resume=true")), quiet)
+        train(compose_settings(words(task, "name=cut")), quiet)
+    monkeypatch.setattr(kind, "run_mcl_step", step)
+    train(compose_settings(words(task, "name=cut", "resume=true")), quiet)
     files = [tmp_path / "runs" / name / "last" / "network.safetensors" for name in ("cut", "whole")]
     assert files[0].read_bytes() == files[1].read_bytes()
     exported = [tmp_path / "runs" / name / "best" / TASKS[task].file for name in ("cut", "whole")]
     assert exported[0].read_bytes() == exported[1].read_bytes() and len(list(exported[0].parent.iterdir())) == 2
     with pytest.raises(InputError, match="nothing to resume"):
-        train(settings_of(words(task, "name=none", "resume=true")), quiet)
+        train(compose_settings(words(task, "name=none", "resume=true")), quiet)
 
 
 @pytest.mark.longer
 @pytest.mark.parametrize("task", FITS)
 def test_a_fit_that_ended_is_left_as_it_is(task, words, tmp_path) -> None:
-    first = train(settings_of(words(task)), quiet)
+    first = train(compose_settings(words(task)), quiet)
     said: list[str] = []
-    assert train(settings_of(words(task, "resume=true")), said.append) == first and "is there" in said[0]
+    assert train(compose_settings(words(task, "resume=true")), said.append) == first and "is there" in said[0]
 
 
 def test_fits_learn_what_is_so(words) -> None:
-    assert train(settings_of(words("merge_belief")), quiet)["val/right_first"] > 0.6
-    odds = train(settings_of(words("match_odds")), quiet)
+    assert train(compose_settings(words("merge_belief")), quiet)["val/right_first"] > 0.6
+    odds = train(compose_settings(words("match_odds")), quiet)
     assert odds["val/match_accuracy"] > 0.7 and odds["val/hypothesis_accuracy"] > 0.7
-    belief = train(settings_of(words("match_belief")), quiet)
+    belief = train(compose_settings(words("match_belief")), quiet)
     assert belief["val/attention_all_after_accuracy"] > 0.9 > 0.7 > belief["val/attention_all_before_accuracy"]
-    assert train(settings_of(words("feature_scale")), quiet)["val/recall@1"] > 0.9
-    assert train(settings_of(words("door_classification", "epochs=8", "rate=0.02")), quiet)["val/auc"] > 0.9
+    assert train(compose_settings(words("feature_scale")), quiet)["val/recall@1"] > 0.9
+    assert train(compose_settings(words("door_classification", "epochs=8", "rate=0.02")), quiet)["val/auc"] > 0.9
 
 
 @pytest.mark.parametrize(
@@ -241,20 +239,20 @@ def test_fits_learn_what_is_so(words) -> None:
 )
 def test_a_wrong_word_is_one_line_with_its_key(given: list[str], key: str) -> None:
     with pytest.raises(InputError, match=key) as refused:
-        settings_of(given)
+        compose_settings(given)
     assert "\n" not in str(refused.value)
 
 
 def test_a_device_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     with pytest.raises(InputError, match="accelerator=cuda"):
-        device_of(settings_of(["task=plan_segmentation", "accelerator=cuda"]))
-    assert device_of(settings_of(["task=door_classification"])).type == "cpu"
+        select_device(compose_settings(["task=plan_segmentation", "accelerator=cuda"]))
+    assert select_device(compose_settings(["task=door_classification"])).type == "cpu"
 
 
 @pytest.mark.parametrize("task", list(TASKS))
 def test_a_wrong_score_to_watch_is_one_line_before_any_data_is_made(task: str, tmp_path: Path) -> None:
-    settings = settings_of([f"task={task}", f"runs={tmp_path}", f"cache={tmp_path / 'cache'}"])
+    settings = compose_settings([f"task={task}", f"runs={tmp_path}", f"cache={tmp_path / 'cache'}"])
     settings.watch = "recal@1"
     with pytest.raises(InputError, match="watch: unknown 'recal@1'") as refused:
         train(settings, quiet)
@@ -262,13 +260,13 @@ def test_a_wrong_score_to_watch_is_one_line_before_any_data_is_made(task: str, t
 
 
 def test_batches_made_beside_are_the_same() -> None:
-    assert list(made_beside(iter(range(1, 7)))) == list(range(1, 7))
+    assert list(prefetch_batches(iter(range(1, 7)))) == list(range(1, 7))
 
     def broken() -> Iterator[int]:
         yield 1
         raise InputError("the second batch")
 
-    batches = made_beside(broken())
+    batches = prefetch_batches(broken())
     assert next(batches) == 1
     with pytest.raises(InputError, match="the second batch"):
         next(batches)
@@ -280,17 +278,17 @@ def test_a_source_with_hardly_any_door_keeps_its_model() -> None:
     features = rng.normal(size=(80, len(WALL_DOOR_FEATURES)))
     right = (features[:, 0] > 0) & (sources == SOURCES.index("wall"))
     right[-2:] = True  # two doors of plans without walls
-    model = wall_doors.doors_model([(DoorCandidates(np.zeros(80, EDGE_DTYPE), features, sources), right)], 1.0)
+    model = wall_doors.fit_doors_model([(DoorCandidates(np.zeros(80, EDGE_DTYPE), features, sources), right)], 1.0)
     shipped = read_weights_json("topomerge.extraction.elevations", WALL_DOORS_FILE)
     assert model["flat"] == shipped["flat"] and model["wall"] != shipped["wall"] and model["wall"][1] > 0.5
 
 
 def test_scores_of_classes_and_doors() -> None:
-    scores = class_scores(np.diag([5, 4, 0, 0, 1]))
+    scores = score_classes(np.diag([5, 4, 0, 0, 1]))
     assert scores["mean_iou"] == scores["mean_f1"] == scores["accuracy"] == 1 and scores["iou_shut"] == 0
-    scores = class_scores(np.array([[3, 1], [1, 3]] + [[0, 0]] * 3) @ np.eye(2, 5, dtype=int))
+    scores = score_classes(np.array([[3, 1], [1, 3]] + [[0, 0]] * 3) @ np.eye(2, 5, dtype=int))
     assert scores["iou_inside"] == pytest.approx(0.6) and scores["f1_wall"] == pytest.approx(0.75)
-    doors = door_scores(np.array([0.9, 0.8, 0.3, 0.1]), np.array([True, False, True, False]))
+    doors = score_doors(np.array([0.9, 0.8, 0.3, 0.1]), np.array([True, False, True, False]))
     assert doors["precision"] == doors["recall"] == 0.5 and doors["auc"] == pytest.approx(0.75)
 
 

@@ -42,8 +42,8 @@ def test_steps_run_in_order_and_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.longer
 def test_each_step_is_a_task_with_its_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[object] = []
-    monkeypatch.setattr(weights, "train", lambda settings, say: asked.append(settings))
-    monkeypatch.setattr("topomerge.datasets.pairs.build.build", lambda settings, say: asked.append(settings))
+    monkeypatch.setattr(weights, "train", lambda settings, log_line: asked.append(settings))
+    monkeypatch.setattr("topomerge.datasets.pairs.build.build", lambda settings, log_line: asked.append(settings))
     for task in TASKS:
         weights.make_task(task, tmp_path, ["jobs=2", f"cache={tmp_path}", "export="])
     sets, settings = [a.data.name for a in asked if not hasattr(a, "task")], [a for a in asked if hasattr(a, "task")]  # type: ignore[attr-defined]

@@ -9,28 +9,27 @@ from typing import Any
 import numpy as np
 import torch
 from topomerge.datasets.pairs.passage_examples import PassageExamples
-from topomerge.datasets.pairs.plan_examples import PlanExample, PlanRecipe, example_arrays
+from topomerge.datasets.pairs.plan_examples import PlanExample, PlanItem, PlanRecipe, build_example_arrays
 from topomerge.datasets.pairs.plan_truth import TRUE_CLASSES
-from topomerge.datasets.pairs.scan_items import PlanItem
-from topomerge.datasets.pairs.wall_examples import WallExample, WallItem, wall_arrays
+from topomerge.datasets.pairs.wall_examples import WallExample, WallItem, build_wall_arrays
 
 from topomerge.embedding.engineered import FEATURES
-from topomerge.embedding.turns import FACTS, TurnedRows
+from topomerge.embedding.quarter_turns import FACTS, TurnedRows
 from topomerge.extraction.elevations.elevation import ALONG, BANDS, DEPTHS, FACE_DTYPE, STRIP_CHANNELS
-from topomerge.extraction.passages import EVIDENCE
+from topomerge.extraction.extract import EVIDENCE
 from topomerge.extraction.plans.passages import Passage
-from topomerge.extraction.plans.plan import profile_bands
+from topomerge.extraction.plans.plan import build_profile_bands
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.extraction.room_odds import GRID_FEATURES, POSE_FEATURES, ROOM_FEATURES
 from topomerge.fusion.match_belief import BELIEVED_METHODS
 from topomerge.io import archive
-from topomerge.matching.odds import hypothesis_features
-from topomerge.registration.evidence.crops import LOOKED, SIDE
+from topomerge.matching.consistency import compute_hypothesis_features
+from topomerge.registration.evidence.places import LOOKED, SIDE
 from topomerge.training.feature_scale import PairFeatures
 from topomerge.training.match_belief import MatchRows
-from topomerge.training.match_odds import Evidence
-from topomerge.training.packed import GraphPair
-from topomerge.training.room_matcher import Example, View
+from topomerge.training.match_odds import MatchEvidence
+from topomerge.training.packed_pairs import GraphPair
+from topomerge.training.room_matcher import MatcherExample, MatcherView
 from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, Array, Sim3, TopometricMap, VoxelGrid
 
 EDGE = 0.1  # m
@@ -42,7 +41,7 @@ def plan_files(folder: Path, count: int) -> list[Path]:
     paths = []
     for k in range(count):
         path = folder / f"{k}.npz"
-        archive.write(example_arrays(PlanItem(k, "procedural", 0, "", ""), [two_rooms(4 * k)]), path)
+        archive.write(build_example_arrays(PlanItem(k, "procedural", 0, "", ""), [two_rooms(4 * k)]), path)
         paths.append(path)
     return paths
 
@@ -55,7 +54,7 @@ def wall_files(folder: Path, count: int) -> list[Path]:
         map, faces, strips, truth, doors = two_doors(2 * k)
         example = WallExample(np.array([0, len(truth)]), strips, truth, doors, map, (), faces, "tls/procedural")
         path = folder / f"{k}.npz"
-        archive.write(wall_arrays(WallItem(k, "procedural", 0, "", ""), example), path)
+        archive.write(build_wall_arrays(WallItem(k, "procedural", 0, "", ""), example), path)
         paths.append(path)
     return paths
 
@@ -77,7 +76,7 @@ def two_doors(later: int) -> tuple[TopometricMap, Array, Array, Array, Array]:
     edge["open"], edge["confidence"] = True, 0.9
     label = (floor.cells[:, 1] > 30).astype(np.int32)
     none = np.zeros(0, np.int32)
-    empty = floor.with_cells(np.zeros((0, 3), np.int32))
+    empty = floor.replace_cells(np.zeros((0, 3), np.int32))
     map = TopometricMap(empty, none, floor, label, rooms, edge, np.zeros(1, STOREY_DTYPE))
     face = np.array([(0, (0, 3), (1, 0), (0, 1), 8.0, 0.0)], FACE_DTYPE)
     truth, strip = np.zeros(160, np.uint8), np.zeros((160, DEPTHS, STRIP_CHANNELS), np.uint8)
@@ -97,8 +96,8 @@ def two_rooms(wider: int) -> PlanExample:
     wall[middle : middle + 2, 18:27] = False
     inside = ~wall
     inside[[0, -1]] = inside[:, [0, -1]] = False
-    bands = profile_bands(EDGE)
-    profile = np.where(wall, bands.mask(-0.3, 2.4), np.where(inside, bands.mask(-0.3, 0.3), 0)).astype(np.uint64)
+    bands = build_profile_bands(EDGE)
+    profile = np.where(wall, bands.build_mask(-0.3, 2.4), np.where(inside, bands.build_mask(-0.3, 0.3), 0)).astype(np.uint64)
     nowhere = np.full(wall.shape, np.nan)
     plan = StoreyPlan(np.zeros(2), EDGE, wall, inside, profile, bands, np.zeros(wall.shape), nowhere)
     room = np.full(wall.shape, -1, np.int16)
@@ -163,7 +162,7 @@ WINNER_INPUTS = (
 )  # fmt: skip
 
 
-def evidence(*_: Any) -> list[Evidence]:
+def evidence(*_: Any) -> list[MatchEvidence]:
     """Hypotheses of which that with more evidence is right, and rooms of which those that fit are one."""
     rng, pairs = np.random.default_rng(0), []
     for k in range(12):
@@ -171,7 +170,7 @@ def evidence(*_: Any) -> list[Evidence]:
         metres = np.column_stack([rng.uniform(1, 5, 3) + 30 * right, rng.uniform(1, 5, 3), rng.uniform(1, 20, 3)])
         one = rng.random(8) < 0.5
         rooms = np.column_stack([np.ones(8), one + rng.random(8), rng.random(8), np.zeros(8), np.zeros(8)])
-        pairs.append(Evidence(f"b{k}", hypothesis_features(metres), right, rooms, one))
+        pairs.append(MatchEvidence(f"b{k}", compute_hypothesis_features(metres), right, rooms, one))
     return pairs
 
 
@@ -209,7 +208,7 @@ def feature_pairs(*_: Any) -> list[PairFeatures]:
     return pairs
 
 
-def room_examples(count: int) -> list[Example]:
+def room_examples(count: int) -> list[MatcherExample]:
     """Pairs of maps of five rooms, of which the second one lacks the last room; it stands a quarter turn away."""
     rng = np.random.default_rng(0)
     out = []
@@ -220,14 +219,17 @@ def room_examples(count: int) -> list[Example]:
         away = np.column_stack([back.real, back.imag])
         sides = [(rows, places, 5), (np.roll(rows, 1, axis=1), away, 4)]
         views = [
-            [View(TurnedRows(r[:n], p[:n] * (1, 1 - 2 * (k % 2)), "", np.zeros((n, FACTS))), np.arange(n)) for k in range(2)]
+            [
+                MatcherView(TurnedRows(r[:n], p[:n] * (1, 1 - 2 * (k % 2)), "", np.zeros((n, FACTS))), np.arange(n))
+                for k in range(2)
+            ]
             for r, p, n in sides
         ]
         graphs = [{"x": torch.from_numpy(rng.uniform(5, 30, (n, 16)))} for _, _, n in sides]
         matches = torch.arange(4).repeat(2, 1).T
         truth = (torch.arange(5), torch.arange(4)), (torch.ones(5), torch.ones(4))
         pair = GraphPair(graphs[0], graphs[1], matches, *truth, {"file": "", "sides": "ab"}, torch.eye(4))
-        out.append(Example(views[0], views[1], pair, 1))
+        out.append(MatcherExample(views[0], views[1], pair, 1))
     return out
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from topomerge.errors import InputError
-from topomerge.types.deformation import Deformation
+from topomerge.types.placement import Deformation
 
 
 def deformation(moves: np.ndarray, spacing: float = 5.0, storeys: int = 1) -> Deformation:

@@ -8,15 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.grids import COMPILED, cell_lists, grids, random_grid
-from topomerge.kernels import morton
+from topomerge.kernels import voxels
 from topomerge.types import VoxelGrid
 
 
 @COMPILED
 @given(grids(min_size=1))
 def test_bounds_and_centroids_as_in_the_seeds(grid):
-    low, high = grid.cell_bounds(grid.cells)
-    for v, v_min, v_max, v_c in zip(grid.cells, low, high, grid.centroids(), strict=True):
+    low, high = grid.compute_cell_bounds(grid.cells)
+    for v, v_min, v_max, v_c in zip(grid.cells, low, high, grid.compute_centroids(), strict=True):
         assert np.allclose(v_min, grid.origin + v * grid.edge, atol=1e-12)
         assert np.allclose(v_max, grid.origin + (v + 1) * grid.edge, atol=1e-12)
         assert np.allclose(v_c, (v_min + v_max) * 0.5, atol=1e-12)
@@ -30,8 +30,8 @@ def test_bounds_and_centroids_as_in_the_seeds(grid):
 def test_locate_finds_the_cell_that_holds_the_point(grid, seed):
     inside = grid.origin + (grid.cells + np.random.default_rng(seed).uniform(0.001, 0.999, (len(grid), 3))) * grid.edge
     assert np.array_equal(grid.locate(inside), grid.cells)
-    assert np.array_equal(grid.locate(grid.centroids()), grid.cells)
-    assert np.array_equal(grid.rows(grid.locate(inside)), np.arange(len(grid)))
+    assert np.array_equal(grid.locate(grid.compute_centroids()), grid.cells)
+    assert np.array_equal(grid.find_rows(grid.locate(inside)), np.arange(len(grid)))
 
 
 def test_locate_is_integer_division_from_v_min():
@@ -61,13 +61,13 @@ def test_from_cells_does_not_depend_on_the_order():
 
 
 def test_subset_with_cells_and_with_properties():
-    grid = random_grid().with_properties(height=np.arange(len(random_grid())))
-    part = grid.subset(grid.cells[:, 2] > 3)
-    assert part.shape == grid.shape and (part.properties["height"] == grid.rows(part.cells)).all()
-    more = grid.with_properties(twice=grid.properties["height"] * 2)
+    grid = random_grid().assign_properties(height=np.arange(len(random_grid())))
+    part = grid.select_cells(grid.cells[:, 2] > 3)
+    assert part.shape == grid.shape and (part.properties["height"] == grid.find_rows(part.cells)).all()
+    more = grid.assign_properties(twice=grid.properties["height"] * 2)
     assert set(more.properties) == {"height", "twice"} and set(grid.properties) == {"height"}
-    assert np.array_equal(more.rows(grid.cells), np.arange(len(grid)))
-    other = grid.with_cells(np.array([[5, 5, 5], [1, 1, 1]]))
+    assert np.array_equal(more.find_rows(grid.cells), np.arange(len(grid)))
+    other = grid.replace_cells(np.array([[5, 5, 5], [1, 1, 1]]))
     assert other.cells.tolist() == [[1, 1, 1], [5, 5, 5]] and other.shape == grid.shape and not other.properties
 
 
@@ -88,7 +88,7 @@ TWO_CELLS = np.array([[0, 0, 0], [1, 0, 0]], np.int32)
         ({"cells": TWO_CELLS - 1}, "outside"),
         ({"shape": (1, 1, 1)}, "outside"),
         ({"shape": (2, 0, 1)}, "shape"),
-        ({"shape": (morton.AXIS_LIMIT + 1, 1, 1)}, "shape"),
+        ({"shape": (voxels.AXIS_LIMIT + 1, 1, 1)}, "shape"),
         ({"properties": {"count": np.zeros(3)}}, "count"),
     ],
 )
@@ -99,7 +99,7 @@ def test_grid_refuses(arguments, message):
         VoxelGrid(**{**valid, **arguments})
 
 
-@pytest.mark.parametrize("cells", [[[0, 0, -1]], [[0, 0, 0], [morton.AXIS_LIMIT, 0, 0]], [[2**32, 0, 0]], [[0.5, 0, 0]]])
+@pytest.mark.parametrize("cells", [[[0, 0, -1]], [[0, 0, 0], [voxels.AXIS_LIMIT, 0, 0]], [[2**32, 0, 0]], [[0.5, 0, 0]]])
 def test_from_cells_refuses(cells):
     with pytest.raises(ValueError, match="cells"):
         VoxelGrid.from_cells(np.array(cells))

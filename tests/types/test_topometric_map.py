@@ -28,7 +28,7 @@ def small_map(**changes):
 
 
 def test_map_refuses_what_does_not_fit_together():
-    assert small_map().storey_of_cells().tolist() == [0, 0]
+    assert small_map().find_cell_storeys().tolist() == [0, 0]
     loop, astray, high = np.zeros(1, EDGE_DTYPE), np.zeros(1, EDGE_DTYPE), np.zeros(2, ROOM_DTYPE)
     astray["rooms"], high["storey"] = (0, 7), 3
     for changes in (

@@ -8,7 +8,7 @@ import numpy as np
 
 import topomerge as tm
 from tests.fusion.plans_of import MOVE, office, part
-from topomerge.fusion.fuse import fuse, rooms_in_common
+from topomerge.fusion.fuse import fuse, match_common_rooms
 from topomerge.fusion.result import MergeResult, RoomMatch
 from topomerge.registration.pipeline import Registration
 from topomerge.types import Array, Deformation, Sim3
@@ -46,7 +46,7 @@ def bent_merge(bent: bool = True) -> MergeResult:
     b = tm.extract(MOVE.apply(drift(part(points, low=(5, -99)))).astype(np.float32), name="second.ply")
     bends = {1: straightening()} if bent else {}
     joined = fuse((a, b), [(0, Sim3()), (1, POSE)], bends)
-    rooms, _ = rooms_in_common(a, b, POSE, (None, bends.get(1)))
+    rooms, _ = match_common_rooms(a, b, POSE, (None, bends.get(1)))
     matches = tuple(RoomMatch((0, 1), (i, j), 0.9) for i, j in rooms.tolist())
     registration = Registration(POSE, 0.97, True, defaultdict(float))
     seconds = dict.fromkeys(("read", "extract", "embed", "match", "fuse"), 0.0)

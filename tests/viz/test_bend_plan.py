@@ -16,9 +16,9 @@ from tests.viz import test_report as report
 from tests.viz.bent_merge import SWAY, bent_merge
 from topomerge.fusion.result import MergeResult, Placement
 from topomerge.types import Sim3
-from topomerge.viz.bend_plan import PieceShifts, arrow_factor, arrows, bend_table, bent_path
-from topomerge.viz.merge_report import merge_html
-from topomerge.viz.sheet import lay_out
+from topomerge.viz.merge_plan import PieceShifts, choose_arrow_factor, deform_path, render_arrows, render_deformation_table
+from topomerge.viz.merge_report import render_merge_html
+from topomerge.viz.svg import lay_out
 
 pytestmark = pytest.mark.longer  # all are of one merge
 
@@ -30,7 +30,7 @@ def merged() -> MergeResult:
 
 @pytest.fixture(scope="module")
 def text(merged: MergeResult) -> str:
-    return merge_html(merged)
+    return render_merge_html(merged)
 
 
 def corners(d: str) -> list[np.ndarray]:
@@ -48,28 +48,28 @@ def test_outlines_are_drawn_bent_and_keep_the_rigid_ones(merged: MergeResult, te
             assert rigid.shape == bent.shape
             most = max(most, float(np.hypot(*(bent - rigid).T).max()))
     assert 0.8 * 100 * SWAY < most < 1.2 * 100 * SWAY
-    assert merge_html(merged) == text
+    assert render_merge_html(merged) == text
 
 
 def test_straight_edges_bend(merged: MergeResult) -> None:
     b = merged.maps[1]
     sheet, _ = lay_out(b, "b")
     d = "M0 0l2000 0 0 40 -2000 0z"
-    rigid, bent = bent_path(d, sheet, merged.bends[1], 1.0)
+    rigid, bent = deform_path(d, sheet, merged.bends[1], 1.0)
     (outline,), (bow,) = corners(rigid), corners(bent)
     assert len(outline) == len(bow) == 22 and outline[0].tolist() == [0, 0] and [2000, 40] in outline.tolist()
-    places = np.column_stack([sheet.metres(outline), np.ones(len(outline))])
-    assert np.array_equal(bow, sheet.cm(merged.bends[1].apply(places)))
+    places = np.column_stack([sheet.convert_to_metres(outline), np.ones(len(outline))])
+    assert np.array_equal(bow, sheet.convert_to_cm(merged.bends[1].apply(places)))
     assert np.ptp(bow[:11, 1]) > 100 * SWAY / 2
 
 
 def test_arrows_say_their_true_length(merged: MergeResult, text: str) -> None:
-    shifts = PieceShifts.of(merged.bends[1])
+    shifts = PieceShifts.from_deformation(merged.bends[1])
     words = re.search(r"drawn (\d+) times as long as the move", text)
     assert words
     factor = int(words[1])
     longest = factor * shifts.length.max()
-    assert arrow_factor([shifts], lay_out(merged.maps[0])[0]) <= factor and 0.9 < longest < 2.5
+    assert choose_arrow_factor([shifts], lay_out(merged.maps[0])[0]) <= factor and 0.9 < longest < 2.5
     titles = re.findall(r"<title>(b, room \d+: moved by [^<]*)</title>", text)
     assert len(titles) == (shifts.length >= 0.001).sum()
     assert f"moved by {100 * shifts.length.max():.0f} cm" in " ".join(titles)
@@ -82,18 +82,21 @@ def test_arrows_say_their_true_length(merged: MergeResult, text: str) -> None:
 def test_arrows_stand_on_their_storey_and_are_not_too_many() -> None:
     moves = np.random.default_rng(0).normal(0, (0.2, 0.2, 0.01, 0.0), (1200, 4))
     moves[1199] = 0
-    shifts = PieceShifts.of(deformation(moves, storeys=2))
+    shifts = PieceShifts.from_deformation(deformation(moves, storeys=2))
     sheet, _ = lay_out(building(2, 2))
-    drawn = [str(arrows("b", shifts, storey, sheet, 5)) for storey in (0, 1, 2)]
+    drawn = [str(render_arrows("b", shifts, storey, sheet, 5)) for storey in (0, 1, 2)]
     assert [d.count("<title>") for d in drawn] == [400, 400, 0]
-    still = PieceShifts.of(deformation(np.zeros((4, 4))))
-    assert "<title>" not in arrows("b", still, 0, sheet, 1) and arrow_factor([still, PieceShifts.of(None)], sheet) == 500
+    still = PieceShifts.from_deformation(deformation(np.zeros((4, 4))))
+    assert (
+        "<title>" not in render_arrows("b", still, 0, sheet, 1)
+        and choose_arrow_factor([still, PieceShifts.from_deformation(None)], sheet) == 500
+    )
 
 
 def test_the_table_names_the_largest(merged: MergeResult) -> None:
     places = [Placement(Sim3()), Placement(Sim3(), merged.bends[1])]
-    words = re.sub("<[^>]*>", "|", bend_table(places, ("a", "b"), ("a", None)))
-    shifts = PieceShifts.of(merged.bends[1])
+    words = re.sub("<[^>]*>", "|", render_deformation_table(places, ("a", "b"), ("a", None)))
+    shifts = PieceShifts.from_deformation(merged.bends[1])
     room = int(shifts.room[shifts.length.argmax()])
     assert "|a||rigid||–|" in words
     assert f"|{100 * shifts.length.max():.0f} cm||{100 * np.median(shifts.length):.0f} cm|" in words
@@ -101,7 +104,7 @@ def test_the_table_names_the_largest(merged: MergeResult) -> None:
 
 
 def test_a_rigid_merge_has_neither_arrows_nor_slider(merged: MergeResult) -> None:
-    text = merge_html(replace(merged, bends={}))
+    text = render_merge_html(replace(merged, bends={}))
     page = report.Page(text)
     assert not [p for p in page.all("path") if "data-rigid" in p] and not page.all("g", "bend-arrows")
     assert "data-bend=" not in text and "data-bend>" not in text and "How the maps were bent" not in text

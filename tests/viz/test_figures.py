@@ -13,11 +13,11 @@ from PIL import Image
 
 from tests.scenes_map import building
 from topomerge.errors import InputError
-from topomerge.io.listing import map_to_text
-from topomerge.io.palette import beside, colour_numbers, room_colours
+from topomerge.io.listing import format_map
+from topomerge.io.rooms_ply import assign_colour_numbers, assign_room_colours, find_adjacent_rooms
 from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, TopometricMap, VoxelGrid
-from topomerge.viz.figures import plan_figure, save_figure
-from topomerge.viz.plan import frame_of, places, storey_plans
+from topomerge.viz.figures import plot_plan, save_figure
+from topomerge.viz.plan import compute_frame, find_label_places, rasterize_storeys
 
 
 def without_rooms(map: TopometricMap) -> TopometricMap:
@@ -28,7 +28,7 @@ def without_rooms(map: TopometricMap) -> TopometricMap:
 
 @pytest.mark.parametrize("storeys", [1, 2, 5])
 def test_one_panel_a_storey_at_one_scale(storeys: int) -> None:
-    figure = plan_figure(building(2, storeys))
+    figure = plot_plan(building(2, storeys))
     assert len(figure.axes) == storeys
     scales = set()
     for ax in figure.axes:
@@ -40,7 +40,7 @@ def test_one_panel_a_storey_at_one_scale(storeys: int) -> None:
 
 
 def test_title_and_legend_tell_what_is_drawn() -> None:
-    figure = plan_figure(building(2, 2))
+    figure = plot_plan(building(2, 2))
     words = [text.get_text() for text in figure.texts]
     assert "building.ply: 10 rooms, 2 storeys" in words
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
@@ -50,7 +50,7 @@ def test_title_and_legend_tell_what_is_drawn() -> None:
 def test_a_joined_map_has_the_names_of_all_its_files() -> None:
     scene = replace(building(2, 2), source="house/a.tmap + other house/b.ply + ")
     assert scene.title == "a.tmap + b.ply + map"
-    assert "a.tmap + b.ply + map: 10 rooms, 2 storeys" in [text.get_text() for text in plan_figure(scene).texts]
+    assert "a.tmap + b.ply + map: 10 rooms, 2 storeys" in [text.get_text() for text in plot_plan(scene).texts]
 
 
 def test_ramps_are_drawn_and_listed_as_ramps() -> None:
@@ -58,29 +58,29 @@ def test_ramps_are_drawn_and_listed_as_ramps() -> None:
     edges = scene.edges.copy()
     edges["kind"][edges["kind"] == "stairs"] = "ramp"
     sloped = replace(scene, edges=edges)
-    legend = [text.get_text() for text in plan_figure(sloped).legends[0].get_texts()]
+    legend = [text.get_text() for text in plot_plan(sloped).legends[0].get_texts()]
     assert legend == ["door", "opening", "ramp", "wall", "no room"]
-    text = map_to_text(sloped)
+    text = format_map(sloped)
     assert " 0 stairs, 1 ramp;" in text and "(ramp)" in text and "(stairs)" not in text
 
 
 def test_every_room_has_its_number_inside_it() -> None:
     scene = building(3, 2)
-    frame = frame_of(scene)
-    for storey, plan in enumerate(storey_plans(scene, frame)):
-        place_of_room = places(plan, frame)
+    frame = compute_frame(scene)
+    for storey, plan in enumerate(rasterize_storeys(scene, frame)):
+        place_of_room = find_label_places(plan, frame)
         assert sorted(place_of_room) == np.flatnonzero(scene.rooms["storey"] == storey).tolist()
         for room, place in place_of_room.items():
             i, j = ((np.array([place.x, place.y]) - frame.low) / frame.size).astype(int)
             assert plan.room[i, j] == room and not plan.wall[i, j]
-    texts = [text.get_text() for ax in plan_figure(scene).axes for text in ax.texts]
+    texts = [text.get_text() for ax in plot_plan(scene).axes for text in ax.texts]
     assert [t for t in texts if t.isdigit()] == [str(i) for i in range(len(scene.rooms))]
 
 
 def test_walls_are_cut_and_doors_are_open() -> None:
     scene = building(1, 2)
-    frame = frame_of(scene)
-    for storey, plan in enumerate(storey_plans(scene, frame)):
+    frame = compute_frame(scene)
+    for storey, plan in enumerate(rasterize_storeys(scene, frame)):
         assert plan.wall[0].all() and plan.wall[:, 0].all()
         for edge in scene.edges[(scene.rooms["storey"][scene.edges["rooms"]] == storey).all(axis=1)]:
             i, j = ((edge["centre"][:2] - frame.low) / frame.size).astype(int)
@@ -89,17 +89,17 @@ def test_walls_are_cut_and_doors_are_open() -> None:
 
 def test_rooms_side_by_side_differ() -> None:
     scene = building(6, 3)
-    pairs = beside(scene)
+    pairs = find_adjacent_rooms(scene)
     assert {(0, 2), (0, 12), (12, 25)} <= {tuple(pair) for pair in pairs.tolist()}
-    colours = room_colours(scene)
+    colours = assign_room_colours(scene)
     assert (colours[pairs[:, 0]] != colours[pairs[:, 1]]).any(axis=1).all()
 
 
 def test_colours_of_a_dense_graph() -> None:
     pairs = np.array([(a, b) for a in range(14) for b in range(a)])
-    assert len(set(colour_numbers(14, pairs).tolist())) == 14
-    assert len(colour_numbers(40, np.array([(a, b) for a in range(40) for b in range(a)]))) == 40
-    assert len(colour_numbers(0, np.zeros((0, 2), int))) == 0
+    assert len(set(assign_colour_numbers(14, pairs).tolist())) == 14
+    assert len(assign_colour_numbers(40, np.array([(a, b) for a in range(40) for b in range(a)]))) == 40
+    assert len(assign_colour_numbers(0, np.zeros((0, 2), int))) == 0
 
 
 @pytest.mark.parametrize("joins", [0, 30, 120, 400])
@@ -116,7 +116,7 @@ def test_the_most_constrained_room_is_next(joins: int) -> None:
         free = [c for c in range(8) if c not in taken[room]] or [c for c in range(16) if c not in taken[room]] or list(range(16))
         counts = Counter(numbers.values())
         numbers[room] = min(free, key=lambda c: (counts[c], c))
-    assert colour_numbers(60, pairs).tolist() == [numbers[i] for i in range(60)]
+    assert assign_colour_numbers(60, pairs).tolist() == [numbers[i] for i in range(60)]
 
 
 @pytest.mark.longer
@@ -146,7 +146,7 @@ def test_far_apart_cells_are_drawn_together() -> None:
     cells = np.array([[0, 0, 0], [200_000, 5, 3]])
     grid = VoxelGrid.from_cells(cells)
     scene = without_rooms(replace(building(1, 1), grid=grid, room=np.full(2, -1, np.int32)))
-    assert max(frame_of(scene).shape) <= 1500
+    assert max(compute_frame(scene).shape) <= 1500
 
 
 def test_unknown_folder(tmp_path: Path) -> None:

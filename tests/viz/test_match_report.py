@@ -16,10 +16,10 @@ from tests.scenes import Scene
 from tests.viz.chromium import Page
 from topomerge.cli.main import main as cli
 from topomerge.embedding.surroundings import CROP, CROP_PLANES
-from topomerge.matching.result import Matching
+from topomerge.matching.match import Matching
 from topomerge.types import Sim3
-from topomerge.viz.match_report import match_html, quarters_alike, save_match_report, surroundings_image
-from topomerge.viz.places_view import PIXEL_COLOURS
+from topomerge.viz.match_report import draw_surroundings, find_aligning_quarters, render_match_html, save_match_report
+from topomerge.viz.merge_report import PIXEL_COLOURS
 
 FLAT = Scene().shell(0, 0, 13, 9).wall((5, 0), (5, 9), doors=(2.0,)).wall((5, 5), (13, 5), doors=(4.0,))
 
@@ -44,12 +44,12 @@ def matching(flats) -> Matching:
 def test_crops_are_turned_until_their_walls_agree(quarters: int) -> None:
     crops = np.zeros((2, CROP, CROP, len(CROP_PLANES)), np.uint8)
     crops[0, 10:50, 12, 0] = crops[1, 30, 20:60, 0] = crops[1, 30:40, 20, 0] = 255
-    assert quarters_alike(np.rot90(crops, quarters, (1, 2)), crops) == quarters
+    assert find_aligning_quarters(np.rot90(crops, quarters, (1, 2)), crops) == quarters
 
 
 def test_both_pictures_of_a_match_are_alike(flats, matching) -> None:
     """Of one flat twice, however it stands in its file."""
-    page = match_html(matching, *flats)
+    page = render_match_html(matching, *flats)
     pictures = re.findall(r'<img src="data:image/png;base64,([^"]+)"', page)
     assert len(pictures) == 6
     alike = [_pixels(one) == _pixels(other) for one, other in zip(pictures[::2], pictures[1::2], strict=True)]
@@ -63,7 +63,7 @@ def _pixels(data: str) -> np.ndarray:
 def test_a_picture_has_its_colours_and_the_largest_y_above() -> None:
     crop = np.zeros((CROP, CROP, len(CROP_PLANES)), np.uint8)
     crop[:, -1, CROP_PLANES.index("wall")] = 255
-    image = surroundings_image(crop)
+    image = draw_surroundings(crop)
     assert (image[0] == PIXEL_COLOURS["wall"]).all() and (image[1:] != PIXEL_COLOURS["wall"]).any(axis=2).all()
 
 
@@ -72,8 +72,8 @@ def test_each_match_stands_in_the_page(flats, matching, tmp_path: Path) -> None:
     page = (tmp_path / "m.html").read_text(encoding="utf-8")
     assert page.count("<details data-room-of-a=") == 3 and page.count('class="match"') == 3
     assert "probability 0.60" in page and "&lt;a&gt;.ply" in page and "<a>.ply" not in page
-    assert page == match_html(matching, *flats)
-    none = match_html(Matching(), *flats)
+    assert page == render_match_html(matching, *flats)
+    none = render_match_html(Matching(), *flats)
     assert "<details data-room-of-a=" not in none and "<b>0</b>" in none
 
 

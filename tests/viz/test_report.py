@@ -22,9 +22,9 @@ from tests.viz.test_figures import without_rooms
 from topomerge.cli.main import main
 from topomerge.errors import InputError
 from topomerge.types import AREA_DTYPE, EDGE_DTYPE, TopometricMap, VoxelGrid
-from topomerge.viz.markup import element, join, json_data
-from topomerge.viz.report import report_html, save_report
-from topomerge.viz.scene import scene_data
+from topomerge.viz.plan import build_scene_data
+from topomerge.viz.report import render_report_html, save_report
+from topomerge.viz.tables import build_element, embed_json, join
 
 EVIL = "</script><img src=x onerror=alert(1)>\"'&{{script}}<!--.ply"
 
@@ -60,7 +60,7 @@ def data_of(text: str) -> dict:
 
 def test_every_room_and_door_is_in_plan_and_table() -> None:
     map = building(2, 2)
-    page = Page(report_html(map))
+    page = Page(render_report_html(map))
     rows = page.all("tr")
     assert [row["data-room"] for row in rows if "data-room" in row] == [str(i) for i in range(10)]
     assert sorted(int(p["data-room"] or -1) for p in page.all("path", "room")) == list(range(10))
@@ -73,7 +73,7 @@ def test_every_room_and_door_is_in_plan_and_table() -> None:
 
 def test_what_is_shown_says_how_sure_it_is() -> None:
     map = doubted()
-    page = Page(report_html(map))
+    page = Page(render_report_html(map))
     sure = [f"{odds:.3f}" for odds in map.rooms["confidence"]]
     for tag, name in (("path", "room"), ("g", "label"), ("circle", "node"), ("tr", None)):
         said = {a["data-room"]: a["data-sure"] for a in page.all(tag, name) if "data-room" in a}
@@ -87,7 +87,7 @@ def test_what_is_shown_says_how_sure_it_is() -> None:
 
 
 def test_one_file_without_a_network() -> None:
-    text = report_html(building(1, 1))
+    text = render_report_html(building(1, 1))
     page = Page(text)
     for _, about in page.elements:
         assert not {"src", "srcset", "action", "data", "ping"} & set(about)
@@ -101,18 +101,18 @@ def test_one_file_without_a_network() -> None:
 def test_names_stay_text() -> None:
     map = building(1, 1)
     odd = replace(map, source=f"/tmp/{EVIL}", warnings=(EVIL, "\udcff\x00"), parameters={EVIL: EVIL}, seconds={EVIL: 1.0})
-    plain, escaped = Page(report_html(map)), Page(report_html(odd))
+    plain, escaped = Page(render_report_html(map)), Page(render_report_html(odd))
     assert not escaped.all("img")
     assert len(escaped.all("script")) == len(plain.all("script")) == 2
-    assert report_html(odd).count("{{script}}") >= 4  # told as it is, not filled in
-    assert data_of(report_html(odd)) == data_of(report_html(map))
+    assert render_report_html(odd).count("{{script}}") >= 4  # told as it is, not filled in
+    assert data_of(render_report_html(odd)) == data_of(render_report_html(map))
 
 
 def test_markup_escapes() -> None:
-    link = element("a", "<b>", element("i", "x&y"), class_="k", data_x='"<', title=None, hidden=True)
+    link = build_element("a", "<b>", build_element("i", "x&y"), class_="k", data_x='"<', title=None, hidden=True)
     assert link == '<a class="k" data-x="&quot;&lt;" hidden>&lt;b&gt;<i>x&amp;y</i></a>'
-    assert join(["<", element("b")], "&") == "&lt;&<b></b>"  # what stands between is the program's own
-    data = json_data({"a": "</script><!--&\u2028"}, "x")
+    assert join(["<", build_element("b")], "&") == "&lt;&<b></b>"  # what stands between is the program's own
+    data = embed_json({"a": "</script><!--&\u2028"}, "x")
     assert "</script>" not in data[:-9] and "<!--" not in data and "\u2028" not in data
     assert json.loads(re.sub("<[^>]*>", "", data))["a"] == "</script><!--&\u2028"
 
@@ -129,7 +129,7 @@ def test_same_map_same_bytes_written_whole(tmp_path: Path) -> None:
 def test_size() -> None:
     big = building(30, 1)  # 1,300 m2
     assert big.rooms["area"].sum() > 1250
-    assert len(report_html(big)) < 3e6
+    assert len(render_report_html(big)) < 3e6
 
 
 def test_areas_and_stairs_are_drawn() -> None:
@@ -143,7 +143,7 @@ def test_areas_and_stairs_are_drawn() -> None:
     edges["lower"][stairs] = edges["centre"][stairs] - (2, 0, 0)
     edges["upper"][stairs] = edges["centre"][stairs] + (2, 0, HEIGHT * 0.1)
     edges["open"][0] = False
-    page = Page(report_html(replace(map, areas=areas, narrows=narrow, edges=edges)))
+    page = Page(render_report_html(replace(map, areas=areas, narrows=narrow, edges=edges)))
     assert len(page.all("line", "narrow")) == 1
     assert len(page.all("path", "flight")) == 2 and len(page.all("path", "tread")) == 2
     assert len(page.all("g", "shut")) == 1
@@ -157,14 +157,14 @@ def nothing() -> TopometricMap:
 
 def test_maps_with_little_in_them() -> None:
     for map in (without_rooms(building(1, 1)), nothing()):
-        page = Page(report_html(map))
+        page = Page(render_report_html(map))
         assert len(page.all("svg", "plan")) == 1
 
 
 def test_a_map_of_two_far_cells() -> None:
     grid = VoxelGrid.from_cells(np.array([[0, 0, 0], [200_000, 5, 3]]))
     map = without_rooms(replace(building(1, 1), grid=grid, room=np.full(2, -1, np.int32)))
-    assert max(scene_data(map)["shape"]) <= 65_536 and scene_data(map)["drawn"] == 2
+    assert max(build_scene_data(map)["shape"]) <= 65_536 and build_scene_data(map)["drawn"] == 2
 
 
 def test_command_line_writes_it(tmp_path: Path) -> None:
@@ -246,7 +246,7 @@ def with_probe(text: str, probe: str = PROBE) -> str:
 def test_in_a_browser(tmp_path: Path) -> None:
     page = tmp_path / "a.html"
     map = replace(building(2, 2), source=EVIL, warnings=(EVIL,))
-    page.write_text(with_probe(report_html(map)), encoding="utf-8")
+    page.write_text(with_probe(render_report_html(map)), encoding="utf-8")
     text, console = browse(page, "--dump-dom")
     assert console == []
     title = re.search("<title>(.*?)</title>", text)
@@ -280,7 +280,7 @@ window.addEventListener("load", () => setTimeout(() => {
 @pytest.mark.longer
 def test_the_slider_hides_what_is_less_sure(tmp_path: Path) -> None:
     page = tmp_path / "a.html"
-    page.write_text(with_probe(report_html(doubted()), SLIDE), encoding="utf-8")
+    page.write_text(with_probe(render_report_html(doubted()), SLIDE), encoding="utf-8")
     text, console = browse(page, "--dump-dom")
     assert console == []
     title = re.search("<title>(.*?)</title>", text)

@@ -11,8 +11,8 @@ import pytest
 
 from tests.scenes_map import building
 from tests.viz.chromium import Page
+from topomerge.viz.plan import build_scene_data, encode_leb128
 from topomerge.viz.report import save_report
-from topomerge.viz.scene import leb128, scene_data
 
 WHOLE_STAGE = "document.querySelector('.stage') && document.querySelector('.stage').dataset.whole === 'true'"
 # Turns the building and notes ms from picture to picture, how many cells each has, and the longest ms until all are drawn.
@@ -48,7 +48,7 @@ def test_two_million_cells_are_turned(tmp_path: Path) -> None:
     save_report(map, tmp_path / "a.html")
     written = time.perf_counter() - began
     size = (tmp_path / "a.html").stat().st_size
-    total = scene_data(map)["drawn"]
+    total = build_scene_data(map)["drawn"]
     assert size < 6e6 and total == len(map.grid)
     began = time.perf_counter()
     with Page(tmp_path / "a.html", tmp_path / "profile") as page:
@@ -90,9 +90,9 @@ def decoded(data: dict) -> np.ndarray:
 
 def test_cells_come_back() -> None:
     map = building(1, 2)
-    drawn = decoded(scene_data(map))
+    drawn = decoded(build_scene_data(map))
     cells = map.grid.cells - map.grid.cells.min(axis=0)
-    want = np.column_stack([cells, map.storey_of_cells(), map.room])
+    want = np.column_stack([cells, map.find_cell_storeys(), map.room])
     assert sorted(map_rows(drawn[:, :5])) == sorted(map_rows(want))
 
 
@@ -102,7 +102,7 @@ def map_rows(rows: np.ndarray) -> list[tuple[int, ...]]:
 
 def test_many_cells_are_merged() -> None:
     map = building(2, 1)
-    data = scene_data(map, most=len(map.grid) // 2, seen=np.arange(len(map.grid)) % 2)
+    data = build_scene_data(map, most=len(map.grid) // 2, seen=np.arange(len(map.grid)) % 2)
     assert data["merged"] == 2 and data["edge"] == 0.2 and data["cells"] == len(map.grid)
     drawn = decoded(data)
     assert len(drawn) <= len(map.grid) // 2
@@ -112,5 +112,5 @@ def test_many_cells_are_merged() -> None:
 
 
 def test_leb128() -> None:
-    assert leb128(np.array([0, 127, 128, 300, 1 << 40])) == bytes([0, 127, 128, 1, 172, 2, 128, 128, 128, 128, 128, 32])
-    assert leb128(np.zeros(0, np.int64)) == b""
+    assert encode_leb128(np.array([0, 127, 128, 300, 1 << 40])) == bytes([0, 127, 128, 1, 172, 2, 128, 128, 128, 128, 128, 32])
+    assert encode_leb128(np.zeros(0, np.int64)) == b""

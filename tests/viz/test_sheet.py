@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from tests.scenes_map import building
-from topomerge.viz.outline import whole_rooms
-from topomerge.viz.plan import frame_of, storey_plans
-from topomerge.viz.sheet import direction, lay_out
+from topomerge.viz.plan import compute_frame, rasterize_storeys
+from topomerge.viz.svg import estimate_wall_direction, fill_rooms, lay_out
 
 
 @pytest.mark.parametrize("degrees", [-40, -20, 0, 10, 30, 44])
@@ -19,28 +18,28 @@ def test_walls_run_along_the_paper(degrees: float) -> None:
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     x, y = np.abs(c * i + s * j), np.abs(-s * i + c * j)
     walls = ((x < 80) & (y < 50)) & ~((x < 77) & (y < 47))
-    assert np.degrees(direction(walls)) == pytest.approx(degrees, abs=1.0)
+    assert np.degrees(estimate_wall_direction(walls)) == pytest.approx(degrees, abs=1.0)
 
 
 def test_paper_and_building() -> None:
     sheet, _ = lay_out(building(1, 1))
     a, b, c, d, e, f = sheet.back
     for point in ((2.5, -1.0), (6.0, 3.25)):
-        x, y = sheet.at(np.array(point))
+        x, y = sheet.locate(np.array(point))
         assert (a * x + b * y + c, d * x + e * y + f) == pytest.approx(point, abs=0.006)
     turned = replace(sheet, turn=0.4)
     a, b, c, d, e, f = turned.back
-    x, y = turned.at(np.array([2.5, -1.0]))
+    x, y = turned.locate(np.array([2.5, -1.0]))
     assert (a * x + b * y + c, d * x + e * y + f) == pytest.approx((2.5, -1.0), abs=0.008)
 
 
 def test_small_gaps_are_filled_and_no_room_takes_from_another() -> None:
     map = building(1, 1)
-    frame = frame_of(map)
-    plan = storey_plans(map, frame)[0]
+    frame = compute_frame(map)
+    plan = rasterize_storeys(map, frame)[0]
     holed = plan.room.copy()
     holed[10:14, 10:30] = -1
-    filled = whole_rooms(replace(plan, room=holed), frame)
+    filled = fill_rooms(replace(plan, room=holed), frame)
     assert (filled[10:14, 10:30] == plan.room[10:14, 10:30]).all()
     labelled = plan.room >= 0
     assert (filled[labelled] == plan.room[labelled]).all()

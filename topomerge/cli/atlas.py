@@ -1,33 +1,50 @@
-"""The command `atlas`: many maps in one folder, to which maps are added, from which they are taken away, and in which a place is
-found."""
+"""Commands `atlas` and `watch`: maps that come in one by one."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import sys
+import time
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from topomerge.cli.command import Command, option
-from topomerge.cli.console import check_inputs, say, say_line, warn, write_out
+from topomerge.cli.console import (
+    Command,
+    build_option,
+    check_inputs,
+    check_outputs,
+    find_signal,
+    format_failure,
+    guard_printing,
+    print_line,
+    print_text,
+    warn,
+    write_out,
+)
 from topomerge.cli.options import (
     ATLAS_OPTIONS,
     CLOUD_OPTIONS,
-    at_least_one,
-    atlas_choices,
+    build_json_option,
+    build_output_option,
+    build_quiet_option,
     check_cloud_options,
-    json_option,
-    map_from,
-    quiet,
+    collect_atlas_options,
+    collect_given,
+    load_input_map,
+    parse_count,
+    parse_positive,
 )
 from topomerge.errors import InputError
 
 if TYPE_CHECKING:
     from topomerge.fusion.atlas.partners import Workers
     from topomerge.fusion.atlas.result import AtlasResult
+    from topomerge.fusion.atlas.watch import FolderWatcher, Reader
+    from topomerge.types import TopometricMap
+    from topomerge.viz.rerun_log import RerunLog
 
 
 ROOMS_SHOWN = 8  # pairs of rooms of a map that `find` prints
@@ -38,7 +55,7 @@ rooms: pairs that look most like each other among the rooms of both maps, even i
 `topomerge merge` tells whether it is the same place."""
 
 
-def atlas_command(args: argparse.Namespace) -> int:
+def run_atlas(args: argparse.Namespace) -> int:
     """`topomerge atlas add|remove|list|find DIR …`. Status 2 of the first two: no maps are connected."""
     if args.verb in ("add", "find"):
         return _add(args) if args.verb == "add" else _find(args)
@@ -46,38 +63,38 @@ def atlas_command(args: argparse.Namespace) -> int:
 
 
 def _add(args: argparse.Namespace) -> int:
-    from topomerge.fusion.atlas.folder import check_folder
+    from topomerge.fusion.atlas.folder import read_folder
     from topomerge.fusion.atlas.store import add
-    from topomerge.viz.atlas_report import atlas_html
+    from topomerge.viz.atlas_report import render_atlas_html
 
     if not args.items:
         raise InputError(f"{args.folder}: name the maps or clouds to add: topomerge atlas add {args.folder} MAP ...")
-    check_folder(args.folder)
-    choices, workers = atlas_choices(args), _workers(args)
+    read_folder(args.folder)
+    choices, workers = collect_atlas_options(args), _build_workers(args)
     check_inputs(args.items)
     check_cloud_options(args.items, args)
-    maps = ((Path(path).stem, replace(map_from(path, args), source=path)) for path in args.items)  # one in memory at a time
-    return _report(add(args.folder, maps, atlas_html, workers, **choices), args)
+    maps = ((Path(path).stem, replace(load_input_map(path, args), source=path)) for path in args.items)  # one in memory at a time
+    return _report_result(add(args.folder, maps, render_atlas_html, workers, **choices), args)
 
 
-def _workers(args: argparse.Namespace) -> Workers | None:
+def _build_workers(args: argparse.Namespace) -> Workers | None:
     """Who registers pairs: None is this process."""
-    from topomerge.fusion.atlas.partners import cluster, processes
+    from topomerge.fusion.atlas.partners import connect_cluster, start_processes
 
     if args.cluster and args.jobs > 1:
         raise InputError("--cluster and --jobs: give one of them; the workers of a cluster are its own")
-    return cluster(args.cluster) if args.cluster else processes(args.jobs) if args.jobs > 1 else None
+    return connect_cluster(args.cluster) if args.cluster else start_processes(args.jobs) if args.jobs > 1 else None
 
 
 def _remove(args: argparse.Namespace) -> int:
     from topomerge.fusion.atlas.folder import read_atlas
     from topomerge.fusion.atlas.store import remove
-    from topomerge.viz.atlas_report import atlas_html
+    from topomerge.viz.atlas_report import render_atlas_html
 
     if not args.items:
         names = ", ".join(e.name for e in read_atlas(args.folder).entries)
         raise InputError(f"{args.folder}: name the maps to take out; it holds {names or 'none'}")
-    return _report(remove(args.folder, args.items, atlas_html), args)
+    return _report_result(remove(args.folder, args.items, render_atlas_html), args)
 
 
 def _find(args: argparse.Namespace) -> int:
@@ -87,7 +104,7 @@ def _find(args: argparse.Namespace) -> int:
         raise InputError(f"{args.folder}: name the one map or cloud to look for: topomerge atlas find {args.folder} MAP")
     check_inputs(args.items)
     check_cloud_options(args.items, args)
-    sightings = find(args.folder, map_from(args.items[0], args), args.first)
+    sightings = find(args.folder, load_input_map(args.items[0], args), args.first)
     if args.json:
         write_out(json.dumps([asdict(s) for s in sightings], indent=1, ensure_ascii=False) + "\n")
         return 0
@@ -96,19 +113,21 @@ def _find(args: argparse.Namespace) -> int:
         rooms = ", ".join(f"{i} = {j}" for i, j, _ in s.rooms[:ROOMS_SHOWN]) or "none similar"
         rows.append((s.name, "" if s.fit is None else f"{s.fit:+.1f}", f"{s.share:.2f}", rooms))
     widths = [max(len(row[c]) for row in rows) for c in range(3)]
-    say("\n".join("  ".join((*(f"{word:<{wide}}" for word, wide in zip(row, widths, strict=False)), row[3])) for row in rows))
+    print_text(
+        "\n".join("  ".join((*(f"{word:<{wide}}" for word, wide in zip(row, widths, strict=False)), row[3])) for row in rows)
+    )
     if not args.quiet:
-        say(f"\n{FIND_COLUMNS}")
+        print_text(f"\n{FIND_COLUMNS}")
     return 0
 
 
-def _report(result: AtlasResult, args: argparse.Namespace) -> int:
+def _report_result(result: AtlasResult, args: argparse.Namespace) -> int:
     """Say what came out, and return the exit status."""
     warn(result.warnings)
     if not args.quiet:
-        say_line(f"{result.words()} -> {args.folder}")
+        print_line(f"{result.format_summary()} -> {args.folder}")
     elif result.alone and len(result.names) > 1:
-        say_line(f"topomerge: {result.words()}", sys.stderr)
+        print_line(f"topomerge: {result.format_summary()}", sys.stderr)
     return 2 if result.status == "abstained" else 0
 
 
@@ -122,15 +141,15 @@ def _list(args: argparse.Namespace) -> int:
         write_out(json.dumps(listing, indent=1, ensure_ascii=False) + "\n")
         return 0
     try:
-        table = _table(listing)
+        table = _format_listing(listing)
     except (KeyError, TypeError) as error:
         reason = f"{type(error).__name__}: {error}"[:120]
         raise InputError(f"{args.folder}: its atlas.json is damaged ({reason}); make the atlas again from its maps") from error
-    say(f"{args.folder}: {table}")
+    print_text(f"{args.folder}: {table}")
     return 0
 
 
-def _table(listing: Mapping[str, Any]) -> str:
+def _format_listing(listing: Mapping[str, Any]) -> str:
     """What atlas.json lists, as text."""
     rows = [("map", "rooms", "storeys", "where", "source")]
     joined_in = {k: n for n, c in enumerate(listing["components"]) for k in c["maps"] if len(c["maps"]) > 1}
@@ -144,27 +163,158 @@ def _table(listing: Mapping[str, Any]) -> str:
 
 ATLAS = Command(
     "atlas",
-    atlas_command,
+    run_atlas,
     "keep many maps together: add, remove, list, find",
     "topomerge atlas add house/ ground.ply cellar.tmap attic.las",
     (
-        option(
+        build_option(
             "verb",
             choices=("add", "remove", "list", "find"),
             help="add maps (a new folder becomes an atlas), remove or list them, or find which of them a new map shows",
         ),
-        option("folder", metavar="DIR", help="the atlas"),
-        option("items", nargs="*", metavar="MAP", help="add, find: clouds or .tmap; remove: names as `list` prints them"),
-        option("--first", type=at_least_one, default=5, metavar="N", help="find: how many maps to name (default 5)"),
-        option("--jobs", type=at_least_one, default=1, metavar="N", help="add: register pairs in N processes (default 1)"),
-        option("--cluster", default="", metavar="ADDRESS", help="add: register pairs on a Dask cluster, e.g. tcp://host:8786"),
+        build_option("folder", metavar="DIR", help="the atlas"),
+        build_option("items", nargs="*", metavar="MAP", help="add, find: clouds or .tmap; remove: names as `list` prints them"),
+        build_option("--first", type=parse_count, default=5, metavar="N", help="find: how many maps to name (default 5)"),
+        build_option("--jobs", type=parse_count, default=1, metavar="N", help="add: register pairs in N processes (default 1)"),
+        build_option(
+            "--cluster", default="", metavar="ADDRESS", help="add: register pairs on a Dask cluster, e.g. tcp://host:8786"
+        ),
         *ATLAS_OPTIONS,
         *CLOUD_OPTIONS,
-        json_option("list: print atlas.json; find: print maps and rooms as JSON"),
-        quiet("print nothing but warnings and what stands apart; find: only the table"),
+        build_json_option("list: print atlas.json; find: print maps and rooms as JSON"),
+        build_quiet_option("print nothing but warnings and what stands apart; find: only the table"),
     ),
     paths=("folder", "items"),
     description="Keep many maps together: those that belong to each other are joined, the others stay apart and are named. "
     "Status 2: nothing is connected. find names the maps and rooms that a new map shows, most likely first; merge tells whether "
     "it is so.",
+)
+
+
+EVERY, SETTLE = 2.0, 2.0  # s
+
+
+def run_watch(args: argparse.Namespace) -> int:
+    """`topomerge watch`: until Ctrl-C, or with --once until all that is there is in the atlas."""
+    began = time.monotonic()
+    watch: FolderWatcher | None = None
+    try:
+        watch = _build_monitor(args)
+        busy = True
+        while busy or not args.once:
+            busy = watch.update()
+            if busy or not args.once:
+                time.sleep(args.every)
+    except (KeyboardInterrupt, Exception) as stop:
+        if not isinstance(find_signal(stop), KeyboardInterrupt):
+            raise
+        done = "nothing was read yet" if watch is None else _format_summary(watch)
+        print_text(f"stopped after {time.monotonic() - began:.0f} s: {done}")
+        return 130 if args.once else 0
+    if not args.quiet:
+        print_line(_format_summary(watch))
+    return 0
+
+
+def _build_monitor(args: argparse.Namespace) -> FolderWatcher:
+    """What looks into the folder, and tells what it does."""
+    from topomerge.fusion.atlas.watch import FolderWatcher
+    from topomerge.viz.atlas_report import render_atlas_html
+
+    def tell(line: str, is_warning: bool) -> None:
+        if is_warning:
+            warn([line])
+        elif not args.quiet:
+            print_line(line)
+            with guard_printing():
+                sys.stdout.flush()
+
+    log = _open_rerun_log(args)
+
+    def report(result: AtlasResult, joined: Mapping[int, TopometricMap], title: str, **words: Any) -> str:
+        if log is not None and "component" not in words:  # once, with the page of all
+            log.log(result, joined)
+        return render_atlas_html(result, joined, title, **words)
+
+    return FolderWatcher(
+        Path(args.folder),
+        Path(args.output),
+        _build_reader(args),
+        report,
+        tell,
+        settle=args.settle,
+        replacing=args.replace == "longer",
+        settings=collect_atlas_options(args),
+        warm=not args.once,
+    )
+
+
+def _open_rerun_log(args: argparse.Namespace) -> RerunLog | None:
+    if not hasattr(args, "rerun"):
+        return None
+    from topomerge.viz.rerun_log import RerunLog
+
+    if args.rerun is not None:
+        check_outputs([args.rerun])
+    return RerunLog(args.rerun)
+
+
+def _format_summary(watch: FolderWatcher) -> str:
+    from topomerge.fusion.atlas.folder import read_folder
+
+    counts, held = watch.counts, len(read_folder(watch.atlas).entries)
+    parts = [f"{counts[what]} {what}" for what in ("added", "replaced", "unreadable") if counts[what]] or ["nothing new"]
+    return f"{', '.join(parts)}; {watch.atlas} holds {held} map{'s' * (held != 1)}"
+
+
+def _build_reader(args: argparse.Namespace) -> Reader:
+    from topomerge.fusion.atlas.watch import Reader
+
+    def read(path: Path) -> TopometricMap:
+        return replace(load_input_map(str(path), args), source=str(path))
+
+    def failure(error: Exception, path: Path) -> str | None:
+        return None if find_signal(error) is not None else f"{format_failure(error, [str(path)])}; it is skipped until it changes"
+
+    names = ("voxel_size", "up", "unit", "one_frame", "sensor")
+    return Reader(read, json.dumps(collect_given(args, *names), sort_keys=True), failure)
+
+
+WATCH = Command(
+    "watch",
+    run_watch,
+    "put scans and maps that appear in a folder into an atlas",
+    "topomerge watch scans/ -o site/",
+    (
+        build_option("folder", metavar="DIR", help="folder to watch: each file, or folder of scans, directly in it is one map"),
+        build_output_option("ATLAS", "the atlas; a new folder becomes one"),
+        build_option("--once", action="store_true", default=False, help="stop when everything in the folder is in the atlas"),
+        build_option("--every", type=parse_positive, default=EVERY, metavar="S", help="seconds between two looks (default 2)"),
+        build_option(
+            "--settle",
+            type=parse_positive,
+            default=SETTLE,
+            metavar="S",
+            help="a file is complete after so many seconds without a change (default 2)",
+        ),
+        build_option(
+            "--replace",
+            choices=("longer", "never"),
+            default="longer",
+            help="longer (default): a changed file replaces its earlier map if it has most of that map's rooms; never: both stay",
+        ),
+        *ATLAS_OPTIONS,
+        *CLOUD_OPTIONS,
+        build_option(
+            "--rerun",
+            nargs="?",
+            metavar="A.rrd",
+            help="log cells, rooms, graph and links to Rerun: into a file, or without a name to a viewer that is opened",
+        ),
+        build_quiet_option("print nothing but warnings"),
+    ),
+    paths=("folder", "output", "rerun"),
+    description="Watch a folder: scans and maps that appear in it, or change, become maps of an atlas. It may be stopped at any "
+    "moment (Ctrl-C) and started again; report.html of the atlas loads itself anew in an open browser. A file that can't be "
+    "read is named once, and tried again when it changes.",
 )

@@ -13,15 +13,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from topomerge.cli.command import Command, option
-from topomerge.cli.console import write_out
+from topomerge.cli.console import Command, build_option, write_out
 
 SHELLS = ("bash", "zsh", "fish")
 FOLDER_METAVARS = ("DIR", "FOLDER")
 
 
 @dataclass(frozen=True)
-class Word:
+class CompletionWord:
     """An option, or an argument without a flag (`flags` is empty), which may `repeat`."""
 
     flags: tuple[str, ...]
@@ -31,30 +30,34 @@ class Word:
     repeat: bool = False
 
 
-def completion_command(args: argparse.Namespace) -> int:
+def run_completion(args: argparse.Namespace) -> int:
     """`topomerge completion`: print the script that completes all of `args.commands`."""
-    write_out(script(args.shell, args.commands))
+    write_out(build_script(args.shell, args.commands))
     return 0
 
 
-def script(shell: str, commands: Sequence[Command]) -> str:
-    """The script that completes `topomerge` in a shell.
+def build_script(shell: str, commands: Sequence[Command]) -> str:
+    """Build the script that completes `topomerge` in a shell.
 
     Args:
         shell: one of `SHELLS`.
         commands: those that it shall know.
     """
-    words = {c.name: [*(_word(flags, settings, c.paths) for flags, settings in c.arguments), *COMMON_OPTIONS] for c in commands}
-    return {"bash": _bash, "zsh": _zsh, "fish": _fish}[shell](words, {c.name: c.summary for c in commands})
+    words = {
+        c.name: [*(_build_word(flags, settings, c.paths) for flags, settings in c.arguments), *COMMON_OPTIONS] for c in commands
+    }
+    return {"bash": _build_bash_script, "zsh": _build_zsh_script, "fish": _build_fish_script}[shell](
+        words, {c.name: c.summary for c in commands}
+    )
 
 
 COMMON_OPTIONS = (
-    Word(("-v", "--verbose"), "tell more", "none"),
-    Word(("-h", "--help"), "show the help", "none"),
+    CompletionWord(("-v", "--verbose"), "tell more", "none"),
+    CompletionWord(("-h", "--help"), "show the help", "none"),
 )
 
 
-def _word(flags: tuple[str, ...], settings: dict[str, Any], paths: tuple[str, ...]) -> Word:
+def _build_word(flags: tuple[str, ...], settings: dict[str, Any], paths: tuple[str, ...]) -> CompletionWord:
     option_flags = flags if flags[0].startswith("-") else ()
     dest = settings.get("dest") or next((f for f in flags if f.startswith("--")), flags[0]).lstrip("-").replace("-", "_")
     choices = tuple(str(c) for c in settings.get("choices") or ())
@@ -66,39 +69,39 @@ def _word(flags: tuple[str, ...], settings: dict[str, Any], paths: tuple[str, ..
         value = "folder" if settings.get("metavar") in FOLDER_METAVARS else "file"
     else:
         value = "other"
-    return Word(option_flags, settings.get("help") or "", value, choices, settings.get("nargs") in ("*", "+"))
+    return CompletionWord(option_flags, settings.get("help") or "", value, choices, settings.get("nargs") in ("*", "+"))
 
 
-def _options(words: Iterable[Word]) -> list[str]:
+def _list_flags(words: Iterable[CompletionWord]) -> list[str]:
     return [flag for word in words for flag in word.flags]
 
 
-def _bash_value(word: Word) -> str:
+def _format_bash_value(word: CompletionWord) -> str:
     return {"choice": f'_words "{" ".join(word.choices)}"', "file": "_files -f", "folder": "_files -d"}.get(word.value, ":")
 
 
-def _bash_cases(command: str, words: Sequence[Word]) -> Iterable[str]:
+def _iter_bash_cases(command: str, words: Sequence[CompletionWord]) -> Iterable[str]:
     """What bash offers after each option that takes a value, and for each argument without a flag."""
     for word in words:
         if word.flags and word.value != "none":
             pattern = "|".join(f'"{command} {flag}"' for flag in word.flags)
-            yield f"    {pattern}) {_bash_value(word)}; return ;;"
+            yield f"    {pattern}) {_format_bash_value(word)}; return ;;"
 
 
-def _bash_positions(command: str, words: Sequence[Word]) -> Iterable[str]:
+def _iter_bash_positions(command: str, words: Sequence[CompletionWord]) -> Iterable[str]:
     for place, word in enumerate(w for w in words if not w.flags):
-        yield f'    "{command} "{"*" if word.repeat else place}) {_bash_value(word)} ;;'
+        yield f'    "{command} "{"*" if word.repeat else place}) {_format_bash_value(word)} ;;'
 
 
-def _bash(words: dict[str, list[Word]], summaries: dict[str, str]) -> str:
+def _build_bash_script(words: dict[str, list[CompletionWord]], summaries: dict[str, str]) -> str:
     del summaries
     takes_value = {f'"{name} {flag}"' for name, all in words.items() for w in all if w.value != "none" for flag in w.flags}
     return BASH_SCRIPT % {
         "names": " ".join(words),
         "takes_value": "|".join(sorted(takes_value)),
-        "cases": "\n".join(line for name, all in words.items() for line in _bash_cases(name, all)),
-        "options": "\n".join(f'    {name}) _words "{" ".join(_options(all))}" ;;' for name, all in words.items()),
-        "positions": "\n".join(line for name, all in words.items() for line in _bash_positions(name, all)),
+        "cases": "\n".join(line for name, all in words.items() for line in _iter_bash_cases(name, all)),
+        "options": "\n".join(f'    {name}) _words "{" ".join(_list_flags(all))}" ;;' for name, all in words.items()),
+        "positions": "\n".join(line for name, all in words.items() for line in _iter_bash_positions(name, all)),
     }
 
 
@@ -142,27 +145,28 @@ complete -F _topomerge topomerge
 """
 
 
-def _plain(text: str) -> str:
+def _strip_shell_signs(text: str) -> str:
     """Words that mean nothing to a shell."""
     return re.sub(r"[\[\]:'\"\\`$]", "", " ".join(text.split()))
 
 
-def _zsh_value(word: Word) -> str:
+def _format_zsh_value(word: CompletionWord) -> str:
     action = {"file": "_files", "folder": "_files -/", "choice": f"({' '.join(word.choices)})", "other": " "}.get(word.value, "")
     return f":value:{action}" if action else ""
 
 
-def _zsh(words: dict[str, list[Word]], summaries: dict[str, str]) -> str:
-    names = "\n".join(f"    '{name}:{_plain(text)}'" for name, text in summaries.items())
+def _build_zsh_script(words: dict[str, list[CompletionWord]], summaries: dict[str, str]) -> str:
+    names = "\n".join(f"    '{name}:{_strip_shell_signs(text)}'" for name, text in summaries.items())
     cases = []
     for name, all in words.items():
         specs = [
-            f"'{flag}{'=' if flag.startswith('--') and w.value != 'none' else ''}[{_plain(w.help)}]{_zsh_value(w)}'"
+            f"'{flag}{'=' if flag.startswith('--') and w.value != 'none' else ''}["
+            f"{_strip_shell_signs(w.help)}]{_format_zsh_value(w)}'"
             for w in all
             for flag in w.flags
         ]
         positional = [w for w in all if not w.flags]
-        specs += [f"'{'*' if w.repeat else place}{_zsh_value(w)}'" for place, w in enumerate(positional, 1)]
+        specs += [f"'{'*' if w.repeat else place}{_format_zsh_value(w)}'" for place, w in enumerate(positional, 1)]
         cases.append(f"    {name}) _arguments " + " ".join(specs) + " ;;")
     return ZSH_SCRIPT % {"names": names, "cases": "\n".join(cases)}
 
@@ -191,7 +195,7 @@ compdef _topomerge topomerge
 """
 
 
-def _fish(words: dict[str, list[Word]], summaries: dict[str, str]) -> str:
+def _build_fish_script(words: dict[str, list[CompletionWord]], summaries: dict[str, str]) -> str:
     lines = [
         "# Completion of topomerge for fish. Written by: topomerge completion fish > ~/.config/fish/completions/topomerge.fish",
         "complete -c topomerge -f",
@@ -200,28 +204,30 @@ def _fish(words: dict[str, list[Word]], summaries: dict[str, str]) -> str:
         f"complete -c topomerge -n __fish_use_subcommand -l {name} -d '{text}'"
         for name, text in (("help", "show the help"), ("version", "show the version"))
     ]
-    lines += [f"complete -c topomerge -n __fish_use_subcommand -a {n} -d '{_plain(text)}'" for n, text in summaries.items()]
+    lines += [
+        f"complete -c topomerge -n __fish_use_subcommand -a {n} -d '{_strip_shell_signs(text)}'" for n, text in summaries.items()
+    ]
     for name, all in words.items():
         start = f"complete -c topomerge -n '__fish_seen_subcommand_from {name}'"
-        lines += [f"{start} {_fish_word(word)}" for word in all]
+        lines += [f"{start} {_format_fish_word(word)}" for word in all]
     return "\n".join(lines) + "\n"
 
 
-def _fish_word(word: Word) -> str:
+def _format_fish_word(word: CompletionWord) -> str:
     flags = [f"-l {f[2:]}" if f.startswith("--") else f"-s {f[1:]}" for f in word.flags]
     values = {"file": "-r -F", "folder": "-x -a '(__fish_complete_directories)'", "other": "-x", "none": ""}
     value = f"-x -a '{' '.join(word.choices)}'" if word.choices else values[word.value]
     if not word.flags:
         value = value.replace("-r ", "").replace("-x ", "")
-    return " ".join([*flags, value, f"-d '{_plain(word.help)}'" if word.flags else ""]).strip()
+    return " ".join([*flags, value, f"-d '{_strip_shell_signs(word.help)}'" if word.flags else ""]).strip()
 
 
 COMPLETION = Command(
     "completion",
-    completion_command,
+    run_completion,
     "print a script that completes commands and options in your shell",
     "topomerge completion bash >> ~/.bashrc",
-    (option("shell", choices=SHELLS, help="the shell that is to learn it"),),
+    (build_option("shell", choices=SHELLS, help="the shell that is to learn it"),),
     description="Print a script with which the Tab key completes commands, options and their values: for bash to go into "
     "~/.bashrc, for zsh into ~/.zshrc, for fish into ~/.config/fish/completions/topomerge.fish.",
 )

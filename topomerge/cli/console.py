@@ -1,19 +1,24 @@
-"""What the command line shows while it works, and how it writes: progress bars, warnings, all outputs or none."""
+"""The terminal: tables, progress, errors of one line, signals."""
 
 from __future__ import annotations
 
+import argparse
 import os
+import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any, TextIO
 
-from topomerge.errors import InputError, is_memory_short, printable
+from topomerge.errors import InputError, is_memory_short, make_printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress
+
 
 NEAR_LIMIT = 0.8  # of the memory that a process may take
 LEAST_MEMORY = 550_000_000  # bytes of address space that the libraries alone take, with a small map
@@ -21,7 +26,7 @@ PAGE_SUFFIXES = (".html", ".htm")
 Report = Callable[[float, str], None]  # fraction done in 0..1, what is being done
 
 
-class Bars:
+class ProgressBars:
     """Progress bars on stderr, one a task, that appear once the work has taken over two seconds and vanish at its end.
 
     Args:
@@ -38,7 +43,7 @@ class Bars:
         self._timer = threading.Timer(delay, self._show)
         self._timer.daemon = True
 
-    def __enter__(self) -> Bars:
+    def __enter__(self) -> ProgressBars:
         if self.enabled:
             self._timer.start()
         return self
@@ -50,14 +55,14 @@ class Bars:
             if self._shown is not None:
                 self._shown.stop()
 
-    def task(self, title: str) -> Report | None:
-        """A callable that moves the bar of one task, or None where no bar will be shown."""
+    def start_task(self, title: str) -> Report | None:
+        """Return a callable that moves the bar of one task, or None where no bar will be shown."""
         if not self.enabled:
             return None
 
         def report(fraction: float, text: str = "") -> None:
             with self._lock:
-                self._state[title] = (min(max(float(fraction), 0.0), 1.0), printable(text))
+                self._state[title] = (min(max(float(fraction), 0.0), 1.0), make_printable(text))
                 self._draw()
 
         return report
@@ -88,8 +93,8 @@ class PrintError(Exception):
 
 
 @contextmanager
-def printing() -> Iterator[None]:
-    """Within, only what is printed is written.
+def guard_printing() -> Iterator[None]:
+    """Convert errors of printing within the context into `PrintError`.
 
     Raises:
         PrintError: the disk is full, for example.
@@ -105,25 +110,25 @@ def printing() -> Iterator[None]:
 
 def write_out(text: str) -> None:
     """Write to stdout as it is."""
-    with printing():
+    with guard_printing():
         sys.stdout.write(text)
 
 
-def say(text: str, stream: TextIO | None = None) -> None:
+def print_text(text: str, stream: TextIO | None = None) -> None:
     """Print what may quote a stranger's file; to stdout by default."""
-    with printing():
-        print(printable(text), file=stream)
+    with guard_printing():
+        print(make_printable(text), file=stream)
 
 
-def say_line(text: str, stream: TextIO | None = None) -> None:
+def print_line(text: str, stream: TextIO | None = None) -> None:
     """Print one line, though names of files may hold line breaks; to stdout by default."""
-    say(" ".join(text.splitlines()), stream)
+    print_text(" ".join(text.splitlines()), stream)
 
 
 def warn(messages: Iterable[str]) -> None:
     """Print warnings to stderr, one line each."""
     for message in messages:
-        say(f"topomerge: warning: {' '.join(message.split())}", sys.stderr)
+        print_text(f"topomerge: warning: {' '.join(message.split())}", sys.stderr)
 
 
 def _is_at_memory_limit() -> bool:
@@ -139,7 +144,7 @@ def _is_at_memory_limit() -> bool:
     return most != resource.RLIM_INFINITY and peak * 1024 > NEAR_LIMIT * most
 
 
-def _memory_limit() -> str:
+def _format_memory_limit() -> str:
     """How much of it this process may take, if that is limited."""
     try:
         import resource
@@ -162,14 +167,14 @@ def check_memory_limit() -> None:
     most, _ = resource.getrlimit(resource.RLIMIT_AS)
     if most != resource.RLIM_INFINITY and most < LEAST_MEMORY:
         raise InputError(
-            f"not enough memory{_memory_limit()}: at least {LEAST_MEMORY / 2**30:.2g} GB are needed; raise the limit"
+            f"not enough memory{_format_memory_limit()}: at least {LEAST_MEMORY / 2**30:.2g} GB are needed; raise the limit"
         )
 
 
-def failure_line(error: BaseException, paths: Sequence[str], outputs: Sequence[str] = ()) -> str:
-    """One line about an error that names the file it is about, of those that were read the first."""
+def format_failure(error: BaseException, paths: Sequence[str], outputs: Sequence[str] = ()) -> str:
+    """Return one line about an error that names the file it is about, of those that were read the first."""
     if not isinstance(error, InputError) and (is_memory_short(error) or _is_at_memory_limit()):
-        text = f"not enough memory{_memory_limit()}; take larger voxels or a part of the input"
+        text = f"not enough memory{_format_memory_limit()}; take larger voxels or a part of the input"
     elif isinstance(error, OSError) and error.strerror:
         text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     elif isinstance(error, ImportError):
@@ -185,8 +190,8 @@ def failure_line(error: BaseException, paths: Sequence[str], outputs: Sequence[s
     return " ".join(text.split())
 
 
-def signal_behind(error: BaseException | None) -> BaseException | None:
-    """The Ctrl-C or SIGTERM that an error comes from, if any: one during compiled code comes out as a SystemError."""
+def find_signal(error: BaseException | None) -> BaseException | None:
+    """Find the Ctrl-C or SIGTERM that an error comes from, if any: one during compiled code comes out as a SystemError."""
     seen: set[int] = set()
     while error is not None and not isinstance(error, KeyboardInterrupt | SystemExit):
         if id(error) in seen:  # errors can come from each other
@@ -196,11 +201,11 @@ def signal_behind(error: BaseException | None) -> BaseException | None:
     return error
 
 
-class _Probe(Exception):
+class _WriteProbe(Exception):
     """Ends a trial of writing."""
 
 
-def _place(path: str | Path) -> Path:
+def _resolve_path(path: str | Path) -> Path:
     """Where a path leads, through all links; one that leads round in a circle, at which `Path.resolve` fails, to itself."""
     return Path(os.path.realpath(path))
 
@@ -213,7 +218,7 @@ def check_inputs(paths: Sequence[str]) -> None:
     """
     seen: set[Path] = set()
     for path in paths:
-        place = _place(path)
+        place = _resolve_path(path)
         if not place.exists():
             raise InputError(f"{path}: no such file; check the path")
         if place in seen:
@@ -222,8 +227,8 @@ def check_inputs(paths: Sequence[str]) -> None:
 
 
 @contextmanager
-def output_folder(path: str | Path) -> Iterator[Path]:
-    """A folder to write into, made with those above it where they are missing. What stays empty is taken away again.
+def open_output_folder(path: str | Path) -> Iterator[Path]:
+    """Open a folder to write into, made with those above it where they are missing. What stays empty is taken away again.
 
     Raises:
         InputError: it is a file, or can't be made.
@@ -264,18 +269,18 @@ def check_outputs(outputs: Sequence[str | Path], inputs: Sequence[str | Path] = 
     Raises:
         InputError: a folder is missing or can't be written, a path is a folder, is an input or is given twice.
     """
-    from topomerge.io.atomic import replacing  # here, because topomerge.io imports NumPy
+    from topomerge.io.archive import replace_on_success  # here, because topomerge.io imports NumPy
 
-    taken = {_place(path): "is the input: it would be overwritten; give another name" for path in inputs}
+    taken = {_resolve_path(path): "is the input: it would be overwritten; give another name" for path in inputs}
     for path in map(Path, outputs):
         if path.is_dir():
             raise InputError(f"{path}: is a folder; give the name of a file in it")
-        place = _place(path)
+        place = _resolve_path(path)
         if place in taken:
             raise InputError(f"{path}: {taken[place]}")
         taken[place] = "is named for two outputs; give each its own name"
-        with suppress(_Probe), replacing(path):
-            raise _Probe
+        with suppress(_WriteProbe), replace_on_success(path):
+            raise _WriteProbe
 
 
 def write_all(outputs: Sequence[tuple[str | Path, Callable[[Path], None]]]) -> None:
@@ -287,15 +292,76 @@ def write_all(outputs: Sequence[tuple[str | Path, Callable[[Path], None]]]) -> N
     Raises:
         InputError: one can't be written.
     """
-    from topomerge.io.atomic import replacing
+    from topomerge.io.archive import replace_on_success
 
     with ExitStack() as stack:
         for path, save in outputs:
-            beside = stack.enter_context(replacing(path))
+            beside = stack.enter_context(replace_on_success(path))
             try:
                 save(beside)
             except OSError as error:
                 raise InputError(f"{path}: can't be written ({error.strerror or error}); give another place") from error
         if len(outputs) > 1:  # a kill between two renames must not leave one file of this run beside one of an earlier run
             for path, _ in outputs:
-                _place(path).unlink(missing_ok=True)
+                _resolve_path(path).unlink(missing_ok=True)
+
+
+COMPILER = f"{os.sep}llvmlite{os.sep}"
+ASK_AGAIN = 0.1  # s
+
+
+def exit_on_signals() -> None:
+    """Exit on signals from now on: SIGINT raises KeyboardInterrupt, SIGTERM SystemExit(143), never within the compiler."""
+    asked: list[int] = []
+
+    def leave(number: int, frame: FrameType | None) -> None:
+        asked.append(number)
+        if hasattr(signal, "setitimer") and _is_within_compiler(frame):
+            signal.setitimer(signal.ITIMER_REAL, ASK_AGAIN)
+        elif asked[0] == signal.SIGINT:
+            raise KeyboardInterrupt
+        else:
+            raise SystemExit(143)
+
+    for name in ("SIGINT", "SIGTERM", "SIGALRM"):
+        if hasattr(signal, name):  # Windows has no alarm
+            signal.signal(getattr(signal, name), leave)
+
+
+def _is_within_compiler(frame: FrameType | None) -> bool:
+    """Is any function on the stack the compiler's?"""
+    while frame is not None and COMPILER not in frame.f_code.co_filename:
+        frame = frame.f_back
+    return frame is not None
+
+
+Argument = tuple[tuple[str, ...], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command: its function, its words for the help and its arguments.
+
+    `run` takes the parsed arguments and returns the exit status; `paths` are the arguments that name files, the input first:
+    an error that names no file is reported under the first of them. `one_input` is said of words too many.
+    """
+
+    name: str
+    run: Callable[[argparse.Namespace], int]
+    summary: str
+    example: str
+    arguments: tuple[Argument, ...]
+    paths: tuple[str, ...] = ()
+    description: str = ""
+    one_input: str = ""
+
+
+def build_option(*flags: str, **settings: Any) -> Argument:
+    """Build one argument, as argparse's `add_argument` takes it.
+
+    An option without `default` is absent from the namespace unless it was given: its default has one home, the function
+    that takes it (see `topomerge.cli.options.collect_given`).
+    """
+    if flags[0].startswith("-"):
+        settings.setdefault("default", argparse.SUPPRESS)
+    return flags, settings

@@ -6,37 +6,45 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from topomerge.cli.command import Command, option
-from topomerge.cli.console import check_inputs, check_outputs, output_folder, say_line, warn, write_all
-from topomerge.cli.options import count, given, quiet, share
+from topomerge.cli.console import (
+    Command,
+    build_option,
+    check_inputs,
+    check_outputs,
+    open_output_folder,
+    print_line,
+    warn,
+    write_all,
+)
+from topomerge.cli.options import build_quiet_option, collect_given, parse_share, parse_whole_number
 from topomerge.errors import InputError
 
 
-def export_command(args: argparse.Namespace) -> int:
+def run_export(args: argparse.Namespace) -> int:
     """`topomerge export`: a map in the formats of other tools."""
-    from topomerge.io.exports import formats, outputs
+    from topomerge.io.exports import parse_formats, prepare_outputs
     from topomerge.io.maps import load_map
-    from topomerge.types import confident
+    from topomerge.types import filter_confident
 
-    names = formats(args.to)
-    options = _export_options(args, names)
-    source = _map_file(args.input)
-    path, folder = _place(args, names, source)
+    names = parse_formats(args.to)
+    options = _collect_export_options(args, names)
+    source = _find_map_file(args.input)
+    path, folder = _choose_output_path(args, names, source)
     topomap = load_map(source)
     warn(topomap.warnings)
-    topomap = confident(topomap, getattr(args, "min_confidence", 0.0))
-    with output_folder(path.parent):
-        files = [file for name in names for file in outputs(topomap, name, path, folder, **options)]
+    topomap = filter_confident(topomap, getattr(args, "min_confidence", 0.0))
+    with open_output_folder(path.parent):
+        files = [file for name in names for file in prepare_outputs(topomap, name, path, folder, **options)]
         check_outputs([file for file, _ in files], [source])
         write_all(files)
     if not args.quiet:
         written = " ".join(str(file) for file, _ in files)
         rooms = f"{len(topomap.rooms)} room{'s' if len(topomap.rooms) != 1 else ''}"
-        say_line(f"{rooms}, {len(topomap.edges)} doors and stairs -> {written}")
+        print_line(f"{rooms}, {len(topomap.edges)} doors and stairs -> {written}")
     return 0
 
 
-def _export_options(args: argparse.Namespace, names: list[str]) -> dict[str, Any]:
+def _collect_export_options(args: argparse.Namespace, names: list[str]) -> dict[str, Any]:
     """The options that only some formats know.
 
     Raises:
@@ -44,29 +52,29 @@ def _export_options(args: argparse.Namespace, names: list[str]) -> dict[str, Any
     """
     from topomerge.io.exports import FORMATS
 
-    options = given(args, "origin", "storey")
-    frames = [name for text in given(args, "frames").values() for name in text.split(",")]
+    options = collect_given(args, "origin", "storey")
+    frames = [name for text in collect_given(args, "frames").values() for name in text.split(",")]
     for key in options:
         able = [name for name, form in FORMATS.items() if key in form.options]
         if not set(able) & set(names):
             raise InputError(f"--{key}: means nothing for {', '.join(names)}; it is for {' and '.join(able)}")
-    if names == ["tf2"] and given(args, "min_confidence"):
+    if names == ["tf2"] and collect_given(args, "min_confidence"):
         raise InputError("--min-confidence: means nothing for tf2, which holds no rooms; leave it out")
     if "origin" in options:
         from topomerge.io.exports.geojson import parse_origin
 
         options["origin"] = parse_origin(options["origin"])
     if "tf2" in names:
-        from topomerge.io.exports.tf2 import frame_poses
+        from topomerge.io.exports.tf2 import read_frame_poses
 
         path = Path(args.input)
-        options["transforms"] = frame_poses(path if path.is_dir() else path.parent, frames)
+        options["transforms"] = read_frame_poses(path if path.is_dir() else path.parent, frames)
     elif frames:
         raise InputError(f"--frames: means nothing for {', '.join(names)}; it is for tf2")
     return options
 
 
-def _map_file(named: str) -> Path:
+def _find_map_file(named: str) -> Path:
     """The .tmap that a user means, who may have named the folder of a merge or of an atlas."""
     path = Path(named)
     if path.is_dir():
@@ -83,7 +91,7 @@ def _map_file(named: str) -> Path:
     return path
 
 
-def _place(args: argparse.Namespace, names: list[str], source: Path) -> tuple[Path, bool]:
+def _choose_output_path(args: argparse.Namespace, names: list[str], source: Path) -> tuple[Path, bool]:
     """Where to write: a file, or (True) a folder with the stem of the names in it."""
     from topomerge.io.exports import FORMATS
 
@@ -101,39 +109,41 @@ def _place(args: argparse.Namespace, names: list[str], source: Path) -> tuple[Pa
 
 EXPORT = Command(
     "export",
-    export_command,
+    run_export,
     "write a map for other tools: GIS, BIM, robots, graphs",
     "topomerge export merged/ --to geojson,indoorgml,ros -o exported/",
     (
-        option("input", metavar="MAP", help="a .tmap, or the folder of a merge or an atlas"),
-        option(
+        build_option("input", metavar="MAP", help="a .tmap, or the folder of a merge or an atlas"),
+        build_option(
             "--to",
             required=True,
             metavar="FORMAT[,FORMAT]",
             default=None,
             help="graphml, geojson, indoorgml, dsg (Spark-DSG), ros (grids, keepout, Nav2 routes), rviz, tf2, ply, las, ifc",
         ),
-        option(
+        build_option(
             "-o",
             "--output",
             metavar="OUT",
             default=None,
             help="file, or folder for several formats and for ros (default: beside the map, named after it)",
         ),
-        option(
+        build_option(
             "--origin",
             metavar="LAT,LON[,HEADING]",
             help="geojson: where (0, 0) of the map lies, and how far its y axis is turned clockwise from north, degrees",
         ),
-        option("--frames", metavar="NAME,NAME", help="tf2: names of the maps' frames, in their order (default: their files')"),
-        option("--storey", type=count, metavar="N", help="geojson, ros: only this storey"),
-        option(
+        build_option(
+            "--frames", metavar="NAME,NAME", help="tf2: names of the maps' frames, in their order (default: their files')"
+        ),
+        build_option("--storey", type=parse_whole_number, metavar="N", help="geojson, ros: only this storey"),
+        build_option(
             "--min-confidence",
-            type=share,
+            type=parse_share,
             metavar="P",
             help="leave out rooms, doors, stairs and windows that are less likely than P, 0 to 1 (default 0: none)",
         ),
-        quiet(),
+        build_quiet_option(),
     ),
     paths=("input", "output"),
     description="Write a map in the formats of other tools: rooms as polygons, doors, storeys, their graph, grids to drive by.",

@@ -1,47 +1,77 @@
-"""The command `extract`: points in, map out."""
+"""The commands of one map: extract, info, embed, and the export of an embedder."""
 
 from __future__ import annotations
 
 import argparse
+import shutil
 from functools import partial
 from pathlib import Path
 
 import topomerge
-from topomerge.cli.command import Command, option
-from topomerge.cli.console import PAGE_SUFFIXES, Bars, check_outputs, check_suffix, say, warn, write_all
-from topomerge.cli.options import ONE_FRAME, UNIT, UP, above_zero, given, output, quiet
+from topomerge.cli.console import (
+    PAGE_SUFFIXES,
+    Command,
+    ProgressBars,
+    build_option,
+    check_outputs,
+    check_suffix,
+    open_output_folder,
+    print_line,
+    print_text,
+    warn,
+    write_all,
+    write_out,
+)
+from topomerge.cli.options import (
+    CLOUD_OPTIONS,
+    CONTEXT_STEPS,
+    DESCRIPTOR,
+    ONE_FRAME,
+    UNIT,
+    UP,
+    build_json_option,
+    build_output_option,
+    build_quiet_option,
+    check_cloud_options,
+    check_descriptor,
+    collect_given,
+    load_input_map,
+    parse_positive,
+)
+from topomerge.embedding.learned import EMBEDDER_FILE, find_state, read_embedder_card
 from topomerge.errors import InputError
+from topomerge.networks.network import card_of
 
 OTHER_OUTPUTS = "--json, --ply, --figure, --report"
 FIGURE_FORMATS = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
 
 
-def extract_command(args: argparse.Namespace) -> int:
+def run_extract(args: argparse.Namespace) -> int:
     """`topomerge extract`: find the rooms, doors and storeys of a cloud; write the map and whatever else was asked for."""
-    outputs = _outputs(args)
-    check_outputs([path for path, _ in outputs], [args.input, *given(args, "poses").values()])
+    outputs = _list_outputs(args)
+    check_outputs([path for path, _ in outputs], [args.input, *collect_given(args, "poses").values()])
     if Path(args.output).suffix.lower() != ".tmap":  # no other command would take it for a map
         raise InputError(f"{args.output}: -o names the map; end its name with .tmap (for other files there are {OTHER_OUTPUTS})")
-    with Bars(enabled=not args.quiet) as bars:
+    with ProgressBars(enabled=not args.quiet) as bars:
         from topomerge.extraction.extract import extract
         from topomerge.io.points import read_chunks
 
-        reading = given(
+        reading = collect_given(
             args, "up", "unit", "scale", "resolution", "extrude", "ceiling", "spacing", "doors", "poses", "topic", "one_frame"
         )
-        chunks = read_chunks(args.input, **reading, progress=bars.task("read"))
-        choices = given(args, "voxel_size", "preset")
-        topomap = extract(chunks, **choices, name=args.input, progress=bars.task("extract"))
+        chunks = read_chunks(args.input, **reading, progress=bars.start_task("read"))
+        choices = collect_given(args, "voxel_size", "preset")
+        topomap = extract(chunks, **choices, name=args.input, progress=bars.start_task("extract"))
         write_all([(path, partial(getattr(topomerge, writer), topomap)) for path, writer in outputs])
     warn(topomap.warnings)
     if not args.quiet:
-        from topomerge.io.listing import map_to_text
+        from topomerge.io.listing import format_map
 
-        say(map_to_text(topomap))
+        print_text(format_map(topomap))
     return 0
 
 
-def _outputs(args: argparse.Namespace) -> list[tuple[str, str]]:
+def _list_outputs(args: argparse.Namespace) -> list[tuple[str, str]]:
     """Where to write, and the name of topomerge's function (map, path) that writes it."""
     if args.figure and Path(args.figure).suffix.lower() not in FIGURE_FORMATS:
         raise InputError(f"{args.figure}: unknown kind of figure; end the name with one of {' '.join(FIGURE_FORMATS)}")
@@ -55,42 +85,151 @@ def _outputs(args: argparse.Namespace) -> list[tuple[str, str]]:
 
 EXTRACT = Command(
     "extract",
-    extract_command,
+    run_extract,
     "find the rooms, doors and storeys of one partial map",
     "topomerge extract scan.ply -o a.tmap --json a.json --ply a_rooms.ply --figure a.png",
     (
-        option("input", metavar="SCAN", help="point cloud, folder of scans, ROS bag, mesh, building model, OctoMap or 2D map"),
-        output("A.tmap", "map to write"),
-        option("--json", metavar="A.json", default=None, help="also write rooms, doors and storeys as JSON"),
-        option("--ply", metavar="A.ply", default=None, help="also write the occupied cells with their room as PLY"),
-        option("--figure", metavar="A.png", default=None, help="also draw the plan of each storey"),
-        option("--report", metavar="A.html", default=None, help="also write plans, tables and a 3D view as one web page"),
-        option("--voxel-size", type=above_zero, metavar="E", help="edge length of a cell, m (default 0.1)"),
-        option("--preset", choices=("default", "thesis"), help="default, or the parameters of the thesis"),
+        build_option(
+            "input", metavar="SCAN", help="point cloud, folder of scans, ROS bag, mesh, building model, OctoMap or 2D map"
+        ),
+        build_output_option("A.tmap", "map to write"),
+        build_option("--json", metavar="A.json", default=None, help="also write rooms, doors and storeys as JSON"),
+        build_option("--ply", metavar="A.ply", default=None, help="also write the occupied cells with their room as PLY"),
+        build_option("--figure", metavar="A.png", default=None, help="also draw the plan of each storey"),
+        build_option("--report", metavar="A.html", default=None, help="also write plans, tables and a 3D view as one web page"),
+        build_option("--voxel-size", type=parse_positive, metavar="E", help="edge length of a cell, m (default 0.1)"),
+        build_option("--preset", choices=("default", "thesis"), help="default, or the parameters of the thesis"),
         UP,
         UNIT,
         ONE_FRAME,
-        option("--scale", type=above_zero, metavar="S", help="multiply coordinates by this (default 1)"),
-        option("--resolution", type=above_zero, metavar="R", help="m per pixel of a plain image of a floor plan"),
-        option("--extrude", type=above_zero, metavar="H", help="m of wall height for 2D maps (default 2.5)"),
-        option("--ceiling", action="store_true", help="close 2D maps with a ceiling"),
-        option(
+        build_option("--scale", type=parse_positive, metavar="S", help="multiply coordinates by this (default 1)"),
+        build_option("--resolution", type=parse_positive, metavar="R", help="m per pixel of a plain image of a floor plan"),
+        build_option("--extrude", type=parse_positive, metavar="H", help="m of wall height for 2D maps (default 2.5)"),
+        build_option("--ceiling", action="store_true", help="close 2D maps with a ceiling"),
+        build_option(
             "--spacing",
-            type=above_zero,
+            type=parse_positive,
             metavar="D",
             help="m between points on surfaces of meshes, models and 2D maps, or at the finest level of an octree",
         ),
-        option("--doors", action="store_true", help="keep the door leaves of building models, where doors are modelled shut"),
-        option(
+        build_option(
+            "--doors", action="store_true", help="keep the door leaves of building models, where doors are modelled shut"
+        ),
+        build_option(
             "--poses",
             metavar="TRAJECTORY",
             help="where scans were taken: a KITTI or TUM file, or a topic of the bag (default: a trajectory beside the scans; "
             "in a bag tf, then odometry)",
         ),
-        option("--topic", metavar="NAME", help="topic to read, where a bag has points of several sensors, or maps as well"),
-        quiet("no table, no progress; only warnings"),
+        build_option("--topic", metavar="NAME", help="topic to read, where a bag has points of several sensors, or maps as well"),
+        build_quiet_option("no table, no progress; only warnings"),
     ),
     paths=("input", "output", "json", "ply", "figure", "report", "poses"),
     description="Find the rooms, doors and storeys of one partial map, and print a table of them.",
     one_input="extract takes one scan; `topomerge merge` takes several",
+)
+
+
+def run_info(args: argparse.Namespace) -> int:
+    """`topomerge info`: print the rooms, storeys, doors and times of a map, as tables or as JSON."""
+    from topomerge.io.listing import convert_map_to_json, format_json, format_map
+    from topomerge.io.maps import load_map
+
+    topomap = load_map(args.input)
+    warn(topomap.warnings)
+    if args.json:
+        write_out(format_json(convert_map_to_json(topomap)))
+    else:
+        print_text(format_map(topomap))
+    return 0
+
+
+INFO = Command(
+    "info",
+    run_info,
+    "print what a map holds",
+    "topomerge info a.tmap",
+    (build_option("input", metavar="A.tmap", help="a map that `topomerge extract` wrote"), build_json_option()),
+    paths=("input",),
+    description="Print the rooms, storeys, doors and times of a map.",
+)
+
+
+def run_embed(args: argparse.Namespace) -> int:
+    """`topomerge embed`: describe each room of a map; write a NumPy array (rooms, numbers), or (rooms, 4, numbers)."""
+    check_outputs([args.output], [args.input])
+    check_suffix("-o", args.output, (".npy",))
+    check_cloud_options([args.input], args)
+    check_descriptor(args)
+    from topomerge.embedding.learned import build_embedder
+    from topomerge.embedding.quarter_turns import get_rows
+
+    describe = build_embedder(args.descriptor, args.k)
+    rows = get_rows(describe(load_input_map(args.input, args)))
+    import numpy as np
+
+    def save(path: Path) -> None:
+        with path.open("wb") as file:  # np.save would add .npy to a name in capitals
+            np.save(file, rows, allow_pickle=False)
+
+    write_all([(args.output, save)])
+    if not args.quiet:
+        rooms = f"{len(rows)} room{'s' if len(rows) != 1 else ''}"
+        print_line(f"{rooms}, {' x '.join(map(str, rows.shape[1:]))} numbers each -> {args.output}")
+    return 0
+
+
+EMBED = Command(
+    "embed",
+    run_embed,
+    "describe each room of a map by numbers",
+    "topomerge embed a.tmap --descriptor shapedna --k 1 -o a.npy",
+    (
+        build_option("input", metavar="A", help="a .tmap, or a cloud, from which a map is extracted first"),
+        build_output_option("A.npy", "NumPy array with a row for each room, or one for each of its quarter turns"),
+        DESCRIPTOR,
+        CONTEXT_STEPS,
+        *CLOUD_OPTIONS,
+        build_quiet_option(),
+    ),
+    paths=("input", "output"),
+    description="Describe each room of a map by numbers: rooms that look alike get rows that are close.",
+)
+
+
+def run_export_embedder(args: argparse.Namespace) -> int:
+    """`topomerge export-embedder`: the best embedder of a run, or what an earlier version wrote, as ONNX with its card."""
+    state = find_state(args.run_folder)
+    if state is None:
+        card = read_embedder_card(args.run_folder)
+        with open_output_folder(args.output) as folder:
+            for file in (card.path, card_of(card.path)):
+                shutil.copyfile(file, folder / file.name.replace(card.path.stem, Path(EMBEDDER_FILE).stem, 1))
+    else:
+        try:
+            from topomerge.models.export import export_embedder
+            from topomerge.models.weights import read_state
+        except ModuleNotFoundError as error:
+            raise InputError(f"weights of torch need {error.name}: pip install topomerge[learn]") from error
+        network, about = read_state(state)
+        with open_output_folder(args.output) as folder:
+            export_embedder(network, folder, about)
+    if not args.quiet:
+        card = read_embedder_card(folder)
+        print_line(f"{card.path.stat().st_size} bytes, {card.network.size} numbers a room -> {folder}")
+    return 0
+
+
+EXPORT_EMBEDDER = Command(
+    "export-embedder",
+    run_export_embedder,
+    "write the best embedder of a training run, to be used elsewhere",
+    "topomerge export-embedder runs/x -o embedder/",
+    (
+        build_option("run_folder", metavar="RUN", help="folder of a run of train.py, or its best/ or last/"),
+        build_output_option("DIR", "folder for the files"),
+        build_quiet_option(),
+    ),
+    paths=("run_folder", "output"),
+    description="Write the best embedder of a run as embedder.onnx and embedder.card.json; topomerge.load_embedder reads them.",
 )

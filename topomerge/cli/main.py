@@ -10,32 +10,231 @@ import argparse
 import logging
 import os
 import sys
+import tempfile
 import traceback
 import warnings
 from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any, NoReturn
 
 from topomerge import __version__
-from topomerge.cli.atlas import ATLAS
-from topomerge.cli.command import Command
+from topomerge.cli.atlas import ATLAS, WATCH
 from topomerge.cli.completion import COMPLETION
-from topomerge.cli.console import PrintError, check_memory_limit, failure_line, printing, signal_behind
-from topomerge.cli.dataset import DATASET
-from topomerge.cli.embed import EMBED
+from topomerge.cli.console import (
+    PAGE_SUFFIXES,
+    Command,
+    PrintError,
+    build_option,
+    check_inputs,
+    check_memory_limit,
+    check_outputs,
+    check_suffix,
+    exit_on_signals,
+    find_signal,
+    format_failure,
+    guard_printing,
+    open_output_folder,
+    print_line,
+    print_text,
+    write_all,
+)
 from topomerge.cli.export import EXPORT
-from topomerge.cli.export_embedder import EXPORT_EMBEDDER
-from topomerge.cli.extract import EXTRACT
-from topomerge.cli.info import INFO
-from topomerge.cli.match import MATCH
-from topomerge.cli.merge import MERGE
-from topomerge.cli.signals import leave_on_signals
-from topomerge.cli.simulate import SIMULATE
-from topomerge.cli.view import VIEW
-from topomerge.cli.watch import WATCH
-from topomerge.errors import printable
+from topomerge.cli.extract import EMBED, EXPORT_EMBEDDER, EXTRACT, INFO
+from topomerge.cli.merge import MATCH, MERGE
+from topomerge.cli.options import build_output_option, build_quiet_option, collect_given, parse_count, parse_whole_number
+from topomerge.errors import InputError, make_printable
+
+
+def dataset_command(args: argparse.Namespace) -> int:
+    """`topomerge dataset check`: print what the pairs of a folder have in common, and what is wrong with them."""
+    from topomerge.datasets.pairs.own_pairs import check_folder
+
+    def tell(text: str) -> None:
+        if not args.quiet:
+            print_line(text, sys.stderr)
+
+    lines, wrong = check_folder(args.folder, args.cache, args.jobs, tell)
+    print_text("\n".join(lines))
+    if wrong:
+        raise InputError(f"{args.folder}: captures and pairs that are wrong: {wrong}; correct what is marked WRONG above")
+    return 0
+
+
+DATASET = Command(
+    "dataset",
+    dataset_command,
+    "check a folder of your own captures and pairs, to train and to evaluate on",
+    "topomerge dataset check my_scans/",
+    (
+        build_option("verb", choices=("check",), help="extract the captures, and print what the pairs have in common"),
+        build_option("folder", metavar="DIR", help="a folder with a pairs.yaml, or such a file"),
+        build_option("--cache", default="cache", metavar="DIR", help="of the maps; that of train.py (default cache)"),
+        build_option("--jobs", type=parse_count, default=1, metavar="N", help="processes (default 1)"),
+        build_quiet_option("print only the table"),
+    ),
+    paths=("folder",),
+    description="Check the pairs.yaml of a folder of captures (docs: Training, Your own pairs): for each pair the rooms of both "
+    "maps, those that match, and the area in common; and what is wrong. Status 1: something is.",
+)
+
+
+KINDS_OF_BUILDINGS = ("office", "openplan", "apartment", "hotel", "hospital", "school", "lab", "house")  # of datasets/buildings
+
+
+def run_simulate(args: argparse.Namespace) -> int:
+    """`topomerge simulate`: scan a building of a seed; write the clouds, the truth and a picture into a folder."""
+    choices = collect_given(args, "seed", "storeys", "overlap", "rooms", "hard")
+    if hasattr(args, "sensors"):
+        choices["sensors"] = tuple(name.strip() for name in args.sensors.split(",") if name.strip())
+    with open_output_folder(args.output) as folder:
+        check_outputs([folder / "truth.json"])
+        from topomerge.datasets.pairs.simulate import prepare_outputs, simulate_maps
+
+        building, sessions, frame = simulate_maps(args.building, **choices, scale=args.scale == "free")
+        files = prepare_outputs(building, sessions, frame, folder)
+        write_all(files)
+    if not args.quiet:
+        rooms = f"the building {building.name} has {len(building.rooms)} rooms"
+        print_line(f"{rooms} -> {' '.join(str(path) for path, _ in files)}")
+    return 0
+
+
+SIMULATE = Command(
+    "simulate",
+    run_simulate,
+    "make one or two partial maps of a building that is known exactly",
+    "topomerge simulate --building office --seed 7 --sensors tls,depth --overlap 0.4 -o pair/",
+    (
+        build_option(
+            "--building",
+            required=True,
+            choices=KINDS_OF_BUILDINGS,
+            metavar="KIND",
+            default=None,
+            help=", ".join(KINDS_OF_BUILDINGS),
+        ),
+        build_option("--seed", type=parse_whole_number, metavar="N", help="each number makes another building (default 7)"),
+        build_option("--storeys", type=parse_whole_number, metavar="N", help="1 to 8 (default 1)"),
+        build_option(
+            "--sensors", metavar="A,B", help="tls lidar depth mono laser2d tablet; one gives one cloud (default tls,depth)"
+        ),
+        build_option("--overlap", type=float, metavar="S", help="share of the rooms that both maps visit (default 0.4)"),
+        build_option(
+            "--rooms",
+            type=parse_whole_number,
+            metavar="N",
+            help="rooms of each map, at most (default 15; a single cloud has all)",
+        ),
+        build_option("--scale", choices=("free", "known"), default="known", help="free: the scale of b is unknown"),
+        build_option(
+            "--hard", choices=("other-building", "other-storey", "twin-wing"), help="b shows a place that looks like that of a"
+        ),
+        build_output_option("DIR", "folder for a.ply, b.ply, truth.json, plan.png"),
+        build_quiet_option(),
+    ),
+    paths=("output",),
+    description="Make partial maps of a building from a seed: clouds in random frames, the truth about them, and a picture.",
+)
+
+
+def run_view(args: argparse.Namespace) -> int:
+    """`topomerge view`: a report in the browser."""
+    if args.serve is None:
+        page = _prepare_page(args)
+        if args.open:
+            _show(page.resolve().as_uri(), str(page))
+        else:
+            print_text(str(page))
+        return 0
+    from topomerge.viz.report import serve
+
+    with tempfile.TemporaryDirectory(prefix="topomerge-") as scratch:
+        serve(_prepare_page(args, scratch), args.serve, _show if args.open else _print_address)
+    return 0
+
+
+def _print_address(address: str) -> None:
+    with guard_printing():
+        print(address, flush=True)
+
+
+def _prepare_page(args: argparse.Namespace, scratch: str | None = None) -> Path:
+    """The report to show; that of a map is made first."""
+    path = Path(args.input)
+    if path.is_dir():
+        page = path / "report.html"
+        if page.is_file() and args.output is None:
+            return page
+        if not (path / "map.tmap").is_file():
+            raise InputError(f"{path}: holds no report.html; give the folder of a merge or an atlas, a .tmap or an .html")
+        path = path / "map.tmap"
+    check_inputs([str(path)])
+    if path.suffix.lower() in PAGE_SUFFIXES:
+        if args.output is not None:
+            raise InputError(f"{args.output}: -o is for the report of a .tmap, and {path} is a page already; leave it out")
+        return path
+    if path.suffix.lower() != ".tmap":
+        raise InputError(f"{path}: can't be shown; give a .tmap (of `topomerge extract`), the folder of a merge or an .html")
+    from topomerge.io.maps import load_map
+    from topomerge.viz.report import save_report
+
+    topomap = load_map(path)
+    if args.output is not None:
+        place = Path(args.output)
+    else:  # a browser reads it after this program has ended: only what is served is deleted
+        place = Path(scratch or tempfile.mkdtemp(prefix="topomerge-")) / f"{path.stem}.html"
+    check_outputs([place], [path])
+    check_suffix("-o", str(place), PAGE_SUFFIXES)
+    write_all([(place, partial(save_report, topomap))])
+    return place
+
+
+def _show(address: str, name: str = "") -> None:
+    """Open an address in the browser, and say where it is for those who have none."""
+    import webbrowser
+
+    _print_address(name or address)
+    try:
+        opened = webbrowser.open(address)
+    except (webbrowser.Error, OSError):
+        opened = False
+    if not opened:
+        print("topomerge: no browser could be opened here; open this in one", file=sys.stderr)
+
+
+def _parse_port(text: str) -> int:
+    number = parse_whole_number(text)
+    if number > 65535:
+        raise argparse.ArgumentTypeError(f"must be a port from 0 to 65535, not {text}")
+    return number
+
+
+VIEW = Command(
+    "view",
+    run_view,
+    "show a report in the browser",
+    "topomerge view merged/",
+    (
+        build_option("input", metavar="PATH", help="folder of a merge or an atlas, a .tmap (a report is made of it) or an .html"),
+        build_option("-o", "--output", metavar="A.html", default=None, help="keep the report of a .tmap here"),
+        build_option("--no-open", dest="open", action="store_false", default=True, help="only print where the report is"),
+        build_option(
+            "--serve",
+            nargs="?",
+            const=0,
+            default=None,
+            type=_parse_port,
+            metavar="PORT",
+            help="serve it on this machine until Ctrl-C (default: any free port)",
+        ),
+    ),
+    paths=("input", "output"),
+    description="Show the report of a merge, an atlas or a map in the browser.",
+)
+
 
 COMMANDS = (EXTRACT, INFO, EMBED, MATCH, MERGE, SIMULATE, COMPLETION, ATLAS, WATCH, EXPORT, EXPORT_EMBEDDER, VIEW, DATASET)
-
 EXIT_STATUSES = """\
 exit status:
   0    done
@@ -45,7 +244,6 @@ exit status:
   141  what read the output went away (`| head`)
   143  terminated
 Set TOPOMERGE_DEBUG=1, or give -v twice, to see the traceback of a failure."""
-
 SIGNED_OPTIONS = ("--origin", "--up")  # their value may start with a dash
 
 
@@ -53,11 +251,11 @@ class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line, with status 1: 2 is reserved for "no trustworthy merge"."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(1, printable(f"{self.prog}: {message} (see {self.prog} --help)\n"))
+        self.exit(1, make_printable(f"{self.prog}: {message} (see {self.prog} --help)\n"))
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of every command."""
+    """Build the parser of every command."""
     parser = _Parser(
         prog="topomerge",
         description="Rooms, doors and storeys out of partial indoor maps, matched and merged across sensors.",
@@ -88,7 +286,7 @@ def _add(commands: Any, command: Command) -> None:
     parser.set_defaults(run=command.run, paths=command.paths, one_input=command.one_input)
 
 
-def _named_paths(args: argparse.Namespace) -> tuple[list[str], list[str]]:
+def _collect_paths(args: argparse.Namespace) -> tuple[list[str], list[str]]:
     """The files that the user named, the input first; and the output."""
     values = {name: getattr(args, name) for name in args.paths if getattr(args, name, None)}
     output = values.pop("output", None)
@@ -96,14 +294,14 @@ def _named_paths(args: argparse.Namespace) -> tuple[list[str], list[str]]:
     return paths, [] if output is None else [str(output)]
 
 
-def _empty_name(args: argparse.Namespace) -> str:
+def _find_empty_name(args: argparse.Namespace) -> str:
     """For which file an empty name was given, if for one; that is what a script's unset variable leaves, and pathlib would take
     it for the current folder."""
     values = {name: getattr(args, name, None) for name in args.paths}
     return next((name for name, value in values.items() if value == "" or (isinstance(value, list) and "" in value)), "")
 
 
-def _joined(words: Sequence[str]) -> list[str]:
+def _join_signed_values(words: Sequence[str]) -> list[str]:
     """`--origin -33.9,151.2` as `--origin=-33.9,151.2`: argparse takes a value that starts with a dash for another option."""
     joined: list[str] = []
     for word in words:
@@ -147,14 +345,14 @@ def _run(args: argparse.Namespace) -> int:
     try:
         check_memory_limit()
         status = int(args.run(args))
-        with printing():
+        with guard_printing():
             sys.stdout.flush()
         return status
     except BrokenPipeError:
         _drop_output()
         return 141
     except (KeyboardInterrupt, Exception) as error:
-        signalled = signal_behind(error)
+        signalled = find_signal(error)
         if isinstance(signalled, SystemExit):
             raise signalled from None
         if signalled is not None:
@@ -166,7 +364,7 @@ def _run(args: argparse.Namespace) -> int:
             _drop_output()
             print(f"topomerge: {error}", file=sys.stderr)
             return 1
-        print(printable(f"topomerge: {failure_line(error, *_named_paths(args))}"), file=sys.stderr)
+        print(make_printable(f"topomerge: {format_failure(error, *_collect_paths(args))}"), file=sys.stderr)
         return 1
 
 
@@ -180,18 +378,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit status, see `EXIT_STATUSES`.
     """
     if argv is None:
-        leave_on_signals()
+        exit_on_signals()
     _open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a terminal without m² must not end the work
     parser = build_parser()
     try:
-        args, unknown = parser.parse_known_args(_joined(sys.argv[1:] if argv is None else argv))
+        args, unknown = parser.parse_known_args(_join_signed_values(sys.argv[1:] if argv is None else argv))
         if unknown:
             one_input = "" if unknown[0].startswith("-") or not args.one_input else f": {args.one_input}"
             parser.error(f"unrecognized arguments: {' '.join(unknown)}{one_input}")
-        if empty := _empty_name(args):
+        if empty := _find_empty_name(args):
             parser.error(f"the name given for {empty} is empty; give the name of a file or folder")
         if args.run is None:
             parser.print_help(sys.stderr)

@@ -9,15 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from topomerge.cli.command import Argument, option
-from topomerge.cli.console import Bars, warn
+from topomerge.cli.console import Argument, ProgressBars, build_option, warn
 from topomerge.errors import InputError
 
 if TYPE_CHECKING:
     from topomerge.types import TopometricMap
 
 
-def _number(text: str, allowed: Callable[[float], bool], range_text: str) -> float:
+def _parse_number(text: str, allowed: Callable[[float], bool], range_text: str) -> float:
     try:
         value = float(text)
     except ValueError:
@@ -27,37 +26,37 @@ def _number(text: str, allowed: Callable[[float], bool], range_text: str) -> flo
     return value
 
 
-def above_zero(text: str) -> float:
-    """A finite number above 0, as the `type` of an argument."""
-    return _number(text, lambda value: 0 < value < float("inf"), "above 0")
+def parse_positive(text: str) -> float:
+    """Parse a finite number above 0, as the `type` of an argument."""
+    return _parse_number(text, lambda value: 0 < value < float("inf"), "above 0")
 
 
-def share(text: str) -> float:
+def parse_share(text: str) -> float:
     """A number from 0 to 1, as the `type` of an argument."""
-    return _number(text, lambda value: 0 <= value <= 1, "from 0 to 1")
+    return _parse_number(text, lambda value: 0 <= value <= 1, "from 0 to 1")
 
 
-def count(text: str) -> int:
-    """A whole number from 0 on, as the `type` of an argument."""
+def parse_whole_number(text: str) -> int:
+    """Parse a whole number from 0 on, as the `type` of an argument."""
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"must be a whole number, not {text!r}")
     return int(text)
 
 
-def at_least_one(text: str) -> int:
-    """A whole number from 1 on, as the `type` of an argument."""
+def parse_count(text: str) -> int:
+    """Parse a whole number from 1 on, as the `type` of an argument."""
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"must be a whole number from 1 on, not {text!r}")
     return int(text)
 
 
-def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """Those of the options that were given: for the others, the function that takes them has its defaults."""
+def collect_given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Collect the options that were given; for the others, the called function has its defaults."""
     return {name: getattr(args, name) for name in names if hasattr(args, name)}
 
 
 @contextmanager
-def about(name: str) -> Iterator[None]:
+def name_option_in_errors(name: str) -> Iterator[None]:
     """An error of the input within is the fault of this option: its line begins with it."""
     try:
         yield
@@ -71,97 +70,99 @@ def check_descriptor(args: argparse.Namespace) -> None:
     Raises:
         InputError: no.
     """
-    from topomerge.embedding.embedders import embedder
+    from topomerge.embedding.learned import build_embedder
 
-    with about("--descriptor"):
-        embedder(args.descriptor)
-    with about("--k"):
+    with name_option_in_errors("--descriptor"):
+        build_embedder(args.descriptor)
+    with name_option_in_errors("--k"):
         steps = getattr(args, "k", 0)
         if steps and args.descriptor == "learned":
             raise InputError("steps of context are for descriptors of single rooms; learned sees what is around: leave it out")
         if steps:
-            embedder(args.descriptor, steps)
+            build_embedder(args.descriptor, steps)
 
 
-def belief_choices(args: argparse.Namespace) -> dict[str, Any]:
-    """What `BELIEF_OPTIONS` say, as keywords of `merge` and `atlas`.
+def collect_belief_options(args: argparse.Namespace) -> dict[str, Any]:
+    """Collect `BELIEF_OPTIONS` as keywords of `merge` and `atlas`.
 
     Raises:
         InputError: a threshold and a risk, or a risk that no threshold can promise.
     """
-    choices = given(args, "threshold", "same")
+    choices = collect_given(args, "threshold", "same")
     if hasattr(args, "risk"):
-        from topomerge.fusion.inputs import risk_threshold
+        from topomerge.fusion.inputs import find_risk_threshold
 
         if "threshold" in choices:
             raise InputError("--threshold and --risk both say when to believe a merge; give one of them")
         try:
-            choices["threshold"] = risk_threshold(args.risk)
+            choices["threshold"] = find_risk_threshold(args.risk)
         except InputError as error:
             raise InputError(f"--{error}") from error
     return choices
 
 
-def atlas_choices(args: argparse.Namespace) -> dict[str, Any]:
-    """What `ATLAS_OPTIONS` say, as settings of an atlas.
+def collect_atlas_options(args: argparse.Namespace) -> dict[str, Any]:
+    """Collect `ATLAS_OPTIONS` as settings of an atlas.
 
     Raises:
-        InputError: as `belief_choices`.
+        InputError: as `collect_belief_options`.
     """
-    return {**given(args, "scale", "embedder"), **belief_choices(args)}
+    return {**collect_given(args, "scale", "embedder"), **collect_belief_options(args)}
 
 
-def output(metavar: str, help: str) -> Argument:
-    """Where to write what a command is for."""
-    return option("-o", "--output", required=True, metavar=metavar, default=None, help=help)
+def build_output_option(metavar: str, help: str) -> Argument:
+    """Build the option of the output path."""
+    return build_option("-o", "--output", required=True, metavar=metavar, default=None, help=help)
 
 
-def quiet(help: str = "print nothing") -> Argument:
-    """That nobody watches."""
-    return option("-q", "--quiet", action="store_true", default=False, help=help)
+def build_quiet_option(help: str = "print nothing") -> Argument:
+    """Build the option that prints nothing."""
+    return build_option("-q", "--quiet", action="store_true", default=False, help=help)
 
 
-def json_option(help: str = "print JSON instead of tables") -> Argument:
-    """That a program reads what is printed."""
-    return option("--json", action="store_true", default=False, help=help)
+def build_json_option(help: str = "print JSON instead of tables") -> Argument:
+    """Build the option that prints JSON."""
+    return build_option("--json", action="store_true", default=False, help=help)
 
 
-UP = option(
+UP = build_option(
     "--up",
     choices=("z", "y", "x", "-z", "-y", "-x"),
     help="axis of the input that points up (default z, for glTF y); with a minus sign: down",
 )
-UNIT = option("--unit", choices=("m", "cm", "mm", "ft", "in"), help="unit of the input (default m)")
-ONE_FRAME = option(
+UNIT = build_option("--unit", choices=("m", "cm", "mm", "ft", "in"), help="unit of the input (default m)")
+ONE_FRAME = build_option(
     "--one-frame",
     action="store_true",
     help="read all files of a folder as one cloud: tiles, or registered stations, of one frame",
 )
-DESCRIPTOR = option(
+DESCRIPTOR = build_option(
     "--descriptor",
     default="learned",
     metavar="NAME",
     help="learned (default; the embedder that ships), engineered, shapedna, feather, or the folder of a trained embedder",
 )
 BELIEF_OPTIONS = (
-    option(
+    build_option(
         "--known",
         dest="same",
         choices=("nothing", "building", "storey"),
         help="what you already know: all maps are of one building, or of one storey (default nothing)",
     ),
-    option("--risk", type=above_zero, metavar="N", help="accept so many false merges in a thousand pairs; sets the threshold"),
-    option(
+    build_option(
+        "--risk", type=parse_positive, metavar="N", help="accept so many false merges in a thousand pairs; sets the threshold"
+    ),
+    build_option(
         "--threshold",
-        type=share,
+        type=parse_share,
         metavar="P",
         help="merge from this probability on (default 0.61; in an atlas 0.8, or 0.9 above eleven maps)",
     ),
 )
 ATLAS_OPTIONS = (
-    option("--scale", choices=("fixed", "free"), help="free: the maps may differ in scale (default fixed)"),
+    build_option("--scale", choices=("fixed", "free"), help="free: the maps may differ in scale (default fixed)"),
     *BELIEF_OPTIONS,
-    option(
+    build_option(
         "--descriptor",
         dest="embedder",
         choices=("learned", "engineered", "shapedna", "feather"),
@@ -169,13 +170,15 @@ ATLAS_OPTIONS = (
     ),
 )
 SENSORS = ("tls", "lidar", "depth", "tablet", "laser2d", "drawing")  # those of registration/bend/drift.json
-CONTEXT_STEPS = option("--k", type=count, default=0, metavar="K", help="steps of context around each room (default 0)")
+CONTEXT_STEPS = build_option(
+    "--k", type=parse_whole_number, default=0, metavar="K", help="steps of context around each room (default 0)"
+)
 CLOUD_OPTIONS = (
-    option("--voxel-size", type=above_zero, metavar="E", help="edge length of the cells of a cloud, m (default 0.1)"),
+    build_option("--voxel-size", type=parse_positive, metavar="E", help="edge length of the cells of a cloud, m (default 0.1)"),
     UP,
     UNIT,
     ONE_FRAME,
-    option(
+    build_option(
         "--sensor",
         choices=SENSORS,
         help="sensor of the clouds: sets how much drift merge may bend away (default: unknown, as much as for a phone)",
@@ -193,21 +196,21 @@ def check_cloud_options(paths: Sequence[str], args: argparse.Namespace) -> None:
     Raises:
         InputError: names the first of them; or the files of one frame, where no input is a folder.
     """
-    useless = given(args, "voxel_size", "up", "unit", "sensor")
+    useless = collect_given(args, "voxel_size", "up", "unit", "sensor")
     if useless and all(Path(path).suffix.lower() == ".tmap" for path in paths):
         name = next(iter(useless)).replace("_", "-")
         raise InputError(f"--{name}: is for clouds, of no use to a .tmap; give the scan that it was made of, or leave it out")
-    if given(args, "one_frame") and not any(Path(path).is_dir() for path in paths):
+    if collect_given(args, "one_frame") and not any(Path(path).is_dir() for path in paths):
         raise InputError("--one-frame: is for folders of files; give such a folder, or leave it out")
 
 
-def reading_choices(path: str, args: argparse.Namespace) -> dict[str, Any]:
-    """How to read one input: `CLOUD_OPTIONS` of reading, of which some are for folders only."""
-    return given(args, "up", "unit", *(["one_frame"] if Path(path).is_dir() else []))
+def collect_reading_options(path: str, args: argparse.Namespace) -> dict[str, Any]:
+    """Collect the `CLOUD_OPTIONS` of reading one input, of which some are for folders only."""
+    return collect_given(args, "up", "unit", *(["one_frame"] if Path(path).is_dir() else []))
 
 
-def map_from(path: str, args: argparse.Namespace) -> TopometricMap:
-    """The map in a .tmap, or the one that is extracted from anything else with the `CLOUD_OPTIONS` that were given.
+def load_input_map(path: str, args: argparse.Namespace) -> TopometricMap:
+    """Load the map in a .tmap, or the one that is extracted from anything else with the `CLOUD_OPTIONS` that were given.
 
     Raises:
         InputError: it can't be read or extracted; the line names the file.
@@ -221,10 +224,10 @@ def map_from(path: str, args: argparse.Namespace) -> TopometricMap:
             from topomerge.extraction.extract import extract
             from topomerge.io.points import read_chunks
 
-            with Bars(enabled=not getattr(args, "quiet", False)) as bars:
-                chunks = read_chunks(path, **reading_choices(path, args), progress=bars.task("read"))
-                topomap = extract(chunks, **given(args, "voxel_size"), name=path, progress=bars.task("extract"))
-            topomap = replace(topomap, parameters={**topomap.parameters, **given(args, "sensor")})
+            with ProgressBars(enabled=not getattr(args, "quiet", False)) as bars:
+                chunks = read_chunks(path, **collect_reading_options(path, args), progress=bars.start_task("read"))
+                topomap = extract(chunks, **collect_given(args, "voxel_size"), name=path, progress=bars.start_task("extract"))
+            topomap = replace(topomap, parameters={**topomap.parameters, **collect_given(args, "sensor")})
     except InputError as error:
         text = str(error) if path in str(error) else f"{path}: {error}"
         if advised := [name for name in EXTRACT_ADVICE if name in text]:

@@ -1,21 +1,4 @@
-"""The door between geometry and learning: a topometric map as a graph of tensors.
-
-Everything that a network may learn from is independent of the map's frame: lengths, counts and turns seen from above (gravity is
-known, so the sense of a turn is, too). Where rooms and doors lie in the map's frame is kept beside it, for matching and fusion.
-
-| tensor | shape | content |
-|---|---|---|
-| `x` | (R, F) float32 | `schema.ROOM_FEATURES` |
-| `room_points` | (R, P, 3) float32 | centres of occupied cells, m, about the room's middle; z = 0 is its floor |
-| `edge_index` | (2, 2E) int64 | from room, to room: every edge of the map in both directions |
-| `edge_attr` | (2E, G) float32 | `schema.EDGE_FEATURES`, seen from the first room |
-| `door_index` | (2, K) int64 | two different edges (columns of `edge_index`) that leave one room |
-| `door_attr` | (K, 3) float32 | `schema.DOOR_FEATURES` |
-| `storey` | (R,) int64 | of the rooms; the number depends on what the map saw, so it is no feature |
-| `pos`, `edge_pos` | (R, 3), (2E, 3) float64 | middle of each room and door in the frame of the input, m |
-
-Torch is imported inside the functions that return tensors: whoever only caches `graph_arrays` needs none.
-"""
+"""The graph of a map's rooms as arrays, and the schema of its columns."""
 
 from __future__ import annotations
 
@@ -24,28 +7,126 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from topomerge.embedding.schema import EDGE_KINDS, LENGTH_POWERS, POINTS_PER_ROOM, columns_of_power
 from topomerge.errors import InputError
-from topomerge.extraction.storeys import lowest_of_column
-from topomerge.types import Array, TopometricMap, mostly_unseen
+from topomerge.extraction.storeys import select_lowest_of_column
+from topomerge.types import Array, TopometricMap, is_mostly_unseen
 
 if TYPE_CHECKING:
     from torch_geometric.data import Data
 
-GRAPH_FORMAT = 1  # of `graph_arrays`; part of the name of whatever is cached
+
+POINTS_PER_ROOM = 512  # that stand for a room
+EDGE_KINDS = ("door", "opening", "stairs")  # of edges
+ROOM_FEATURES = (
+    "area",  # m2
+    "height",  # m; 0: no ceiling seen
+    "volume",  # m3
+    "length",  # m, along the first principal axis seen from above: the side of a rectangle of the same spread
+    "width",  # m, along the second
+    "elongation",  # width / length
+    "fill",  # area / (length * width): 1 for a rectangle
+    "floor_spread",  # m, standard deviation of the floor's height: stairs, ramps
+    "degree",  # rooms that one can walk to
+    "doors",
+    "openings",
+    "stairs",
+    "door_width",  # m, mean over doors and openings; 0: none
+    "reach",  # m, from the middle to the farthest door; 0: none
+    "completeness",  # share of the outline that was seen
+    "glimpsed",  # 0 or 1
+)
+EDGE_FEATURES = (
+    "width",  # m
+    "height",  # m; 0: nothing seen above
+    *EDGE_KINDS,  # one of them is 1
+    "distance",  # m, between the middles of the rooms, seen from above
+    "climb",  # m, from floor to floor
+    "from_middle",  # m, from the first room's middle to the door, seen from above
+    "to_middle",  # m, from the door to the second room's middle
+    "turn_sin",  # of the turn at the door, walking from middle to middle; to the left is positive
+    "turn_cos",
+)
+DOOR_FEATURES = (
+    "distance",  # m, between two doors of a room, seen from above
+    "angle_sin",  # of the angle at the room's middle from the first door to the second, counter-clockwise
+    "angle_cos",
+)
+LAYOUT_FEATURES = (
+    "distance",  # m, between two doors nearby, seen from above
+    "climb",  # m
+    "angle_sin",  # of the angle from the way out of the room to the way to the other door, counter-clockwise
+    "angle_cos",
+    "same",  # 1: both lead out of one room
+)
+WAY_FEATURES = (  # in the direction of the walls, in which crops are turned, too
+    "room_x",  # m, from the middle of the first room to that of the second
+    "room_y",
+    "door_x",  # m, to the door between them
+    "door_y",
+)
+THESIS_FEATURES = (
+    "points",  # log of 1 + m2: occupied cells times the area of a cell's face
+    "planarity",  # (s2 - s3) / s1 of the singular values s
+    "box_volume",  # log of 1 + m3, of the smallest upright box
+    "height",  # m, of that box
+    "projection",  # log of 1 + m2, of the cells seen from above
+    "spread",  # m, mean distance to the centroid
+    "eigenvalues",  # smallest over largest eigenvalue of the covariance
+    "smallest",  # m, smallest singular value over the root of the number of cells
+    "s3_s12",  # s3 / (s1 + s2)
+    "s2_s1",  # s2 / s1, not s1 / s2: that of a line is not finite
+    "verticality",  # of the first principal axis: 0 level, 1 upright
+    "roughness",  # m, mean distance to the plane of the 32 nearest cells
+)
+SPECTRUM_FEATURES = tuple(f"eigenvalue_{k}" for k in range(1, 33))  # 1/m2, ascending
+TABLES = {  # tensor of the graph -> its columns
+    "x": ROOM_FEATURES,
+    "edge_attr": EDGE_FEATURES,
+    "door_attr": DOOR_FEATURES,
+    "near_attr": LAYOUT_FEATURES,
+    "edge_way": WAY_FEATURES,
+    "engineered": THESIS_FEATURES,
+    "shapedna": SPECTRUM_FEATURES,
+}
+LENGTH_POWERS = {  # tensor -> column -> power of a length in its unit: how it grows when a map does
+    "x": {
+        "area": 2, "height": 1, "volume": 3, "length": 1, "width": 1, "floor_spread": 1, "door_width": 1, "reach": 1,
+    },
+    "edge_attr": {"width": 1, "height": 1, "distance": 1, "climb": 1, "from_middle": 1, "to_middle": 1},
+    "door_attr": {"distance": 1},
+}  # fmt: skip
 
 
-def to_graph(map: TopometricMap, points_per_room: int = POINTS_PER_ROOM) -> Data:
-    """A map as a `torch_geometric.data.Data` with the tensors above. The same map gives the same tensors.
+def count_columns(tensor: str) -> int:
+    """Return number of columns of a tensor of the graph."""
+    return len(TABLES[tensor])
+
+
+def find_column(tensor: str, feature: str) -> int:
+    """Place of a feature among the columns of a tensor."""
+    return TABLES[tensor].index(feature)
+
+
+def find_columns_of_power(tensor: str, power: int) -> list[int]:
+    """Return columns whose unit is this power of a length, ascending."""
+    powers = LENGTH_POWERS[tensor]
+    return [k for k, feature in enumerate(TABLES[tensor]) if powers.get(feature) == power]
+
+
+GRAPH_FORMAT = 1  # of `build_graph_arrays`; part of the name of whatever is cached
+
+
+def build_graph(map: TopometricMap, points_per_room: int = POINTS_PER_ROOM) -> Data:
+    """Return a map as a `torch_geometric.data.Data` with the tensors above. The same map gives the same tensors.
 
     Raises:
         InputError: `points_per_room` is below 1.
     """
-    return from_arrays(graph_arrays(map, points_per_room))
+    return convert_to_tensors(build_graph_arrays(map, points_per_room))
 
 
-def from_arrays(arrays: Mapping[str, Array]) -> Data:
-    """What `graph_arrays` gave, as tensors."""
+def convert_to_tensors(arrays: Mapping[str, Array]) -> Data:
+    """Convert the arrays of `build_graph_arrays` to tensors."""
     import torch
     from torch_geometric.data import Data
 
@@ -54,8 +135,8 @@ def from_arrays(arrays: Mapping[str, Array]) -> Data:
     return Data(**values, num_nodes=len(arrays["x"]))
 
 
-def graph_arrays(map: TopometricMap, points_per_room: int = POINTS_PER_ROOM) -> dict[str, Array]:
-    """The arrays of the graph, by name (see the top of this file).
+def build_graph_arrays(map: TopometricMap, points_per_room: int = POINTS_PER_ROOM) -> dict[str, Array]:
+    """Return the arrays of the graph, by name (see the top of this file).
 
     Raises:
         InputError: `points_per_room` is below 1.
@@ -65,46 +146,46 @@ def graph_arrays(map: TopometricMap, points_per_room: int = POINTS_PER_ROOM) -> 
     ends = map.open_edges["rooms"].astype(np.int64).reshape(-1, 2)
     index = np.concatenate([ends, ends[:, ::-1]]).T.copy()
     doors = np.concatenate([map.open_edges, map.open_edges])
-    floors, spread, sides = _floors(map)
-    pairs = _door_pairs(index[0])
+    floors, spread, sides = _measure_floors(map)
+    pairs = _find_door_pairs(index[0])
     return {
-        "x": _room_features(map, index, doors, spread, sides),
-        "room_points": _room_points(map, floors, points_per_room),
+        "x": _compute_room_features(map, index, doors, spread, sides),
+        "room_points": _sample_room_points(map, floors, points_per_room),
         "edge_index": index,
-        "edge_attr": _edge_features(map.rooms["centroid"], index, doors, floors),
+        "edge_attr": _compute_edge_features(map.rooms["centroid"], index, doors, floors),
         "door_index": pairs,
-        "door_attr": _door_features(map.rooms["centroid"], index, doors, pairs),
+        "door_attr": _compute_door_features(map.rooms["centroid"], index, doors, pairs),
         "storey": map.rooms["storey"].astype(np.int64),
         "pos": np.ascontiguousarray(map.rooms["centroid"]),
         "edge_pos": np.ascontiguousarray(doors["centre"]),
     }
 
 
-def resized(arrays: Mapping[str, Array], scale: float) -> dict[str, Array]:
-    """The arrays of the graph of a map whose unit is so many m long."""
+def rescale_graph(arrays: Mapping[str, Array], scale: float) -> dict[str, Array]:
+    """Return the arrays of the graph of a map whose unit is so many m long."""
     out = dict(arrays)
     for name in LENGTH_POWERS.keys() & out.keys():
         factor = np.ones(out[name].shape[1])
         for power in (1, 2, 3):
-            factor[columns_of_power(name, power)] = scale**power
+            factor[find_columns_of_power(name, power)] = scale**power
         out[name] = (out[name] * factor).astype(out[name].dtype)
     return out | {name: out[name] * scale for name in ("room_points", "pos", "edge_pos")}
 
 
-def _groups(labels: Array, count: int) -> list[Array]:
+def _group_rows(labels: Array, count: int) -> list[Array]:
     """Rows of each label 0..count-1, ascending."""
     order = np.argsort(labels, kind="stable")
     return np.split(order, np.searchsorted(labels[order], np.arange(count + 1)))[1:-1]
 
 
-def _floors(map: TopometricMap) -> tuple[Array, Array, Array]:
+def _measure_floors(map: TopometricMap) -> tuple[Array, Array, Array]:
     """Height (m) of each room's floor and its standard deviation; (R, 2) sides of the rectangle with its spread."""
     count = len(map.rooms)
     heights, spread, sides = np.zeros(count), np.zeros(count), np.zeros((count, 2))
-    rows = lowest_of_column(map.navigable)
-    places = map.navigable.centroids(map.navigable.cells[rows])
+    rows = select_lowest_of_column(map.navigable)
+    places = map.navigable.compute_centroids(map.navigable.cells[rows])
     body = float(map.parameters.get("body_width", 0.0))  # the strip along the walls is not navigable
-    for r, group in enumerate(_groups(map.navigable_room[rows], count)):
+    for r, group in enumerate(_group_rows(map.navigable_room[rows], count)):
         floor = places[group]
         if len(floor):
             heights[r], spread[r] = np.median(floor[:, 2]), floor[:, 2].std()
@@ -113,7 +194,7 @@ def _floors(map: TopometricMap) -> tuple[Array, Array, Array]:
     return heights, spread, sides
 
 
-def _room_features(map: TopometricMap, index: Array, doors: Array, spread: Array, sides: Array) -> Array:
+def _compute_room_features(map: TopometricMap, index: Array, doors: Array, spread: Array, sides: Array) -> Array:
     rooms, count = map.rooms, len(map.rooms)
     of_kind = [np.bincount(index[0][doors["kind"] == kind], minlength=count) for kind in EDGE_KINDS]
     degree = np.bincount(np.unique(index, axis=1)[0], minlength=count)
@@ -125,24 +206,24 @@ def _room_features(map: TopometricMap, index: Array, doors: Array, spread: Array
     columns = [
         rooms["area"], rooms["height"], rooms["volume"], sides[:, 0], sides[:, 1], sides[:, 1] / np.maximum(sides[:, 0], 1e-6),
         rooms["area"] / box, spread, degree, *of_kind, widths / np.maximum(of_kind[0] + of_kind[1], 1), reach,
-        rooms["completeness"], mostly_unseen(rooms),
+        rooms["completeness"], is_mostly_unseen(rooms),
     ]  # fmt: skip
     return np.stack(columns, axis=1).astype(np.float32)
 
 
-def _room_points(map: TopometricMap, floors: Array, number: int) -> Array:
+def _sample_room_points(map: TopometricMap, floors: Array, number: int) -> Array:
     """Cells of each room spread evenly over their Morton order; a room of fewer cells repeats them."""
     out = np.zeros((len(map.rooms), number, 3), np.float32)
-    for r, rows in enumerate(_groups(map.room, len(map.rooms))):
+    for r, rows in enumerate(_group_rows(map.room, len(map.rooms))):
         cells = map.grid.cells[rows] if len(rows) else map.navigable.cells[map.navigable_room == r]
         if len(cells):
             chosen = np.arange(number) % len(cells) if len(cells) < number else np.arange(number) * len(cells) // number
             middle = [*map.rooms["centroid"][r, :2], floors[r]]
-            out[r] = map.grid.centroids(cells[chosen]) - middle
+            out[r] = map.grid.compute_centroids(cells[chosen]) - middle
     return out
 
 
-def _edge_features(middle: Array, index: Array, doors: Array, floors: Array) -> Array:
+def _compute_edge_features(middle: Array, index: Array, doors: Array, floors: Array) -> Array:
     source, target = index
     way_in = (doors["centre"] - middle[source])[:, :2]
     way_out = (middle[target] - doors["centre"])[:, :2]
@@ -150,28 +231,28 @@ def _edge_features(middle: Array, index: Array, doors: Array, floors: Array) -> 
     straight = np.linalg.norm(way_in + way_out, axis=1)
     lengths = [np.linalg.norm(way, axis=1) for way in (way_in, way_out)]
     climb = floors[target] - floors[source]
-    columns = [doors["width"], doors["height"], *kinds, straight, climb, *lengths, *_angle(way_in, way_out)]
+    columns = [doors["width"], doors["height"], *kinds, straight, climb, *lengths, *_compute_angle(way_in, way_out)]
     return np.stack(columns, axis=1).astype(np.float32)
 
 
-def _door_pairs(source: Array) -> Array:
+def _find_door_pairs(source: Array) -> Array:
     """(2, K) every two edges that leave the same room, in both orders."""
     if not len(source):
         return np.zeros((2, 0), np.int64)
-    groups = _groups(source, int(source.max()) + 1)
+    groups = _group_rows(source, int(source.max()) + 1)
     pairs = [np.stack(np.meshgrid(g, g, indexing="ij")).reshape(2, -1) for g in groups]
     joined = np.concatenate(pairs, axis=1)
     return np.ascontiguousarray(joined[:, joined[0] != joined[1]], np.int64)
 
 
-def _door_features(middle: Array, index: Array, doors: Array, pairs: Array) -> Array:
+def _compute_door_features(middle: Array, index: Array, doors: Array, pairs: Array) -> Array:
     first, second = doors["centre"][pairs[0]], doors["centre"][pairs[1]]
     at = middle[index[0][pairs[0]]]
     distance = np.linalg.norm((second - first)[:, :2], axis=1)
-    return np.stack([distance, *_angle((first - at)[:, :2], (second - at)[:, :2])], axis=1).astype(np.float32)
+    return np.stack([distance, *_compute_angle((first - at)[:, :2], (second - at)[:, :2])], axis=1).astype(np.float32)
 
 
-def _angle(a: Array, b: Array) -> tuple[Array, Array]:
+def _compute_angle(a: Array, b: Array) -> tuple[Array, Array]:
     """Sine and cosine of the angle from a to b, counter-clockwise; 0 and 1 where one of them has no length."""
     product = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
     fine = product > 1e-9

@@ -1,33 +1,214 @@
-"""A trained embedder as what `match`, `merge` and the command line take: a callable map -> (R, D), or `TurnedRows` where what a
-room looks like depends on how the map is turned. ONNX Runtime runs it (`topomerge.networks`), whatever it was trained as.
-"""
+"""Embedders by name: engineered, spectral, learned."""
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from topomerge.embedding.door_layout import door_layout
-from topomerge.embedding.graph import graph_arrays, resized
-from topomerge.embedding.network import Network, build_embedder_signature, tensors
-from topomerge.embedding.point_features import point_features, point_spectra
-from topomerge.embedding.rooms_around import with_rooms_around
-from topomerge.embedding.schema import POINTS_PER_ROOM
-from topomerge.embedding.sheets import sheet_arrays
-from topomerge.embedding.surroundings import CROP_SHAPES, crops
-from topomerge.embedding.turns import Rows, TurnedRows, aligned, along_walls, edge_ways, quarter_turned, room_facts
-from topomerge.embedding.weights import read_embedder_card
-from topomerge.networks.network import Run, open_network
+from topomerge.embedding.engineered import (
+    add_context,
+    build_engineered,
+    build_feather,
+    compute_door_layout,
+    compute_point_features,
+    compute_point_spectra,
+)
+from topomerge.embedding.graph import (
+    EDGE_KINDS,
+    POINTS_PER_ROOM,
+    TABLES,
+    build_graph_arrays,
+    count_columns,
+    find_column,
+    rescale_graph,
+)
+from topomerge.embedding.network import Network, build_embedder_signature, build_network, list_tensors
+from topomerge.embedding.quarter_turns import (
+    Descriptor,
+    Rows,
+    TurnedRows,
+    align_rows,
+    compute_edge_positions,
+    compute_room_features,
+    rotate_graph,
+    rotate_to_walls,
+)
+from topomerge.embedding.shapedna import build_shapedna
+from topomerge.embedding.sheets import build_sheet_arrays
+from topomerge.embedding.surroundings import CROP_SHAPES, cut_crops
+from topomerge.errors import InputError
+from topomerge.io.archive import find_weights_file
+from topomerge.networks.network import WEIGHTS_PACKAGE, Run, card_of, open_network, read_card
 from topomerge.numpy_nn import softmax
 from topomerge.types import Array, TopometricMap
 
-POINT_TABLES = {"engineered": point_features, "shapedna": point_spectra}  # computed from the points where a network reads them
+STOREY_CLIMB = 2.0  # m at most, between the middles of rooms of one storey
+DISTANCE, CLIMB, TURN_COS = (find_column("edge_attr", feature) for feature in ("distance", "climb", "turn_cos"))
+KIND_COLUMNS = [find_column("edge_attr", kind) for kind in EDGE_KINDS]
 
 
-def load_embedder(path: str | Path | None = None) -> Learned:
+def add_proximity_edges(graph: Mapping[str, Array], reach: float) -> dict[str, Array]:
+    """`edge_index`, `edge_attr` and `edge_pos` of `embedding.graph` with an edge between any two rooms of a storey whose middles
+    are at most `reach` (m, seen from above) apart.
+
+    Its features are the distance and the climb; it is of no kind. Ways back stay half of all edges behind the ways there.
+    """
+    pos = np.asarray(graph["pos"], float)
+    away = np.linalg.norm(pos[:, None, :2] - pos[None, :, :2], axis=2)
+    first, second = np.nonzero(np.triu((away <= reach) & (abs(pos[:, None, 2] - pos[None, :, 2]) <= STOREY_CLIMB), 1))
+    features = np.zeros((len(first), count_columns("edge_attr")), np.float32)
+    features[:, DISTANCE], features[:, CLIMB], features[:, TURN_COS] = away[first, second], pos[second, 2] - pos[first, 2], 1.0
+    back = features.copy()
+    back[:, CLIMB] *= -1
+    middle = (pos[first] + pos[second]) / 2
+    index, attr, places = (np.asarray(graph[name]) for name in ("edge_index", "edge_attr", "edge_pos"))
+    half = index.shape[1] // 2
+    ways = np.concatenate([index[:, :half], [first, second], index[:, half:], [second, first]], axis=1)
+    return {
+        "edge_index": ways.astype(np.int64),
+        "edge_attr": np.concatenate([attr[:half], features, attr[half:], back]).astype(np.float32),
+        "edge_pos": np.concatenate([places[:half], middle, places[half:], middle]),
+    }
+
+
+def is_door_edge(graph: Mapping[str, Array]) -> Array:
+    """Return (2E,) bool: which edges are doors, openings or stairs."""
+    return np.asarray(np.asarray(graph["edge_attr"])[:, KIND_COLUMNS].any(axis=1))
+
+
+EMBEDDER_FORMAT = 3
+EMBEDDER_CLASS = "topomerge.models.Embedder"
+EMBEDDER_FILE = "embedder.onnx"
+PRETRAINED = "pretrained"  # names the embedder that ships
+STATE_FILE, STATE_SETTINGS = "embedder.safetensors", "embedder.json"  # of a training under way, and of earlier versions
+
+
+@dataclass(frozen=True, eq=False)
+class EmbedderCard:
+    """What is known of an embedder.
+
+    Args:
+        path: of its network.
+        network: what it is made of.
+        temperature: that divides similarities.
+        about: on what it was trained, how good it is.
+        digest: of its file, which its rows are marked with.
+        values: all that the card says.
+    """
+
+    path: Path
+    network: Network
+    temperature: float
+    about: dict[str, Any]
+    digest: str
+    values: dict[str, Any]
+
+
+def find_embedder(path: str | Path | None = None) -> Path:
+    """Find the network of an embedder.
+
+    Args:
+        path: a file, the folder that it is in, or a run, whose best embedder is taken; `PRETRAINED` or None: the one that ships.
+
+    Raises:
+        InputError: there is none.
+    """
+    if path is None or (str(path) == PRETRAINED and not Path(path).exists()):
+        return find_weights_file(WEIGHTS_PACKAGE, EMBEDDER_FILE)
+    path = Path(path)
+    if path.suffix == Path(EMBEDDER_FILE).suffix:
+        return path
+    for folder in (path, path / "best"):
+        if (folder / EMBEDDER_FILE).exists():
+            return folder / EMBEDDER_FILE
+    if find_state(path):
+        raise InputError(
+            f"{path}: holds weights of torch, of a training that has not ended or of an earlier version; run topomerge "
+            f"export-embedder {path} -o FOLDER, and give FOLDER"
+        )
+    raise InputError(f"{path / EMBEDDER_FILE}: No such file; give a run's folder, or one of export-embedder")
+
+
+def find_state(path: str | Path) -> Path | None:
+    """Find the folder with weights of torch: the path itself, that of one of the files, or the best of a run; None without."""
+    path = Path(path)
+    folder = path.parent if path.name in (STATE_FILE, STATE_SETTINGS) else path
+    return next((place for place in (folder, folder / "best") if (place / STATE_SETTINGS).exists()), None)
+
+
+def read_embedder_card(path: str | Path | None = None) -> EmbedderCard:
+    """Read what is known of an embedder; `path` as of `find_embedder`.
+
+    Raises:
+        InputError: there is none, its card is damaged, of another format or class, or it was trained on other features.
+    """
+    file = find_embedder(path)
+    values = read_card(file)
+    card = card_of(file)
+    network = check_settings(card, values, EMBEDDER_FORMAT)
+    temperature = values.get("temperature")
+    if not isinstance(temperature, float) or not 0 < temperature <= 1:
+        raise InputError(f"{card}: temperature must be above 0 and at most 1, not {str(temperature)[:20]}; export it again")
+    return EmbedderCard(file, network, temperature, dict(values["about"]), values["sha256"], values)
+
+
+def describe_embedder(network: Network, about: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What both kinds of files say of a network: of its architecture, of the features that it reads, and of its training."""
+    features = {name: list(TABLES[name]) for name in list_tensors(network) if name in TABLES}
+    return {"class": EMBEDDER_CLASS, "network": asdict(network), "features": features, "about": dict(about or {})}
+
+
+def build_card(network: Network, temperature: float, about: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What the card of an embedder says, but for its file."""
+    known = {"format": EMBEDDER_FORMAT, "temperature": temperature, **describe_embedder(network, about)}
+    return build_embedder_signature(network).describe() | known
+
+
+def check_settings(path: Path, values: Mapping[str, Any], format_number: int) -> Network:
+    """The network that the settings of a file describe; its encoders need not be known here, only what it reads.
+
+    Raises:
+        InputError: of another format or class, incomplete, or trained on other features.
+    """
+    if values.get("class") != EMBEDDER_CLASS:
+        raise InputError(f"{path}: is of class {str(values.get('class'))[:60]!r}, not {EMBEDDER_CLASS}")
+    if values.get("format") != format_number:
+        raise InputError(
+            f"{path}: has format {str(values.get('format'))[:20]}, this version reads {format_number}; export it with the "
+            f"version that wrote it, or train it again"
+        )
+    needs = {"network": dict, "sha256": str, "about": dict, "features": dict}
+    if not all(isinstance(values.get(key), kind) for key, kind in needs.items()):
+        raise InputError(f"{path}: lacks {', '.join(needs)}; export it again")
+    try:
+        network = build_network(values["network"], known=False)
+    except InputError as error:
+        raise InputError(f"{path}: {str(error)[:300]}; export it again") from error
+    for name, columns in describe_embedder(network, None)["features"].items():
+        trained = values["features"].get(name)
+        if trained != columns:
+            trained = trained if isinstance(trained, list) else []
+            differing = [str(column)[:40] for column in (*trained, *columns) if (column in trained) != (column in columns)]
+            what = ", ".join(differing[:3]) or "their order"
+            raise InputError(
+                f"{path}: was trained on {len(trained)} columns of {name}, this version has {len(columns)} (other: {what}); "
+                f"train it again"
+            )
+    return network
+
+
+POINT_TABLES = {
+    "engineered": compute_point_features,
+    "shapedna": compute_point_spectra,
+}  # computed from the points where a network reads them
+
+
+def load_embedder(path: str | Path | None = None) -> LearnedEmbedder:
     """A trained embedder. Neither torch, Hydra nor the training code is needed.
 
     Args:
@@ -38,10 +219,10 @@ def load_embedder(path: str | Path | None = None) -> Learned:
     """
     card = read_embedder_card(path)
     run = open_network(card.path, card.digest, build_embedder_signature(card.network), card.values)
-    return Learned(run, card.network, card.temperature, card.about, card.digest)
+    return LearnedEmbedder(run, card.network, card.temperature, card.about, card.digest)
 
 
-class Learned:
+class LearnedEmbedder:
     """Callable map -> (R, D) float64 of length 1, or `TurnedRows`; the same map gives the same rows.
 
     Args:
@@ -59,63 +240,109 @@ class Learned:
         self.embedder = embedder
 
     def __call__(self, map: TopometricMap) -> Rows:
-        return self.graph(self.arrays(map))[0]
+        return self.embed_graph(self.build_arrays(map))[0]
 
     def at_scales(self, map: TopometricMap) -> Callable[[float], Rows]:
-        """What the embedder gives for a map of unknown scale, whose unit is taken for so many m."""
-        of_map = self._graph_arrays(map)
+        """Return a function that embeds a map of unknown scale, given the m that its unit is taken for."""
+        of_map = self._build_graph_arrays(map)
 
         def rows(scale: float) -> Rows:
-            arrays = resized(of_map, scale)
-            return self.graph(arrays if self.network.turns == 1 else arrays | sheet_arrays(map, scale))[0]
+            arrays = rescale_graph(of_map, scale)
+            return self.embed_graph(arrays if self.network.turns == 1 else arrays | build_sheet_arrays(map, scale))[0]
 
         return rows
 
-    def matchability(self, map: TopometricMap) -> Array:
+    def compute_matchability(self, map: TopometricMap) -> Array:
         """(R,) float64: how alike a room of another map must at least be, as a cosine, before it is rather this one than none."""
-        return self.temperature * self.graph(self.arrays(map))[1]
+        return self.temperature * self.embed_graph(self.build_arrays(map))[1]
 
-    def probabilities(self, a: TopometricMap, b: TopometricMap) -> tuple[Array, Array]:
+    def compute_probabilities(self, a: TopometricMap, b: TopometricMap) -> tuple[Array, Array]:
         """That each room of a (R_a, R_b + 1) is each of b, in the last place none of them; and of b likewise (R_b, R_a + 1)."""
-        (ea, da), (eb, db) = (self.graph(self.arrays(m)) for m in (a, b))
-        ea, eb = aligned(ea, eb)
+        (ea, da), (eb, db) = (self.embed_graph(self.build_arrays(m)) for m in (a, b))
+        ea, eb = align_rows(ea, eb)
         logits = ea @ eb.T / self.temperature
         return softmax(np.column_stack([logits, da])), softmax(np.column_stack([logits.T, db]))
 
-    def graph(self, arrays: Mapping[str, Array]) -> tuple[Rows, Array]:
-        """Embeddings and dustbins (R,), as logits, of what `arrays` gives."""
+    def embed_graph(self, arrays: Mapping[str, Array]) -> tuple[Rows, Array]:
+        """Return embeddings and dustbins (R,), as logits, of what `arrays` gives."""
         turns = self.network.turns
         if not len(arrays["x"]):
             none = np.zeros((0, turns, self.network.size))
             return (none[:, 0] if turns == 1 else TurnedRows(none, np.zeros((0, 2)), self.embedder)), np.zeros(0)
-        inputs, names = dict(arrays), tensors(self.network)
+        inputs, names = dict(arrays), list_tensors(self.network)
         if self.network.node.around:
-            inputs |= with_rooms_around(inputs, self.network.node.around)
+            inputs |= add_proximity_edges(inputs, self.network.node.around)
         inputs |= {n: compute(arrays["room_points"]) for n, compute in POINT_TABLES.items() if n in names and n not in arrays}
         if "near_index" in names and "near_index" not in arrays:
-            layout = door_layout(*(arrays[n] for n in ("edge_index", "pos", "edge_pos")))
+            layout = compute_door_layout(*(arrays[n] for n in ("edge_index", "pos", "edge_pos")))
             inputs |= dict(zip(("near_index", "near_attr"), layout, strict=True))
-        inputs |= {part: crops(inputs, part) for part in CROP_SHAPES if part in names and part not in inputs}
+        inputs |= {part: cut_crops(inputs, part) for part in CROP_SHAPES if part in names and part not in inputs}
         if "edge_way" in names:
-            inputs["edge_way"] = edge_ways(inputs)
+            inputs["edge_way"] = compute_edge_positions(inputs)
         read = {name: inputs[name] for name in names}
-        computed = [self.run(**(quarter_turned(read, k) if k else read)) for k in range(turns)]
+        computed = [self.run(**(rotate_graph(read, k) if k else read)) for k in range(turns)]
         rows, bins = ([array.astype(np.float64) for array in arrays] for arrays in zip(*computed, strict=True))
         if turns == 1:
             return rows[0], bins[0]
         dustbin = np.mean(bins, axis=0)
-        facts = room_facts(arrays["x"], dustbin, arrays["pos"][:, 2])
-        return TurnedRows(np.stack(rows, axis=1), along_walls(arrays), self.embedder, facts), dustbin
+        facts = compute_room_features(arrays["x"], dustbin, arrays["pos"][:, 2])
+        return TurnedRows(np.stack(rows, axis=1), rotate_to_walls(arrays), self.embedder, facts), dustbin
 
     @property
     def needs_points(self) -> bool:
         """Does the network read the points of rooms, or what is reckoned from them?"""
         return bool(set(self.network.geometry.parts) - {"scalars", *CROP_SHAPES})
 
-    def arrays(self, map: TopometricMap) -> dict[str, Array]:
-        """What `graph` takes, of a map."""
-        arrays = self._graph_arrays(map)
-        return arrays if self.network.turns == 1 else arrays | sheet_arrays(map)
+    def build_arrays(self, map: TopometricMap) -> dict[str, Array]:
+        """Build the arrays of a map that `graph` takes."""
+        arrays = self._build_graph_arrays(map)
+        return arrays if self.network.turns == 1 else arrays | build_sheet_arrays(map)
 
-    def _graph_arrays(self, map: TopometricMap) -> dict[str, Array]:
-        return graph_arrays(map, POINTS_PER_ROOM if self.needs_points else 1)
+    def _build_graph_arrays(self, map: TopometricMap) -> dict[str, Array]:
+        return build_graph_arrays(map, POINTS_PER_ROOM if self.needs_points else 1)
+
+
+def load_learned(path: str | None = None) -> Descriptor:
+    """The trained embedder in a folder (see `topomerge.load_embedder`), or the one that ships with the package."""
+    return load_embedder(path)
+
+
+EMBEDDERS: dict[str, Callable[..., Descriptor]] = {
+    "learned": load_learned,
+    "engineered": build_engineered,
+    "shapedna": build_shapedna,
+    "feather": build_feather,
+}
+DEFAULT = "learned"
+
+
+def get_descriptor_name(name: str | Descriptor) -> str:
+    """Return the name of a descriptor for reports, or that of a callable."""
+    return name if isinstance(name, str) else getattr(name, "__name__", type(name).__name__)
+
+
+def build_embedder(name: str | Descriptor = DEFAULT, k: int = 0, context: str = "join", **options: Any) -> Descriptor:
+    """Return a callable map -> (R, D) float64.
+
+    Args:
+        name: ``"learned"``, ``"engineered"``, ``"shapedna"``, ``"feather"``, the folder of a trained one, or a descriptor.
+        k: steps of context (see `add_context`).
+        context: ``"join"`` or ``"mean"``.
+        options: those of the function of that name.
+
+    Raises:
+        InputError: unknown name or option.
+    """
+    if callable(name):
+        if options:
+            raise InputError(f"options {', '.join(options)} are for embedders that are named, not for a callable")
+        return add_context(name, k, context)
+    if name and name not in EMBEDDERS and Path(name).is_dir():
+        return build_embedder("learned", k, context, path=name, **options)
+    if name not in EMBEDDERS:
+        raise InputError(f"unknown descriptor {name!r}: {', '.join(EMBEDDERS)} or the folder of a trained one are possible")
+    make = EMBEDDERS[name]
+    unknown = set(options) - set(inspect.signature(make).parameters)
+    if unknown:
+        raise InputError(f"{name} has no option {', '.join(sorted(unknown))}: {', '.join(inspect.signature(make).parameters)}")
+    return add_context(make(**options), k, context)

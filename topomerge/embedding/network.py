@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
-from topomerge.embedding.schema import POINTS_PER_ROOM, TABLES
+from topomerge.embedding.graph import POINTS_PER_ROOM, TABLES
 from topomerge.embedding.surroundings import CROP_SHAPES
 from topomerge.errors import InputError
-from topomerge.networks.signature import Signature, Tensor
+from topomerge.networks.network import Signature, Tensor
 
 TABLE_PARTS = {"scalars": "x", "engineered": "engineered", "shapedna": "shapedna"}  # part -> table of the graph that it reads
 POINT_PARTS = ("pointnet", "pointnet_local", "voxelcnn")  # these read the points
@@ -87,29 +87,29 @@ class Network:
         return 4 if CROP_SHAPES.keys() & set(self.geometry.parts) or (self.node.ways and self.node.kind != "none") else 1
 
 
-def needed(part: str) -> str:
-    """The tensor of the graph that a part of the geometry reads."""
+def find_tensor(part: str) -> str:
+    """Return the tensor of the graph that a part of the geometry reads."""
     return part if part in CROP_SHAPES else TABLE_PARTS.get(part, "room_points")
 
 
-def pair_tensors(node: Node) -> tuple[str, ...]:
-    """Names of the tensors that tell of pairs of doors, if the node encoder reads any."""
+def list_pair_tensors(node: Node) -> tuple[str, ...]:
+    """Return names of the tensors that tell of pairs of doors, if the node encoder reads any."""
     if not node.doors or node.kind == "none":
         return ()
     return ("near_index", "near_attr") if node.near else ("door_index", "door_attr")
 
 
-def tensors(network: Network) -> tuple[str, ...]:
-    """Names of the tensors that a network reads."""
+def list_tensors(network: Network) -> tuple[str, ...]:
+    """Return names of the tensors that a network reads."""
     ways = ("edge_way",) if network.node.ways and network.node.kind != "none" else ()
-    return (*dict.fromkeys(needed(part) for part in network.geometry.parts), *GRAPH, *pair_tensors(network.node), *ways)
+    return (*dict.fromkeys(find_tensor(part) for part in network.geometry.parts), *GRAPH, *list_pair_tensors(network.node), *ways)
 
 
 def build_embedder_signature(network: Network) -> Signature:
     """Describe an embedder as one call runs it: on a map as it is turned."""
     counted = {"edge_attr": "edges", "edge_way": "edges", "door_attr": "pairs", "near_attr": "pairs"}
     inputs = {}
-    for name in tensors(network):
+    for name in list_tensors(network):
         count = counted.get(name, "rooms")
         if name in TABLES:
             inputs[name] = Tensor((count, len(TABLES[name])), ", ".join(TABLES[name]))
@@ -175,7 +175,7 @@ def _check_sizes(network: Network) -> None:
         raise InputError(f"dropout must be 0 or more and below 1, not {network.dropout}")
 
 
-def network_from(table: Mapping[str, Any], known: bool = True) -> Network:
+def build_network(table: Mapping[str, Any], known: bool = True) -> Network:
     """From what `dataclasses.asdict` gave.
 
     Args:
@@ -185,19 +185,19 @@ def network_from(table: Mapping[str, Any], known: bool = True) -> Network:
         InputError: an unknown key, a value of another type, or what can't be built.
     """
     network = Network(
-        geometry=_filled(Geometry, table.get("geometry", {}), "geometry."),
-        node=_filled(Node, table.get("node", {}), "node."),
-        **{k: v for k, v in _values(Network, table, "").items() if k not in ("geometry", "node")},
+        geometry=_fill_dataclass(Geometry, table.get("geometry", {}), "geometry."),
+        node=_fill_dataclass(Node, table.get("node", {}), "node."),
+        **{k: v for k, v in _check_values(Network, table, "").items() if k not in ("geometry", "node")},
     )
     check(network) if known else _check_sizes(network)
     return network
 
 
-def _filled(kind: type, table: Any, where: str) -> Any:
-    return kind(**_values(kind, table, where))
+def _fill_dataclass(kind: type, table: Any, where: str) -> Any:
+    return kind(**_check_values(kind, table, where))
 
 
-def _values(kind: type, table: Any, where: str) -> dict[str, Any]:
+def _check_values(kind: type, table: Any, where: str) -> dict[str, Any]:
     """The values of a dataclass' fields, if each is of the type of its default."""
     if not isinstance(table, Mapping):
         raise InputError(f"{where.rstrip('.') or 'network'} must be a table of keys, not {table!r}")

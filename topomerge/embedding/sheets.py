@@ -14,11 +14,11 @@ from topomerge.extraction.plans.storey_plan import (
     USUAL_HEIGHT,
     WALL_HEIGHTS,
     WALL_RULE,
-    band_stack,
-    observed_bands,
-    wall_columns,
+    build_band_stack,
+    detect_wall_columns,
+    is_observed_band,
 )
-from topomerge.kernels.plan import column_bits
+from topomerge.kernels.rasters import compute_column_bits
 from topomerge.types import Array, TopometricMap
 
 FURNITURE_STEP = 1.0  # m above the floor, between low and high things
@@ -53,15 +53,15 @@ class Sheet:
     turn: Array
 
 
-def sheet(map: TopometricMap, scale: float = 1.0) -> Sheet:
-    """The sheet of a map; the same map gives the same one.
+def rasterise_sheet(map: TopometricMap, scale: float = 1.0) -> Sheet:
+    """Return the sheet of a map; the same map gives the same one.
 
     Args:
         scale: m that the unit of a map of unknown scale is taken for; heights stay as they are.
     """
     storeys: list[Sheet] = []
     for s in range(len(map.storeys)):
-        storeys.append(_storey(map, s, storeys[0].turn[0] if storeys else np.pi / 4, scale))
+        storeys.append(_rasterise_storey(map, s, storeys[0].turn[0] if storeys else np.pi / 4, scale))
     height = sum(len(s.room) + GAP for s in storeys)
     width = max((s.room.shape[1] for s in storeys), default=0)
     planes, room = np.zeros((height, width, len(SHEET_PLANES)), np.uint8), np.full((height, width), -1, np.int16)
@@ -76,58 +76,60 @@ def sheet(map: TopometricMap, scale: float = 1.0) -> Sheet:
     return Sheet(planes, room, anchor, doors, np.array([s.turn[0] for s in storeys]))
 
 
-def sheet_arrays(map: TopometricMap, scale: float = 1.0) -> dict[str, Array]:
-    """The sheet of a map by the names that it has among the tensors of a graph."""
-    drawn = sheet(map, scale)
+def build_sheet_arrays(map: TopometricMap, scale: float = 1.0) -> dict[str, Array]:
+    """Return the sheet of a map by the names that it has among the tensors of a graph."""
+    drawn = rasterise_sheet(map, scale)
     places = {"anchor": drawn.anchor, "door_anchor": drawn.doors, "turn": drawn.turn}
     return {"sheet": drawn.planes, "sheet_room": drawn.room, **places}
 
 
-def _storey(map: TopometricMap, storey: int, near: float, scale: float) -> Sheet:
+def _rasterise_storey(map: TopometricMap, storey: int, near: float, scale: float) -> Sheet:
     """One storey by itself, turned by the direction of its walls that is no more than pi/4 from another, rad; anchors of other
     storeys' rooms mean nothing."""
     grid, nav = map.grid, map.navigable
-    masks, ceiling = _columns(map, storey)
-    turn = wall_direction(_middles(grid.origin, np.argwhere(masks[0]), grid.edge))
+    masks, ceiling = _classify_columns(map, storey)
+    turn = estimate_wall_direction(_compute_middles(grid.origin, np.argwhere(masks[0]), grid.edge))
     turn = near + (turn - near + np.pi / 4) % (np.pi / 2) - np.pi / 4
     origin, edge = scale * grid.origin, scale * grid.edge
-    wall, low, high, explored = (_points(origin, np.argwhere(mask), edge, turn) for mask in masks)
+    wall, low, high, explored = (_sample_column_points(origin, np.argwhere(mask), edge, turn) for mask in masks)
     inside = np.flatnonzero((map.navigable_room >= 0) & (map.rooms["storey"][np.maximum(map.navigable_room, 0)] == storey))
-    ground = _points(scale * nav.origin, nav.cells[inside, :2], scale * nav.edge, turn)
+    ground = _sample_column_points(scale * nav.origin, nav.cells[inside, :2], scale * nav.edge, turn)
     label = np.repeat(map.navigable_room[inside], len(ground) // max(len(inside), 1))
-    raster = _raster(np.concatenate([explored, ground]))
-    shares = [raster.share(points, _spacing(edge)) for points in (wall, low, high, explored)]
+    raster = _build_raster(np.concatenate([explored, ground]))
+    shares = [raster.compute_share(points, _compute_spacing(edge)) for points in (wall, low, high, explored)]
     columns = np.argwhere(np.isfinite(ceiling))
-    roofs = _points(origin, columns, edge, turn)
+    roofs = _sample_column_points(origin, columns, edge, turn)
     heights = np.repeat(ceiling[tuple(columns.T)], len(roofs) // max(len(columns), 1))
-    ceilings = np.minimum(raster.mean(roofs, heights) / CEILING_UNIT, 255).round()
-    doors = 255 * raster.near(_turned(scale * _doors(map, storey), turn), DOOR_RADIUS)
-    planes = np.stack([shares[0], raster.share(ground, _spacing(scale * nav.edge)), *shares[1:], ceilings, doors], axis=-1)
-    middles, of_rooms = scale * map.rooms["centroid"], scale * _doors_of_rooms(map).reshape(-1, 2)
-    anchor = (_turned(middles[:, :2], turn) - raster.corner) / SHEET_PIXEL
-    doors_of = (_turned(of_rooms, turn).reshape(-1, MOST_DOORS, 2) - raster.corner) / SHEET_PIXEL
+    ceilings = np.minimum(raster.compute_mean(roofs, heights) / CEILING_UNIT, 255).round()
+    doors = 255 * raster.find_near(_rotate_points(scale * _locate_doors(map, storey), turn), DOOR_RADIUS)
+    planes = np.stack(
+        [shares[0], raster.compute_share(ground, _compute_spacing(scale * nav.edge)), *shares[1:], ceilings, doors], axis=-1
+    )
+    middles, of_rooms = scale * map.rooms["centroid"], scale * _locate_room_doors(map).reshape(-1, 2)
+    anchor = (_rotate_points(middles[:, :2], turn) - raster.corner) / SHEET_PIXEL
+    doors_of = (_rotate_points(of_rooms, turn).reshape(-1, MOST_DOORS, 2) - raster.corner) / SHEET_PIXEL
     rooms = raster.label(ground, label, np.column_stack([map.rooms["centroid"], map.rooms["area"]]))
     return Sheet(planes.astype(np.uint8), rooms, anchor.astype(np.float32), doors_of.astype(np.float32), np.array([turn]))
 
 
-def _columns(map: TopometricMap, storey: int) -> tuple[tuple[Array, ...], Array]:
+def _classify_columns(map: TopometricMap, storey: int) -> tuple[tuple[Array, ...], Array]:
     """Which columns (nx, ny) of a storey's cells are walls, low things, high things, and seen at all; and how high above the
     floor, m, the highest cell of each stands that may be a ceiling, -inf where none does."""
-    grid, (floor, limit) = map.grid, _levels(map, storey)
+    grid, (floor, limit) = map.grid, _measure_levels(map, storey)
     ix, iy = np.ascontiguousarray(grid.cells[:, :2].T.astype(np.int64))
     z = grid.origin[2] + (grid.cells[:, 2] + 0.5) * grid.edge - floor
     z = np.where((z > -BELOW_FLOOR) & (z < limit), z, np.nan)
     shape = grid.shape[:2]
-    profile = column_bits(ix, iy, z, np.zeros(shape), -HEIGHT_BANDS.below * HEIGHT_BANDS.step, HEIGHT_BANDS.step)
-    filled = band_stack(profile, HEIGHT_BANDS, WALL_HEIGHTS)
-    wall = wall_columns(filled[observed_bands(filled)], WALL_RULE)
-    low, high = (_between(profile, *h) & ~wall for h in ((BODY_HEIGHTS[0], FURNITURE_STEP), (FURNITURE_STEP, BODY_HEIGHTS[1])))
+    profile = compute_column_bits(ix, iy, z, np.zeros(shape), -HEIGHT_BANDS.below * HEIGHT_BANDS.step, HEIGHT_BANDS.step)
+    filled = build_band_stack(profile, HEIGHT_BANDS, WALL_HEIGHTS)
+    wall = detect_wall_columns(filled[is_observed_band(filled)], WALL_RULE)
+    low, high = (_is_between(profile, *h) & ~wall for h in ((BODY_HEIGHTS[0], FURNITURE_STEP), (FURNITURE_STEP, BODY_HEIGHTS[1])))
     ceiling, above = np.full(shape, -np.inf), z >= UPRIGHT
     np.maximum.at(ceiling, (ix[above], iy[above]), z[above])
     return (wall, low, high, profile > 0), np.where(wall, -np.inf, ceiling)
 
 
-def _levels(map: TopometricMap, storey: int) -> tuple[float, float]:
+def _measure_levels(map: TopometricMap, storey: int) -> tuple[float, float]:
     """Height of a storey's floor, m, and how far above it the storey ends."""
     row = map.storeys[storey]
     floor = float(row["floor"]) if np.isfinite(row["floor"]) else float(row["ceiling"]) - USUAL_HEIGHT
@@ -135,19 +137,19 @@ def _levels(map: TopometricMap, storey: int) -> tuple[float, float]:
     return floor, min(float(above.min()) - floor - map.grid.edge, HIGHEST) if len(above) else HIGHEST
 
 
-def _between(profile: Array, low: float, high: float) -> Array:
-    out: Array = (profile & profile.dtype.type(HEIGHT_BANDS.mask(low, high))) != 0
+def _is_between(profile: Array, low: float, high: float) -> Array:
+    out: Array = (profile & profile.dtype.type(HEIGHT_BANDS.build_mask(low, high))) != 0
     return out
 
 
-def _doors(map: TopometricMap, storey: int) -> Array:
+def _locate_doors(map: TopometricMap, storey: int) -> Array:
     """(n, 2) m, middles of the doors of a storey's rooms."""
     edges = map.open_edges
     centres: Array = edges["centre"][(map.rooms["storey"][edges["rooms"]] == storey).any(axis=1), :2]
     return centres
 
 
-def _doors_of_rooms(map: TopometricMap) -> Array:
+def _locate_room_doors(map: TopometricMap) -> Array:
     """(R, MOST_DOORS, 2) m, doors of each room, those nearest to its middle first; nan where it has fewer."""
     edges = map.open_edges
     room, centre = edges["rooms"].T.reshape(-1), np.tile(edges["centre"][:, :2], (2, 1))
@@ -161,7 +163,7 @@ def _doors_of_rooms(map: TopometricMap) -> Array:
     return out
 
 
-def wall_direction(walls: Array) -> float:
+def estimate_wall_direction(walls: Array) -> float:
     """The direction in [0, pi/2), rad, along which walls (n, 2), m, line up: that in which they fall into the fewest, fullest
     bins of both axes; 0 without any."""
     if not len(walls):
@@ -171,42 +173,42 @@ def wall_direction(walls: Array) -> float:
     best, around = 0.0, np.pi / 4
     for step in TURN_STEPS:
         turns = best + np.arange(-round(around / step), round(around / step)) * step
-        best = float(turns[int(np.argmax([_sharpness(walls, float(turn)) for turn in turns]))])
+        best = float(turns[int(np.argmax([_measure_sharpness(walls, float(turn)) for turn in turns]))])
         around = step
     return best % (np.pi / 2)
 
 
-def _sharpness(walls: Array, turn: float) -> float:
+def _measure_sharpness(walls: Array, turn: float) -> float:
     """Sum of squares of how many walls fall into each bin of both axes; bins are blurred, so that none is cut in two."""
     total = 0.0
-    for values in _turned(walls, turn).T:
+    for values in _rotate_points(walls, turn).T:
         counts = np.bincount(np.floor((values - values.min()) / BIN).astype(np.int64)).astype(float)
         total += float((counts**2).sum() + (counts[1:] * counts[:-1]).sum())
     return total
 
 
-def _turned(points: Array, turn: float) -> Array:
+def _rotate_points(points: Array, turn: float) -> Array:
     """Points (n, 2) of the map's frame in that of its walls."""
     c, s = np.cos(turn), np.sin(turn)
     out: Array = points @ np.array([[c, -s], [s, c]])
     return out
 
 
-def _middles(origin: Array, columns: Array, edge: float) -> Array:
+def _compute_middles(origin: Array, columns: Array, edge: float) -> Array:
     out: Array = origin[:2] + (columns + 0.5) * edge
     return out
 
 
-def _spacing(edge: float) -> float:
+def _compute_spacing(edge: float) -> float:
     return edge / max(int(np.ceil(edge / BIN - 1e-6)), 1)
 
 
-def _points(origin: Array, columns: Array, edge: float, turn: float) -> Array:
+def _sample_column_points(origin: Array, columns: Array, edge: float, turn: float) -> Array:
     """Points of columns (n, 2), no farther apart than `BIN`, in the frame of the walls: those of a column behind each other."""
-    spacing = _spacing(edge)
+    spacing = _compute_spacing(edge)
     steps = (np.arange(round(edge / spacing)) + 0.5) * spacing - edge / 2
     grid = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-    return _turned((_middles(origin, columns, edge)[:, None] + grid[None]).reshape(-1, 2), turn)
+    return _rotate_points((_compute_middles(origin, columns, edge)[:, None] + grid[None]).reshape(-1, 2), turn)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,25 +218,25 @@ class _Raster:
     corner: Array
     size: tuple[int, int]
 
-    def pixel(self, points: Array) -> Array:
-        """(n,) number of the pixel of each point."""
+    def find_pixels(self, points: Array) -> Array:
+        """Return (n,) number of the pixel of each point."""
         x, y = np.floor((points - self.corner) / SHEET_PIXEL + TIE).astype(np.int64).T
         return np.asarray(np.clip(x, 0, self.size[0] - 1) * self.size[1] + np.clip(y, 0, self.size[1] - 1))
 
     def count(self, points: Array, weight: Array | None = None) -> Array:
-        """Points in each pixel, or the sum of their weights."""
-        return np.bincount(self.pixel(points), weight, self.size[0] * self.size[1]).reshape(self.size)
+        """Return points in each pixel, or the sum of their weights."""
+        return np.bincount(self.find_pixels(points), weight, self.size[0] * self.size[1]).reshape(self.size)
 
-    def share(self, points: Array, spacing: float) -> Array:
+    def compute_share(self, points: Array, spacing: float) -> Array:
         """0 to 255: how much of a pixel points cover that stand so far apart."""
         return np.minimum(self.count(points) * (spacing / SHEET_PIXEL) ** 2 / FULL_SHARE, 1.0) * 255
 
-    def mean(self, points: Array, values: Array) -> Array:
-        """Mean of the values of its points; 0 where there is none."""
+    def compute_mean(self, points: Array, values: Array) -> Array:
+        """Return mean of the values of its points; 0 where there is none."""
         return np.asarray(self.count(points, values) / np.maximum(self.count(points), 1))
 
-    def near(self, points: Array, radius: float) -> Array:
-        """(size) bool: which pixels' middles are no farther from any of a few points."""
+    def find_near(self, points: Array, radius: float) -> Array:
+        """Return (size) bool: which pixels' middles are no farther from any of a few points."""
         out = np.zeros(self.size, bool)
         middles = [self.corner[k] + (np.arange(n) + 0.5) * SHEET_PIXEL for k, n in enumerate(self.size)]
         for x, y in points:
@@ -247,14 +249,14 @@ class _Raster:
         out = np.full(self.size[0] * self.size[1], -1, np.int16)
         if len(points):
             count = int(labels.max()) + 1
-            pair, votes = np.unique(self.pixel(points) * count + labels, return_counts=True)
+            pair, votes = np.unique(self.find_pixels(points) * count + labels, return_counts=True)
             order = np.lexsort((*order_by[pair % count].T, votes))  # the last one written has most votes
             pixel, label = np.divmod(pair[order], count)
             out[pixel] = label
         return out.reshape(self.size)
 
 
-def _raster(points: Array) -> _Raster:
+def _build_raster(points: Array) -> _Raster:
     """Pixels that hold points (n, 2), m, with their middle in their own, so that a turned map has the same pixels, turned."""
     points = points if len(points) else np.zeros((1, 2))
     size = np.floor(np.ptp(points, axis=0) / SHEET_PIXEL).astype(int) + 1

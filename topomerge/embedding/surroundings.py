@@ -14,7 +14,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from topomerge.kernels.crops import cut
+from topomerge.kernels.images import cut
 from topomerge.types import Array
 
 # Parts of a geometry that read crops, and the names of these among the tensors of a graph.
@@ -35,11 +35,11 @@ CROP_SHAPES = {  # of each room
 TIE = 1e-3  # pixels: what lies on a border falls to the same side wherever a map's origin is
 
 
-def crops(map_sheet: Mapping[str, Array], part: str = CROP_PART, rooms: Array | None = None) -> Array:
-    """(n, *CROP_SHAPES[part]) uint8: the surroundings of rooms; of doors that one does not have, nothing.
+def cut_crops(map_sheet: Mapping[str, Array], part: str = CROP_PART, rooms: Array | None = None) -> Array:
+    """Return (n, *CROP_SHAPES[part]) uint8: the surroundings of rooms; of doors that one does not have, nothing.
 
     Args:
-        map_sheet: what `sheets.sheet_arrays` gave; "door_anchor" is read for crops of doors only.
+        map_sheet: what `sheets.build_sheet_arrays` gave; "door_anchor" is read for crops of doors only.
         rooms: (n,) numbers of those that are wanted; all if left out.
     """
     anchor = np.asarray(map_sheet["anchor"])
@@ -68,7 +68,7 @@ def _cut(map_sheet: Mapping[str, Array], middles: Array, number: Array, side: in
     return out
 
 
-def quarter_turned_crops(part: str, shown: Array, turns: int) -> Array:
-    """Crops of a map that is turned by so many quarter turns, counter-clockwise seen from above."""
+def rotate_crops(part: str, shown: Array, turns: int) -> Array:
+    """Return crops of a map that is turned by so many quarter turns, counter-clockwise seen from above."""
     axes = (1, 2) if len(CROP_SHAPES[part]) == 3 else (2, 3)
     return np.rot90(shown, turns, axes)

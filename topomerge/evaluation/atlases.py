@@ -19,17 +19,17 @@ from typing import Any
 import numpy as np
 
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.core.builder import one_thread
+from topomerge.datasets.core.builder import limit_threads
 from topomerge.datasets.pairs.atlases import make_atlas
-from topomerge.datasets.pairs.evaluation_pair import sim3_of
+from topomerge.datasets.pairs.evaluation_pair import convert_to_sim3
 from topomerge.datasets.pairs.pairs import Atlas
-from topomerge.datasets.plans.splits import seeds
+from topomerge.datasets.plans.splits import get_seed_range
 from topomerge.errors import InputError
-from topomerge.evaluation.markdown import write_table
-from topomerge.evaluation.tasks import Row, Say, TaskSettings, measure_missing
+from topomerge.evaluation.documents import write_table
+from topomerge.evaluation.tasks import LogFn, Row, TaskSettings, measure_missing
 from topomerge.extraction.extract import extract
 from topomerge.fusion.atlas.result import AtlasResult
-from topomerge.fusion.atlas.solve import atlas
+from topomerge.fusion.atlas.solve import build_atlas
 from topomerge.io.maps import save_map
 from topomerge.matching.poses import pose_difference
 from topomerge.types import Array, Sim3
@@ -76,12 +76,12 @@ def list_inputs(settings: Settings) -> list[str]:
     return [str(one) for one in list_sets(settings)]
 
 
-def measure(settings: Settings, say: Say) -> list[Row]:
+def measure(settings: Settings, log_line: LogFn) -> list[Row]:
     """Measure the sets that are missing."""
     cache = Path(settings.cache) / "atlas"
     items = {f"{size:02d}_{number:02d}": (split, size, number, cache) for split, size, number in list_sets(settings)}
     path = Path(settings.cache) / "evaluation" / f"atlases_{settings.data.set or 'train'}.jsonl"
-    return measure_missing(path, items, measure_set, say, settings)
+    return measure_missing(path, items, measure_set, log_line, settings)
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def draw_set(split: str, maps: int, number: int) -> tuple[Atlas, Atlas | None]:
     names = sorted(ATLAS_SENSORS)
     weight = np.array([ATLAS_SENSORS[n] for n in names], float)
     sensors = rng.choice(names, maps, p=weight / weight.sum()).tolist()
-    first, last = seeds(split)
+    first, last = get_seed_range(split)
     for _ in range(20):
         kind, seed = str(rng.choice(ATLAS_KINDS)), int(rng.integers(first, last))
         rooms = int(rng.integers(ATLAS_ROOMS[0], ATLAS_ROOMS[1] + 1))
@@ -119,7 +119,7 @@ def make_set(split: str, maps: int, number: int, cache: Path) -> Path:
     if (folder / "truth.json").exists():
         return folder
     folder.mkdir(parents=True, exist_ok=True)
-    with one_thread():
+    with limit_threads():
         atlas, other = draw_set(split, maps, number)
         clouds = list(atlas.maps)
         truth: list[Array | None] = [t.matrix for t in atlas.truth]
@@ -142,7 +142,7 @@ def make_set(split: str, maps: int, number: int, cache: Path) -> Path:
 def load_set(folder: Path) -> AtlasSet:
     """A set that was made."""
     about = json.loads((folder / "truth.json").read_text())
-    truth = tuple(None if t is None else sim3_of(np.array(t)) for t in about.pop("truth"))
+    truth = tuple(None if t is None else convert_to_sim3(np.array(t)) for t in about.pop("truth"))
     return AtlasSet(folder.name, tuple(sorted(folder.glob("map_*.tmap"))), truth, about)
 
 
@@ -157,7 +157,7 @@ def errors(made: AtlasSet, result: AtlasResult) -> dict[int, tuple[float, float]
             if one is None or two is None:
                 out[k] = None
                 continue
-            true, middle = one.inverse() @ two, result.maps[k].grid.centroids().mean(axis=0)
+            true, middle = one.inverse() @ two, result.maps[k].grid.compute_centroids().mean(axis=0)
             off = result.transforms[k].apply(middle[None])[0] - true.apply(middle[None])[0]
             flat = "laser2d" in (sensors[first], sensors[k])
             out[k] = (float(np.linalg.norm(off[:2] if flat else off)), pose_difference(true, result.transforms[k], middle)[1])
@@ -168,7 +168,7 @@ def measure_set(split: str, maps: int, number: int, cache: Path) -> Row:
     """Make one set and put its maps together."""
     made = load_set(make_set(split, maps, number, cache))
     began = process_time()
-    result = atlas(made.files)
+    result = build_atlas(made.files)
     seconds = process_time() - began
     off = errors(made, result)
     right = [k for k, e in off.items() if e is not None and e[0] < RIGHT[0] and e[1] < RIGHT[1]]

@@ -90,7 +90,7 @@ def dev() -> list[Case]:
     return [*out, Case("dev", "campus", "office/AtlanticSuites", "lidar", 1, rooms=15)]
 
 
-def simulated() -> list[Case]:
+def simulate_scan() -> list[Case]:
     """Every kind of building by every sensor."""
     return [
         Case(f"by {sensor}", "procedural", kind, sensor, TEST + 10 * i + 2, rooms=ROOM_NUMBERS)
@@ -176,20 +176,20 @@ def look() -> list[Case]:
 def peers() -> list[Case]:
     """What the classic methods are compared on: every grid with true rooms, and scans from above of each sensor that sees more
     than a slice."""
-    scans = [*simulated(), *(case for case in plans() if case.source == "campus")]
+    scans = [*simulate_scan(), *(case for case in plans() if case.source == "campus")]
     return [*grids(), *(case for case in scans if case.sensor != "laser2d")]
 
 
-GROUPS: dict[str, Callable[[], list[Case]]] = {f.__name__: f for f in (dev, simulated, hard, plans, grids, ifc, pairs, look)}
+GROUPS: dict[str, Callable[[], list[Case]]] = {f.__name__: f for f in (dev, simulate_scan, hard, plans, grids, ifc, pairs, look)}
 # "all" leaves these out: it holds their cases already, or they are for development.
 SELECTIONS: dict[str, Callable[[], list[Case]]] = {"peers": peers, "homes": homes}
 
 
 def select_cases(names: Iterable[str], limit: int | None = None) -> list[Case]:
     """Select cases of groups ("all": all but `dev`), `limit` of each set; of a pair both."""
-    wanted = list(names)
-    groups: list[Any] = [g for name, g in GROUPS.items() if name in wanted or ("all" in wanted and name != "dev")]
-    groups += [g for name, g in SELECTIONS.items() if name in wanted]
+    requested = list(names)
+    groups: list[Any] = [g for name, g in GROUPS.items() if name in requested or ("all" in requested and name != "dev")]
+    groups += [g for name, g in SELECTIONS.items() if name in requested]
     out: list[Case] = []
     for group in groups:
         count: dict[str, int] = {}

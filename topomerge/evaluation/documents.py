@@ -1,22 +1,20 @@
-"""Generated blocks of documents: written between their marks with what made them, and found again once that has changed.
-
-A block stands between ``<!-- NAME:begin -->`` and ``<!-- NAME:end -->``. Its first line is a stamp, a comment that names the
-command, a digest of the code and weights behind it (`code_digest`) and one of its inputs. `results_check` computes both digests
-anew, which takes seconds and measures nothing. A block without a stamp, or with the commit that it was measured at instead,
-is stale.
-"""
+"""Figures in documents: written between marks, drawn as tables, and told stale by digest."""
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from topomerge.code_digest import code_digest
+import numpy as np
+
+from topomerge.code_digest import compute_code_digest
 from topomerge.errors import InputError
-from topomerge.io.atomic import replacing
+from topomerge.io.archive import replace_on_success
+from topomerge.statistics import format_interval
 
 ROOT = Path(__file__).parent.parent.parent
 BLOCK = re.compile(r"<!-- ([\w-]+):begin -->\n(.*?)<!-- \1:end -->", re.DOTALL)
@@ -49,7 +47,7 @@ class Stamp:
 def build_stamp(command: str, modules: Iterable[str], inputs: Iterable[str] = ()) -> Stamp:
     """Build the stamp of what this state of the code makes of these inputs."""
     names = tuple(modules)
-    return Stamp(command, names, code_digest(*names), digest_inputs(inputs))
+    return Stamp(command, names, compute_code_digest(*names), digest_inputs(inputs))
 
 
 def digest_inputs(inputs: Iterable[str]) -> str:
@@ -80,7 +78,7 @@ def write_blocks(page: Path, blocks: Mapping[str, str], stamp: Stamp) -> list[st
             written.append(name)
     if not written:
         raise InputError(f"{page}: has no marks of {', '.join(blocks)}; put <!-- NAME:begin --> and <!-- NAME:end --> into it")
-    with replacing(page) as beside:
+    with replace_on_success(page) as beside:
         beside.write_text(text, encoding="utf-8")
     return written
 
@@ -88,3 +86,45 @@ def write_blocks(page: Path, blocks: Mapping[str, str], stamp: Stamp) -> list[st
 def list_pages(root: Path = ROOT) -> list[Path]:
     """List the README and all pages of the documentation."""
     return [root / "README.md", *sorted((root / "docs").rglob("*.md"))]
+
+
+Row = dict[str, Any]
+
+
+def write_table(heads: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
+    """Write a table."""
+    return "\n".join([write_line(heads), "|" + "---|" * len(heads), *map(write_line, lines)])
+
+
+def write_line(cells: Sequence[object]) -> str:
+    """Write a line of a table."""
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def write_mean(rows: Sequence[Row], key: str) -> str:
+    """Write the mean of a value with its 95 % interval over places (`format_interval`)."""
+    return format_interval(np.array([float(r.get(key, np.nan)) for r in rows]), np.array([r["place"] for r in rows]))
+
+
+def compute_mean(rows: Sequence[Row], key: str) -> str:
+    """Write the mean of a value alone."""
+    return re.split(r"[, ]", write_mean(rows, key))[0]
+
+
+def write_share(counts: Iterable[int]) -> str:
+    """Write right ones of all: 0.95 (19 of 20)."""
+    right, every = counts
+    return f"{right / every:.2f} ({right} of {every})" if every else "none"
+
+
+def write_medians(errors: Iterable[Any]) -> list[str]:
+    """Write the median of each array of errors; – where nothing was compared."""
+    return [f"{np.nanmedian(e):.2f}" if np.isfinite(e).any() else "–" for e in map(np.asarray, errors)]
+
+
+def group_rows(rows: Iterable[Row], key: Callable[[Row], str]) -> dict[str, list[Row]]:
+    """Group rows in the order in which they come."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(key(row), []).append(row)
+    return groups

@@ -17,14 +17,14 @@ from time import process_time
 
 import numpy as np
 
-from topomerge.code_digest import code_digest
+from topomerge.code_digest import compute_code_digest
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.core.difficulty import Difficulty
-from topomerge.datasets.simulation.floor_truth import judge
+from topomerge.datasets.core.building import Difficulty
+from topomerge.datasets.simulation.floor_truth import evaluate_map
 from topomerge.evaluation.cases import BUILDING_KINDS
-from topomerge.evaluation.markdown import write_share, write_table
+from topomerge.evaluation.documents import write_share, write_table
 from topomerge.evaluation.scans import Case, Scan, load_scan
-from topomerge.evaluation.tasks import Row, Say, TaskSettings, find_optional_data, limit_cases, measure_missing
+from topomerge.evaluation.tasks import LogFn, Row, TaskSettings, find_optional_data, limit_cases, measure_missing
 from topomerge.extraction.extract import extract
 from topomerge.metrics import match_places
 from topomerge.types import Array, TopometricMap
@@ -59,13 +59,13 @@ def list_inputs(settings: TaskSettings) -> list[str]:
     return [case.key for case in limit_cases(draw_cases(settings.data.set == "dev"), settings)]
 
 
-def measure(settings: TaskSettings, say: Say) -> list[Row]:
+def measure(settings: TaskSettings, log_line: LogFn) -> list[Row]:
     """Measure each scan by the plan alone, and by plan and walls."""
     scans, data = Path(settings.cache) / "scans", find_optional_data()
     cases = limit_cases(draw_cases(settings.data.set == "dev"), settings)
     items = {f"{case.key} {how}": (case, how, scans, data) for case in cases for how in SHOWN_BY}
     path = Path(settings.cache) / "evaluation" / "doors.jsonl"
-    return measure_missing(path, items, measure_case, say, settings, code_digest(*MAKERS, __name__))
+    return measure_missing(path, items, measure_case, log_line, settings, compute_code_digest(*MAKERS, __name__))
 
 
 def measure_case(case: Case, how: str, scans: Path, data: Path | None) -> Row:
@@ -80,16 +80,16 @@ def score_doors(case: Case, scan: Scan, how: str) -> Row:
     began = process_time()
     map = extract(replace(scan.cloud, colors=None), walls=how != PLAN)
     row: Row = {"how": how, "sensor": case.sensor, "seconds": process_time() - began}
-    verdict = judge(map, truth)
+    verdict = evaluate_map(map, truth)
     row |= {"edges": [verdict.edges.precision, verdict.edges.recall], "iou": verdict.rooms.iou}
     state = make_building(case.building, case.seed, case.storeys, Difficulty(**dict(case.difficulty))).doors["state"]
-    wanted = find_between_visited(scan)
+    requested = find_between_visited(scan)
     edges = map.edges[np.isin(map.edges["kind"], ("door", "opening"))]
-    pairs = match_places(truth.doors[:, 2:], truth.place(edges["centre"]))
+    pairs = match_places(truth.doors[:, 2:], truth.transform_to_building(edges["centre"]))
     there = np.zeros(len(truth.doors), bool)
     there[pairs[:, 0]] = True
     for name in STATES:
-        own = wanted & (state == name)
+        own = requested & (state == name)
         row[name] = [int((there & own).sum()), int(own.sum())]
     row["right"] = [verdict.doors.right, verdict.doors.extracted]
     said_shut = ~edges["open"] & ~find_looked_into(map, edges)
@@ -105,8 +105,8 @@ def find_between_visited(scan: Scan) -> Array:
     """Find the doors between two rooms that were visited: (D,) bool."""
     assert scan.truth is not None
     ends = scan.truth.doors[:, :2].astype(np.int64)
-    wanted: Array = ((ends >= 0) & np.append(scan.truth.visited, False)[ends]).all(axis=1)
-    return wanted
+    requested: Array = ((ends >= 0) & np.append(scan.truth.visited, False)[ends]).all(axis=1)
+    return requested
 
 
 def find_looked_into(map: TopometricMap, edges: Array) -> Array:

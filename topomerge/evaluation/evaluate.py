@@ -10,32 +10,39 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from topomerge.code_digest import code_digest
+from topomerge.code_digest import compute_code_digest
 from topomerge.datasets.pairs.build import Build, build
+from topomerge.datasets.pairs.items import Recipe
 from topomerge.datasets.pairs.own_pairs import build_own_sets, check_own_path
-from topomerge.datasets.pairs.recipe import Recipe
-from topomerge.datasets.real.maps import real_evaluation_pairs
+from topomerge.datasets.real.maps import build_real_pairs
 from topomerge.errors import InputError
 from topomerge.evaluation.figures import save_figures
-from topomerge.evaluation.merge_tables import chosen, decides, independence, merging, reliability, sites
+from topomerge.evaluation.merge_tables import (
+    select_last_variant,
+    tabulate_descriptor_effect,
+    tabulate_independence,
+    tabulate_merging,
+    tabulate_reliability,
+    tabulate_sites,
+)
 from topomerge.evaluation.predict import CODE, predict_all
 from topomerge.evaluation.score import Row, score_all
-from topomerge.evaluation.settings import Evaluation, check, difference, folder_of, prediction_settings
+from topomerge.evaluation.settings import Evaluation, check, collect_prediction_settings, find_difference, get_folder
 from topomerge.evaluation.tables import (
     BY,
     Table,
-    beside,
-    curves,
-    grouped,
-    long_rows,
-    matching,
-    ranking,
+    iter_long_rows,
+    tabulate_groups,
+    tabulate_matching,
+    tabulate_methods,
+    tabulate_ranking,
+    tabulate_robustness,
     write_csv,
     write_section,
 )
-from topomerge.io.atomic import replacing
+from topomerge.io.archive import replace_on_success
 
-Say = Callable[[str], None]
+LogFn = Callable[[str], None]
 OF_MERGES = ("merging", "kinds", "decides", "sites", "independence", "reliability")  # tables that there are where maps are merged
 
 
@@ -50,45 +57,47 @@ class Scores:
     folder: Path
 
 
-def evaluate(settings: Evaluation, say: Say = lambda text: None, command: str = "") -> Scores:
+def evaluate(settings: Evaluation, log_line: LogFn = lambda text: None, command: str = "") -> Scores:
     """Make the pairs and the predictions that are missing, score them, and write tables and figures.
 
     Args:
-        say: is told the progress.
+        log_line: is told the progress.
         command: that led here, for the report.
 
     Raises:
         InputError: settings that nothing can be made of, or a folder that was made with others.
     """
     check(settings)
-    settings = with_own_pairs(settings, say)
-    folder = folder_of(settings)
-    claim(folder, prediction_settings(settings))
-    pairs = listed_pairs(folder / "pairs.json", settings, say)
+    settings = with_own_pairs(settings, log_line)
+    folder = get_folder(settings)
+    claim(folder, collect_prediction_settings(settings))
+    pairs = list_pairs(folder / "pairs.json", settings, log_line)
     if not pairs:
         raise InputError(f"{settings.data.name}: no pair could be made; see the reasons above")
-    files = predict_all(pairs, folder / "predictions", settings, say)
+    files = predict_all(pairs, folder / "predictions", settings, log_line)
     matches, ranks, merges = score_all(pairs, files, settings)
-    old = {r["pair"] for r in (*ranks, *merges) if r["code"] != code_digest(*CODE)}
+    old = {r["pair"] for r in (*ranks, *merges) if r["code"] != compute_code_digest(*CODE)}
     if old:
-        say(f"{len(old)} of {len(files)} pairs were predicted by another version of the code; remake=true predicts them again")
-    parts = report(matches, ranks, merges, settings)
+        log_line(
+            f"{len(old)} of {len(files)} pairs were predicted by another version of the code; remake=true predicts them again"
+        )
+    parts = tabulate_all(matches, ranks, merges, settings)
     figures = save_figures(ranks, matches, merges, folder)
-    head = _about(ranks, merges, settings, command)
+    head = _describe_evaluation(ranks, merges, settings, command)
     images = "\n".join(f"![]({name})" for name in figures)
-    _write(folder / "report.md", "\n\n".join([f"# {folder.name}", head, *(t.markdown() for t in parts), images]))
-    _write(folder / "tables.tex", "\n\n".join(t.latex() for t in parts))
-    write_csv(list(long_rows(ranks, matches, merges, settings)), folder / "scores.csv")
+    _write(folder / "report.md", "\n\n".join([f"# {folder.name}", head, *(t.format_markdown() for t in parts), images]))
+    _write(folder / "tables.tex", "\n\n".join(t.format_latex() for t in parts))
+    write_csv(list(iter_long_rows(ranks, matches, merges, settings)), folder / "scores.csv")
     for name, rows in (("matches", matches), ("ranks", ranks), ("merges", merges)):
         write_csv(rows, folder / f"{name}.csv")
-    summary = "\n\n".join([head, *(t.markdown() for t in short(matches, ranks, merges, settings))])
+    summary = "\n\n".join([head, *(t.format_markdown() for t in tabulate_short(matches, ranks, merges, settings))])
     if settings.write:
         write_section(Path(settings.write), settings.section, summary)
     return Scores(matches, ranks, merges, summary, folder)
 
 
 def _write(path: Path, text: str) -> None:
-    with replacing(path) as beside:
+    with replace_on_success(path) as beside:
         beside.write_text(text + "\n", encoding="utf-8")
 
 
@@ -96,7 +105,7 @@ def claim(folder: Path, plain_settings: dict[str, Any]) -> None:
     """Take a folder for an evaluation: a new one, or one that was made with the same settings.
 
     Args:
-        plain_settings: of `prediction_settings`.
+        plain_settings: of `collect_prediction_settings`.
 
     Raises:
         InputError: it was made with others; the first key that differs is named.
@@ -107,7 +116,7 @@ def claim(folder: Path, plain_settings: dict[str, Any]) -> None:
             before = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise InputError(f"{path}: damaged ({error}); take another folder with name=...") from error
-        if mismatch := difference(before, plain_settings):
+        if mismatch := find_difference(before, plain_settings):
             raise InputError(
                 f"{folder}: was made with other settings ({mismatch}); take another folder with name=..., or delete it"
             )
@@ -118,18 +127,18 @@ def claim(folder: Path, plain_settings: dict[str, Any]) -> None:
     _write(path, json.dumps(plain_settings, indent=1, sort_keys=True))
 
 
-def listed_pairs(listed: Path, settings: Evaluation, say: Say) -> list[Path]:
-    """The pairs of `pairs_of`; once they are all made, a list of them is kept: reading all plans again takes its time."""
+def list_pairs(listed: Path, settings: Evaluation, log_line: LogFn) -> list[Path]:
+    """The pairs of `build_pairs`; once they are all made, a list of them is kept: reading all plans again takes its time."""
     if listed.exists():
         files = [Path(settings.cache) / name for name in json.loads(listed.read_text(encoding="utf-8"))]
         if all(file.exists() for file in files):
             return files
-    files = pairs_of(settings, say)
+    files = build_pairs(settings, log_line)
     _write(listed, json.dumps([Path(os.path.relpath(f, settings.cache)).as_posix() for f in files], indent=0))
     return files
 
 
-def with_own_pairs(settings: Evaluation, say: Say) -> Evaluation:
+def with_own_pairs(settings: Evaluation, log_line: LogFn) -> Evaluation:
     """Name the set of a folder of one's own captures by a hash of all that it is made of; `path` becomes its manifest.
 
     Raises:
@@ -139,7 +148,7 @@ def with_own_pairs(settings: Evaluation, say: Say) -> Evaluation:
     if not settings.path:
         return settings
     cache = Path(settings.cache)
-    manifests = build_own_sets(settings.path, own_cache(cache), settings.jobs, say).manifests
+    manifests = build_own_sets(settings.path, own_cache(cache), settings.jobs, log_line).manifests
     part = {"validation": "val"}.get(settings.data.split, settings.data.split)
     if part not in manifests:
         raise InputError(f"data.split={settings.data.split}: {', '.join(manifests)} are possible of data=folder")
@@ -157,54 +166,62 @@ def list_files(manifest: Path) -> list[Path]:
     return [manifest.parent / "pairs" / row["file"] for row in rows]
 
 
-def pairs_of(settings: Evaluation, say: Say) -> list[Path]:
-    """Files of the kept pairs, made where they are missing."""
+def build_pairs(settings: Evaluation, log_line: LogFn) -> list[Path]:
+    """Return files of the kept pairs, made where they are missing."""
     data = settings.data
     if settings.path:
         return list_files(Path(settings.path))[: settings.limit or None]
     if data.real:
-        real_pairs = real_evaluation_pairs(data.folder, Path(settings.cache), data.real, data.voxel_size, say)
+        real_pairs = build_real_pairs(data.folder, Path(settings.cache), data.real, data.voxel_size, log_line)
         return real_pairs[: settings.limit or None]
     if not data.maps:
         raise InputError(f"{data.name}: its maps are not kept; set data.maps=true")
     pairs = min(settings.limit, data.pairs) if settings.limit else data.pairs
     name = f"{data.name}-first{pairs}" if pairs < data.pairs else data.name  # the manifest of all pairs stays as it is
     recipe = Recipe(**{f.name: getattr(replace(data, pairs=pairs, name=name), f.name) for f in fields(Recipe)})
-    manifest = build(Build(recipe, settings.cache, settings.jobs), say).manifest
+    manifest = build(Build(recipe, settings.cache, settings.jobs), log_line).manifest
     return list_files(manifest)
 
 
-def report(matches: list[Row], ranks: list[Row], merges: list[Row], settings: Evaluation) -> list[Table]:
-    """All tables."""
-    tables = [ranking(ranks, settings), matching(matches, settings)] if ranks else []
-    tables += [grouped(ranks, matches, key, settings) for key in BY if ranks]
+def tabulate_all(matches: list[Row], ranks: list[Row], merges: list[Row], settings: Evaluation) -> list[Table]:
+    """Return all tables."""
+    tables = [tabulate_ranking(ranks, settings), tabulate_matching(matches, settings)] if ranks else []
+    tables += [tabulate_groups(ranks, matches, key, settings) for key in BY if ranks]
     if merges:
-        tables += [merging(merges, "", settings), *(merging(merges, key, settings) for key in BY), decides(merges)]
-        tables += [sites(chosen(merges)), independence(chosen(merges), settings)] if settings.data.real else []
+        tables += [
+            tabulate_merging(merges, "", settings),
+            *(tabulate_merging(merges, key, settings) for key in BY),
+            tabulate_descriptor_effect(merges),
+        ]
+        tables += (
+            [tabulate_sites(select_last_variant(merges)), tabulate_independence(select_last_variant(merges), settings)]
+            if settings.data.real
+            else []
+        )
     if any(m["change"] for m in matches):
-        tables.append(curves(ranks, matches, merges, settings))
-    return [*tables, reliability(matches, merges)]
+        tables.append(tabulate_robustness(ranks, matches, merges, settings))
+    return [*tables, tabulate_reliability(matches, merges)]
 
 
-def short(matches: list[Row], ranks: list[Row], merges: list[Row], settings: Evaluation) -> list[Table]:
-    """The tables that go into the documentation."""
+def tabulate_short(matches: list[Row], ranks: list[Row], merges: list[Row], settings: Evaluation) -> list[Table]:
+    """Return the tables that go into the documentation."""
     if any(m["change"] for m in matches):
-        return [curves(ranks, matches, merges, settings)]
+        return [tabulate_robustness(ranks, matches, merges, settings)]
     table_makers: dict[str, Callable[[], Table]] = {
-        "ranking": lambda: ranking(ranks, settings),
-        "matching": lambda: beside(matches, settings),
-        "merging": lambda: merging(merges, "area", settings),
-        "kinds": lambda: merging(merges, "modality", settings),
-        "decides": lambda: decides(merges),
-        "sites": lambda: sites(chosen(merges)),
-        "independence": lambda: independence(chosen(merges), settings),
-        "reliability": lambda: reliability(chosen(matches), chosen(merges)),
-        **{key: partial(grouped, ranks, matches, key, settings) for key in BY},
+        "ranking": lambda: tabulate_ranking(ranks, settings),
+        "matching": lambda: tabulate_methods(matches, settings),
+        "merging": lambda: tabulate_merging(merges, "area", settings),
+        "kinds": lambda: tabulate_merging(merges, "modality", settings),
+        "decides": lambda: tabulate_descriptor_effect(merges),
+        "sites": lambda: tabulate_sites(select_last_variant(merges)),
+        "independence": lambda: tabulate_independence(select_last_variant(merges), settings),
+        "reliability": lambda: tabulate_reliability(select_last_variant(matches), select_last_variant(merges)),
+        **{key: partial(tabulate_groups, ranks, matches, key, settings) for key in BY},
     }
     return [table_makers[name]() for name in settings.tables if (merges if name in OF_MERGES else ranks)]
 
 
-def _about(ranks: list[Row], merges: list[Row], settings: Evaluation, command: str) -> str:
+def _describe_evaluation(ranks: list[Row], merges: list[Row], settings: Evaluation, command: str) -> str:
     rows = ranks or merges
     pairs, buildings = len({r["pair"] for r in rows}), len({r["building"] for r in rows})
     first = next(iter({r["variant"]: None for r in ranks}), "")

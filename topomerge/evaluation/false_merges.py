@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.datasets.core.physical import physical_building
-from topomerge.evaluation.markdown import write_table
-from topomerge.statistics import NEAR_ZERO, Calibration, calibration, exact_interval
-from topomerge.training.belief_hypotheses import fair, kind_of, right
+from topomerge.datasets.core.building import find_physical_building
+from topomerge.evaluation.documents import write_table
+from topomerge.statistics import NEAR_ZERO, Calibration, compute_exact_interval, measure_calibration
+from topomerge.training.belief_hypotheses import classify_pair, is_distinguishable, is_hypothesis_right
 
 Row = dict[str, Any]
 ORIGINS = ("procedural buildings", "simulated scans of real plans", "real maps", "look-alikes, generated")
@@ -52,17 +52,17 @@ NEGATIVE_HEADS = (
 )  # fmt: skip
 
 
-def good(row: Row, limits: tuple[float, float] = (0.5, 5.0)) -> bool:
+def is_good(row: Row, limits: tuple[float, float] = (0.5, 5.0)) -> bool:
     """Right within m and degrees; a slice or a drawing on the wrong storey is not. Maps of two places have no right pose."""
-    return bool(right(row.get("err"), row["sensors"], limits))
+    return bool(is_hypothesis_right(row.get("err"), row["sensors"], limits))
 
 
-def physical_of(row: Row) -> str:
+def get_physical_building(row: Row) -> str:
     """The physical building of map a."""
-    return str(row.get("physical") or physical_building(row.get("source", "procedural"), row["building"]))
+    return str(row.get("physical") or find_physical_building(row.get("source", "procedural"), row["building"]))
 
 
-def negative_kind(row: Row) -> str:
+def classify_negative(row: Row) -> str:
     """What makes a pair one that must not merge: a key of `PRIOR`; empty where its maps share a room.
 
     Look-alikes are all in, as those that share rooms must not merge a period away.
@@ -70,49 +70,58 @@ def negative_kind(row: Row) -> str:
     if row.get("lookalike"):
         return MADE_ALIKE.get(row["lookalike"], "other look-alikes")
     if row["kind"] == "overlap":
-        return "no room in common" if kind_of(row).startswith("none") else ""
+        return "no room in common" if classify_pair(row).startswith("none") else ""
     if row["kind"] in ("strangers", "other-building"):
         return "other storey" if row["physical"] == row.get("physical_other") else "stranger"
     return {"other-storey": "other storey", "twin-wing": "twin wing"}[row["kind"]]
 
 
-def broken(row: Row) -> bool:
+def is_broken(row: Row) -> bool:
     """Is what is called true known to be wrong? Of a drawing of a map's own building of which the map shows nothing the
     generator gave a twin's frame."""
     return bool(row["kind"] == "overlap" and row.get("common", 1) < 1 and "drawing" in row["sensors"])
 
 
-def tellable(row: Row) -> bool:
+def is_tellable(row: Row) -> bool:
     """Could anybody tell the two places apart by what the maps show? Else the right answer is to abstain."""
-    return bool(row["tellable"]) if "tellable" in row else bool(fair(row))
+    return bool(row["tellable"]) if "tellable" in row else bool(is_distinguishable(row))
 
 
-def false_merge(row: Row) -> bool:
+def is_false_merge(row: Row) -> bool:
     """Believed, and not at a right pose."""
-    return bool(row["believed"]) and not good(row)
+    return bool(row["believed"]) and not is_good(row)
 
 
-def buildings_hit(rows: Sequence[Row]) -> dict[str, float]:
+def measure_hit_buildings(rows: Sequence[Row]) -> dict[str, float]:
     """Physical building of map a -> share of its pairs that were merged falsely."""
     of: dict[str, list[bool]] = {}
     for r in rows:
-        of.setdefault(physical_of(r), []).append(false_merge(r))
+        of.setdefault(get_physical_building(r), []).append(is_false_merge(r))
     return {name: float(np.mean(hits)) for name, hits in of.items()}
 
 
-def tally(name: str, rows: Sequence[Row]) -> list[object]:
+def format_tally(name: str, rows: Sequence[Row]) -> list[object]:
     """A line of the table: under `NEGATIVE_HEADS`."""
-    shares = buildings_hit(rows)
+    shares = measure_hit_buildings(rows)
     hit = sum(share > 0 for share in shares.values())
-    low, high = exact_interval(hit, len(shares))
-    alike = [r for r in rows if not tellable(r)]
+    low, high = compute_exact_interval(hit, len(shares))
+    alike = [r for r in rows if not is_tellable(r)]
     most = np.round(sorted((r["probability"] for r in rows), reverse=True)[:3], 2).tolist()
     interval = f"{hit}: {100 * low:.1f} to {100 * high:.1f} %"
-    believed = sum(map(false_merge, rows))
-    return [name, len(rows), believed, len(shares), interval, len(alike), sum(map(false_merge, alike)), ", ".join(map(str, most))]
+    believed = sum(map(is_false_merge, rows))
+    return [
+        name,
+        len(rows),
+        believed,
+        len(shares),
+        interval,
+        len(alike),
+        sum(map(is_false_merge, alike)),
+        ", ".join(map(str, most)),
+    ]
 
 
-def properties(row: Row) -> Iterator[str]:
+def iter_difficulties(row: Row) -> Iterator[str]:
     """What is difficult beside the kind."""
     yield from row.get("hard", ())
     for sensor, name in (("laser2d", "a 2D slice"), ("drawing", "a floor plan")):
@@ -120,24 +129,24 @@ def properties(row: Row) -> Iterator[str]:
             yield name
 
 
-def negatives(rows: Sequence[Row]) -> list[Row]:
+def select_negatives(rows: Sequence[Row]) -> list[Row]:
     """The pairs that must not merge, each with its `negative`."""
-    return [{**r, "negative": kind} for r in rows if not broken(r) and (kind := negative_kind(r))]
+    return [{**r, "negative": kind} for r in rows if not is_broken(r) and (kind := classify_negative(r))]
 
 
-def false_merges(rows: Sequence[Row]) -> str:
+def tabulate_false_merges(rows: Sequence[Row]) -> str:
     """The table of `negatives`: kinds, all, those that nobody can tell apart, and what is difficult."""
-    out = [tally(kind, mine) for kind in PRIOR if (mine := [r for r in rows if r["negative"] == kind])]
-    out.append(tally("**all**", rows))
-    alike = [r for r in rows if not tellable(r)]
+    out = [format_tally(kind, mine) for kind in PRIOR if (mine := [r for r in rows if r["negative"] == kind])]
+    out.append(format_tally("**all**", rows))
+    alike = [r for r in rows if not is_tellable(r)]
     if alike:
-        out.append(tally("**indistinguishable** (of all; right: to abstain)", alike))
-    for name in sorted({name for r in rows for name in properties(r)}):
-        out.append(tally(f"of all, with {name}", [r for r in rows if name in properties(r)]))
+        out.append(format_tally("**indistinguishable** (of all; right: to abstain)", alike))
+    for name in sorted({name for r in rows for name in iter_difficulties(r)}):
+        out.append(format_tally(f"of all, with {name}", [r for r in rows if name in iter_difficulties(r)]))
     return write_table(NEGATIVE_HEADS, out)
 
 
-def rate_at(rows: Sequence[Row], prior: Mapping[str, float] = PRIOR) -> tuple[float, float, float]:
+def compute_rate(rows: Sequence[Row], prior: Mapping[str, float] = PRIOR) -> tuple[float, float, float]:
     """Share of false merges at a prior of kinds, and the ends of its 95 % interval; nan where there is no row.
 
     Of each kind the mean over its physical buildings of the share of their pairs. What of a kind is not sure is drawn as of k of
@@ -149,7 +158,7 @@ def rate_at(rows: Sequence[Row], prior: Mapping[str, float] = PRIOR) -> tuple[fl
     rng = np.random.default_rng(0)
     rate, drawn = 0.0, np.zeros(PRIOR_ROUNDS)
     for kind, weight in prior.items():
-        shares = list(buildings_hit([r for r in rows if r["negative"] == kind]).values())
+        shares = list(measure_hit_buildings([r for r in rows if r["negative"] == kind]).values())
         if shares:
             hits = sum(shares)
             rate += weight / total * hits / len(shares)
@@ -158,18 +167,18 @@ def rate_at(rows: Sequence[Row], prior: Mapping[str, float] = PRIOR) -> tuple[fl
     return rate, low, high
 
 
-def headline(rows: Sequence[Row]) -> str:
+def format_headline(rows: Sequence[Row]) -> str:
     """The rate at `PRIOR` with every pair in, and without what nobody can tell apart, in words."""
     shares = ", ".join(f"{kind} {weight:g}" for kind, weight in PRIOR.items())
     missing = [kind for kind in PRIOR if not any(r["negative"] == kind for r in rows)]
-    rate, low, high = (100 * v for v in rate_at(rows))
-    apart, least, most = (100 * v for v in rate_at([r for r in rows if tellable(r)]))
+    rate, low, high = (100 * v for v in compute_rate(rows))
+    apart, least, most = (100 * v for v in compute_rate([r for r in rows if is_tellable(r)]))
     text = f"**{rate:.1f} % [{low:.1f}, {high:.1f}] of the pairs that must not merge are believed**, over all pairs, at this "
     text += f"prior of kinds: {shares}. Without the indistinguishable pairs it is {apart:.1f} % [{least:.1f}, {most:.1f}]."
     return text + (f" Not measured, so the other shares are scaled up: {', '.join(missing)}." if missing else "")
 
 
-def origin(row: Row) -> str:
+def classify_origin(row: Row) -> str:
     """Where the maps of a pair are from: one of `ORIGINS`; a real plan beside a procedural building is a real plan.
 
     Look-alikes stand apart: a set of pairs that are all made to deceive says nothing of how sure a probability is elsewhere.
@@ -182,11 +191,11 @@ def origin(row: Row) -> str:
     return ORIGINS[0] if sources == {"procedural"} else ORIGINS[1]
 
 
-def calibrated(rows: Sequence[Row]) -> Calibration:
+def compute_calibration(rows: Sequence[Row]) -> Calibration:
     """`calibration` of the probabilities of pairs, in ten bins, or fewer where a bin of those above the mass near zero would have
     fewer than `PER_BIN`."""
     above = sum(r["probability"] >= NEAR_ZERO for r in rows)
-    return calibration([r["probability"] for r in rows], [good(r) for r in rows], min(max(above // PER_BIN, 1), 10))
+    return measure_calibration([r["probability"] for r in rows], [is_good(r) for r in rows], min(max(above // PER_BIN, 1), 10))
 
 
 def errors(groups: Mapping[str, Sequence[Row]]) -> str:
@@ -194,8 +203,8 @@ def errors(groups: Mapping[str, Sequence[Row]]) -> str:
     out: list[Sequence[object]] = []
     for name, rows in groups.items():
         if rows:
-            whole, believed = calibrated(rows), [r for r in rows if r["believed"]]
-            means = [float(np.mean([f(r) for r in believed])) for f in (probability_of, good)] if believed else []
+            whole, believed = compute_calibration(rows), [r for r in rows if r["believed"]]
+            means = [float(np.mean([f(r) for r in believed])) for f in (probability_of, is_good)] if believed else []
             above = [write_error(whole.above), int(whole.above.count.sum())] if whole.above else ["–", 0]
             out.append(
                 [name, len(rows), write_error(whole), *above[::-1], len(believed), ", ".join(f"{m:.2f}" for m in means) or "–"]
@@ -217,7 +226,7 @@ def reliability(rows: Sequence[Row]) -> str:
     """A line a bin of equal mass and origin: of all pairs, and of those of 0.1 and above."""
     out: list[Sequence[object]] = []
     for name in ORIGINS:
-        whole = calibrated([r for r in rows if origin(r) == name])
+        whole = compute_calibration([r for r in rows if classify_origin(r) == name])
         for title, c in ((f"{name}, all", whole), (f"{name}, 0.1 or more", whole.above)):
             bins = zip(c.count.tolist(), c.probability.tolist(), c.right.tolist(), strict=True) if c else ()
             out += [[title, n, f"{p:.2f}", f"{y:.2f}"] for n, p, y in bins]

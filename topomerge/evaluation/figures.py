@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.evaluation.groups import value
-from topomerge.evaluation.merge_tables import chosen
+from topomerge.evaluation.groups import compute_value
+from topomerge.evaluation.merge_tables import select_last_variant
 from topomerge.evaluation.score import OVERLAPS, Row
-from topomerge.io.atomic import replacing
-from topomerge.statistics import calibration
+from topomerge.io.archive import replace_on_success
+from topomerge.statistics import measure_calibration
 
 ROUNDS = 500
 
@@ -21,59 +21,59 @@ def save_figures(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[
     """Draw what there is something to draw of; names of the files."""
     done = []
     for name, draw in (
-        ("reliability", _reliability),
-        ("overlap", _overlap),
-        ("pr", _precision_recall),
-        ("robustness", _robustness),
+        ("reliability", _draw_reliability),
+        ("overlap", _draw_overlap),
+        ("pr", _draw_precision_recall),
+        ("robustness", _draw_robustness),
     ):
         figure = draw(ranks, matches, merges)
         if figure is not None:
-            with replacing(folder / f"{name}.png") as beside:
+            with replace_on_success(folder / f"{name}.png") as beside:
                 figure.savefig(beside, dpi=120, bbox_inches="tight", format="png")
             done.append(f"{name}.png")
     return done
 
 
-def _figure(columns: int) -> tuple[Any, Any]:
+def _create_figure(columns: int) -> tuple[Any, Any]:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.4 * columns, 3.6))
     return figure, figure.subplots(1, columns, squeeze=False)[0]
 
 
-def _legend(ax: Any) -> None:
+def _add_legend(ax: Any) -> None:
     """Below the axes, where it hides nothing; none where nothing is drawn, as of merges that were not asked for."""
     if ax.get_legend_handles_labels()[0]:
         ax.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2, frameon=False)
 
 
-def _of(rows: Sequence[Row], key: str) -> dict[str, list[Row]]:
+def _group_rows(rows: Sequence[Row], key: str) -> dict[str, list[Row]]:
     out: dict[str, list[Row]] = {}
     for row in rows:
         out.setdefault(row[key], []).append(row)
     return out
 
 
-def _all(rows: Sequence[Row], key: str) -> list[Any]:
+def _collect_values(rows: Sequence[Row], key: str) -> list[Any]:
     return [value for row in rows for value in row[key]]
 
 
-def _reliability(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]) -> Any:
+def _draw_reliability(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]) -> Any:
     """Share that was right against the probability that was told, over bins of equal mass; merges by where the maps come from."""
-    by_origin = _of(chosen(merges), "origin")
+    by_origin = _group_rows(select_last_variant(merges), "origin")
     sets = [("merges", {n: ([r["probability"] for r in s], [r["near"] for r in s]) for n, s in by_origin.items()})]
     rows_with_probability = [m for m in matches if m["k"] == 0 and m["method"] in ("consistent", "mutual")]
-    named = _of([{**m, "title": f"{m['variant']} {m['method']}"} for m in rows_with_probability], "title")
-    sets.append(("matches of rooms", {n: (_all(s, "chance"), _all(s, "good")) for n, s in named.items()}))
+    named = _group_rows([{**m, "title": f"{m['variant']} {m['method']}"} for m in rows_with_probability], "title")
+    sets.append(("matches of rooms", {n: (_collect_values(s, "chance"), _collect_values(s, "good")) for n, s in named.items()}))
     sets = [(title, predictions) for title, predictions in sets if any(len(p) for p, _ in predictions.values())]
     if not sets:
         return None
-    figure, axes = _figure(len(sets))
+    figure, axes = _create_figure(len(sets))
     for ax, (title, predictions) in zip(axes, sets, strict=True):
         ax.plot([0, 1], [0, 1], color="0.7", lw=1)
         for name, (p, y) in predictions.items():
             if len(p):
-                c = calibration(p, y)
+                c = measure_calibration(p, y)
                 line = ax.plot(c.probability, c.right, "o-", ms=4, label=f"{name} ({len(p)}; ECE {c.error:.2f})")[0]
                 if len(predictions) == 1:
                     for x, r, n in zip(c.probability, c.right, c.count, strict=True):
@@ -81,47 +81,47 @@ def _reliability(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[
                             str(n), (x, r), fontsize=7, color=line.get_color(), xytext=(3, -9), textcoords="offset points"
                         )
         ax.set(title=title, xlabel="predicted probability", ylabel="share right", xlim=(0, 1), ylim=(0, 1.02))
-        _legend(ax)
+        _add_legend(ax)
     return figure
 
 
-def _overlap(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]) -> Any:
+def _draw_overlap(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]) -> Any:
     """Recall of rooms and merges by the share of rooms in common."""
     bins = [name for _, name in OVERLAPS]
     if not any(r["overlap"] in bins for r in ranks):
         return None
-    panels = [("recall@1 of rooms", "recall@1", {n: s for n, s in _of(ranks, "variant").items() if s[0]["k"] == 0})]
+    panels = [("recall@1 of rooms", "recall@1", {n: s for n, s in _group_rows(ranks, "variant").items() if s[0]["k"] == 0})]
     method_rows = [
         {**m, "title": f"{m['variant']}, {m['method']}"}
         for m in matches
         if m["k"] == 0 and m["method"] in ("growing", "consistent")
     ]
-    panels.append(("F1 of matches", "F1", _of(method_rows, "title")))
+    panels.append(("F1 of matches", "F1", _group_rows(method_rows, "title")))
     if merges:
-        panels.append(("pairs merged right", "merged", _of(merges, "variant")))
-    figure, axes = _figure(len(panels))
+        panels.append(("pairs merged right", "merged", _group_rows(merges, "variant")))
+    figure, axes = _create_figure(len(panels))
     for ax, (title, metric, rows_by_name) in zip(axes, panels, strict=True):
         for shift, (name, rows) in enumerate(rows_by_name.items()):
-            values = [value([r for r in rows if r["overlap"] == b], metric, ROUNDS) for b in bins]
+            values = [compute_value([r for r in rows if r["overlap"] == b], metric, ROUNDS) for b in bins]
             x = np.arange(len(bins)) + 0.05 * (shift - len(rows_by_name) / 2)
             mid = np.array([v.value for v in values])
             ends = np.array([[max(v.value - v.low, 0), max(v.high - v.value, 0)] for v in values]).T
             ax.errorbar(x, mid, yerr=np.nan_to_num(ends), fmt="o-", ms=4, lw=1, capsize=2, label=name)
         ax.set(title=title, xlabel="share of rooms in common", xticks=range(len(bins)), xticklabels=bins, ylim=(0, 1.02))
-        _legend(ax)
+        _add_legend(ax)
     return figure
 
 
-def _precision_recall(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]) -> Any:
+def _draw_precision_recall(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]) -> Any:
     """Precision against recall of matches, as the least probability that is taken falls; dots: methods that tell none."""
     if not matches:
         return None
-    figure, (ax,) = _figure(1)
-    for name, variant_rows in _of(matches, "variant").items():
+    figure, (ax,) = _create_figure(1)
+    for name, variant_rows in _group_rows(matches, "variant").items():
         if variant_rows[0]["k"]:
             continue
         color = None
-        for method, method_rows in _of(variant_rows, "method").items():
+        for method, method_rows in _group_rows(variant_rows, "method").items():
             units = sum(r["units"] for r in method_rows)
             p = np.concatenate([r["chance"] for r in method_rows])
             good = np.concatenate([r["good"] for r in method_rows]).astype(float)
@@ -136,36 +136,42 @@ def _precision_recall(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequ
                 )
                 color = line[0].get_color()
             else:
-                v = [value(method_rows, m, 1).value for m in ("recall", "precision")]
+                v = [compute_value(method_rows, m, 1).value for m in ("recall", "precision")]
                 mark = {"full": "s", "assignment": "o", "growing": "^"}.get(method, "x")
                 dot = ax.plot(*v, mark, ms=5, color=color, label=f"{name}, {method}")
                 color = dot[0].get_color()
     ax.set(xlabel="recall of rooms in common", ylabel="precision", xlim=(0, 1), ylim=(0, 1.02))
-    _legend(ax)
+    _add_legend(ax)
     return figure
 
 
-def _robustness(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]) -> Any:
+def _draw_robustness(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]) -> Any:
     """F1 against what was changed, one panel a change."""
     changes = sorted({m["change"] for m in matches if m["change"]})
     if not changes:
         return None
-    figure, axes = _figure(len(changes))
+    figure, axes = _create_figure(len(changes))
     for ax, change in zip(axes, changes, strict=True):
         changed_rows = [
             m for m in matches if m["change"] == change and m["k"] == 0 and m["method"] in ("assignment", "consistent", "mutual")
         ]
         values = sorted({m["value"] for m in changed_rows})
-        for name, rows in _of([{**m, "title": f"{m['variant']}, {m['method']}"} for m in changed_rows], "title").items():
-            ax.plot(values, [value([r for r in rows if r["value"] == v], "F1", 1).value for v in values], "o-", ms=4, label=name)
+        for name, rows in _group_rows([{**m, "title": f"{m['variant']}, {m['method']}"} for m in changed_rows], "title").items():
+            ax.plot(
+                values,
+                [compute_value([r for r in rows if r["value"] == v], "F1", 1).value for v in values],
+                "o-",
+                ms=4,
+                label=name,
+            )
         joined = [m for m in merges if m["change"] == change]
         if joined:
-            right = [value([r for r in joined if r["value"] == v], "merged", 1).value for v in values]
+            right = [compute_value([r for r in joined if r["value"] == v], "merged", 1).value for v in values]
             ax.plot(values, right, "k--", lw=1, label="merged right")
         ax.set(title=change, xlabel=LABELS[change], ylabel="F1", ylim=(0, 1.02))
         if change == "density":
             ax.set_xscale("log")
-        _legend(ax)
+        _add_legend(ax)
     return figure
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from topomerge.evaluation.score import GLIMPSED, GROUPS, WHOLE, Row
-from topomerge.statistics import FEWEST_GROUPS, exact_interval
+from topomerge.statistics import FEWEST_GROUPS, compute_exact_interval
 from topomerge.types import Array
 
 LEVELS = [2.5, 97.5]  # percent
@@ -41,7 +41,7 @@ class Value:
         return self.counted < FEWEST_GROUPS
 
 
-def _f1(precision: Array, recall: Array) -> Array:
+def _compute_f1(precision: Array, recall: Array) -> Array:
     both = precision + recall
     return np.where(both > 0, 2 * precision * recall / np.where(both > 0, both, 1), np.where(np.isnan(both), np.nan, 0.0))
 
@@ -68,12 +68,12 @@ RATIOS: dict[str, Ratio] = {
     "seconds": ("seconds", "pairs"),
 }
 COMBINED: dict[str, tuple[str, str, Callable[[Array, Array], Array]]] = {
-    f"F1{g}": (f"precision{g}", f"recall{g}", _f1) for g in GROUPS
+    f"F1{g}": (f"precision{g}", f"recall{g}", _compute_f1) for g in GROUPS
 }
 
 
 def measure(metric: str, counts: Mapping[str, Array]) -> Array:
-    """A metric of sums of counts, element by element; nan where there is nothing to divide by."""
+    """Return a metric of sums of counts, element by element; nan where there is nothing to divide by."""
     if metric in COMBINED:
         first, second, combine = COMBINED[metric]
         return combine(measure(first, counts), measure(second, counts))
@@ -81,22 +81,22 @@ def measure(metric: str, counts: Mapping[str, Array]) -> Array:
     return np.where(bottom > 0, top / np.where(bottom > 0, bottom, 1), np.nan)
 
 
-def needed(metric: str) -> tuple[str, ...]:
-    """The counts that a metric is made of."""
+def list_needed_counts(metric: str) -> tuple[str, ...]:
+    """Return the counts that a metric is made of."""
     if metric in COMBINED:
-        return (*needed(COMBINED[metric][0]), *needed(COMBINED[metric][1]))
+        return (*list_needed_counts(COMBINED[metric][0]), *list_needed_counts(COMBINED[metric][1]))
     return RATIOS[metric]
 
 
-def summed(rows: Sequence[Row], names: Iterable[str], buildings: Sequence[str]) -> dict[str, Array]:
-    """Counts (buildings,) by name."""
+def sum_counts(rows: Sequence[Row], names: Iterable[str], buildings: Sequence[str]) -> dict[str, Array]:
+    """Return counts (buildings,) by name."""
     number = {b: i for i, b in enumerate(buildings)}
     of = np.array([number[r["building"]] for r in rows], int)
     return {n: np.bincount(of, [float(r[n]) for r in rows], len(buildings)) for n in names}
 
 
 @lru_cache(256)
-def draws(buildings: int, rounds: int, seed: int = 0) -> Array:
+def draw_buildings(buildings: int, rounds: int, seed: int = 0) -> Array:
     """(rounds, buildings) how often each building was drawn, with replacement."""
     drawn = np.random.default_rng(seed).integers(buildings, size=(rounds, buildings))
     rows = np.arange(rounds)[:, None] * buildings
@@ -104,35 +104,35 @@ def draws(buildings: int, rounds: int, seed: int = 0) -> Array:
     return counts.reshape(rounds, buildings).astype(np.float64)  # a product of integers is no BLAS call
 
 
-def value(rows: Sequence[Row], metric: str, rounds: int = 2000) -> Value:
-    """A metric over rows, all pairs summed, with its interval over buildings."""
+def compute_value(rows: Sequence[Row], metric: str, rounds: int = 2000) -> Value:
+    """Return a metric over rows, all pairs summed, with its interval over buildings."""
     buildings = sorted({r["building"] for r in rows})
     if not rows:
         return Value(np.nan, np.nan, np.nan, 0, 0)
-    counts = summed(rows, needed(metric), buildings)
+    counts = sum_counts(rows, list_needed_counts(metric), buildings)
     ratio = float(measure(metric, {n: c.sum() for n, c in counts.items()}))
-    held, low, high = _interval(counts, rounds, lambda c: measure(metric, c))
+    held, low, high = _estimate_interval(counts, rounds, lambda c: measure(metric, c))
     return Value(ratio, low, high, len({r["pair"] for r in rows}), len(buildings), held)
 
 
-def gain(rows: Sequence[Row], others: Sequence[Row], metric: str, rounds: int = 2000) -> Value:
-    """How much better rows are than others, of the same pairs; buildings are drawn for both alike."""
+def compute_gain(rows: Sequence[Row], others: Sequence[Row], metric: str, rounds: int = 2000) -> Value:
+    """Compute how much better rows are than others of the same pairs; buildings are drawn for both alike."""
     buildings = sorted({r["building"] for r in rows} | {r["building"] for r in others})
     if not rows or not others:
         return Value(np.nan, np.nan, np.nan, 0, 0)
-    both = [summed(compared_rows, needed(metric), buildings) for compared_rows in (rows, others)]
+    both = [sum_counts(compared_rows, list_needed_counts(metric), buildings) for compared_rows in (rows, others)]
     counts = {(side, name): c for side, of in enumerate(both) for name, c in of.items()}
 
     def better(c: Mapping[tuple[int, str], Array]) -> Array:
         first, second = (measure(metric, {name: v for (s, name), v in c.items() if s == side}) for side in (0, 1))
         return first - second
 
-    held, low, high = _interval(counts, rounds, better)
+    held, low, high = _estimate_interval(counts, rounds, better)
     ratio = float(better({key: c.sum() for key, c in counts.items()}))
     return Value(ratio, low, high, len({r["pair"] for r in rows}), len(buildings), held)
 
 
-def _interval(counts: Mapping[Any, Array], rounds: int, measured: Callable[[Any], Array]) -> tuple[int, float, float]:
+def _estimate_interval(counts: Mapping[Any, Array], rounds: int, measured: Callable[[Any], Array]) -> tuple[int, float, float]:
     """Buildings in which anything was counted, and the ends of the interval over them: of draws, or of fewer than eight their
     range.
 
@@ -144,7 +144,7 @@ def _interval(counts: Mapping[Any, Array], rounds: int, measured: Callable[[Any]
     by_building = {key: c[held] for key, c in counts.items()}
     number = int(held.sum())
     if number >= FEWEST_GROUPS:
-        drawn = draws(number, rounds)
+        drawn = draw_buildings(number, rounds)
         by_building = {key: drawn @ c for key, c in by_building.items()}
     values = measured(by_building)
     finite = values[np.isfinite(values)]
@@ -154,9 +154,9 @@ def _interval(counts: Mapping[Any, Array], rounds: int, measured: Callable[[Any]
     return number, low, high
 
 
-def hit_buildings(rows: Sequence[Row], count: str) -> tuple[int, int, float, float]:
+def count_hit_buildings(rows: Sequence[Row], count: str) -> tuple[int, int, float, float]:
     """Buildings with a row that has any of a count, all buildings, and the ends of the exact 95 % interval of their share: for
     what is rare, as wrong merges are."""
     buildings = {r["building"] for r in rows}
     hit = {r["building"] for r in rows if r[count]}
-    return len(hit), len(buildings), *exact_interval(len(hit), len(buildings))
+    return len(hit), len(buildings), *compute_exact_interval(len(hit), len(buildings))

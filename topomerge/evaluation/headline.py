@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from topomerge.evaluation.documents import OLD_STAMP, ROOT, Stamp
-from topomerge.io.atomic import replacing
+from topomerge.io.archive import replace_on_success
 
 FIGURES = ROOT / "docs" / "results" / "headline.json"
 
@@ -26,7 +26,7 @@ def write_headline(path: Path, figures: Mapping[str, tuple[str, str]], stamp: St
         if entry["name"] in figures:
             entry["result"], entry["of"] = figures[entry["name"]]
             entry["stamp"] = stamp.write_comment()
-    with replacing(path) as beside:
+    with replace_on_success(path) as beside:
         beside.write_text(json.dumps({"figures": entries}, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     if path.resolve() == FIGURES:
         write_readme()
@@ -36,7 +36,7 @@ def write_readme(readme: Path = ROOT / "README.md", path: Path = FIGURES) -> Non
     """Write the figures into the README, between the marks of `headline`."""
     begin, end = "<!-- headline:begin -->", "<!-- headline:end -->"
     before, rest = readme.read_text(encoding="utf-8").split(begin, 1)
-    with replacing(readme) as beside:
+    with replace_on_success(readme) as beside:
         beside.write_text(f"{before}{begin}\n\n{tabulate_headline(path)}\n\n{end}{rest.split(end, 1)[1]}", encoding="utf-8")
 
 

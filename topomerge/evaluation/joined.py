@@ -17,18 +17,17 @@ from typing import Any
 import numpy as np
 
 import topomerge
-from topomerge.datasets.pairs.bent_pairs import DRAWING, BentMaker, bent_items
-from topomerge.datasets.pairs.items import plans_of
-from topomerge.datasets.simulation.floor_truth import Truth, in_frame, judge, truth_of
-from topomerge.datasets.simulation.joined_truth import joined_truth
+from topomerge.datasets.pairs.drifted_pairs import DRAWING, DriftedPairMaker, draw_drifted_items
+from topomerge.datasets.pairs.items import select_plans
+from topomerge.datasets.simulation.floor_truth import FloorTruth, build_truth, evaluate_map, join_truths, transform_truth
 from topomerge.errors import InputError
-from topomerge.evaluation.doubled_walls import doubled_walls
-from topomerge.evaluation.markdown import write_table
-from topomerge.evaluation.tasks import Row, Say, TaskSettings, find_real_data, measure_missing
+from topomerge.evaluation.documents import write_table
+from topomerge.evaluation.score import measure_doubled_walls
+from topomerge.evaluation.tasks import LogFn, Row, TaskSettings, find_real_data, measure_missing
 from topomerge.fusion.fuse import fuse
 from topomerge.registration.bend.bend import bend
-from topomerge.registration.bend.pieces import sensor_drift
-from topomerge.registration.pipeline import fine
+from topomerge.registration.bend.pieces import get_sensor_drift
+from topomerge.registration.pipeline import refine_by_surfaces
 from topomerge.registration.prepared import prepare
 from topomerge.types import Placement, Sim3, TopometricMap
 
@@ -57,66 +56,71 @@ def list_inputs(settings: TaskSettings) -> list[str]:
 @lru_cache(maxsize=1)
 def load_makers(split: str, pairs: int) -> dict[str, Any]:
     """Load what makes the pairs of a split."""
-    items, plans = bent_items(split, str(find_real_data()), pairs)
+    items, plans = draw_drifted_items(split, str(find_real_data()), pairs)
     return {item.name: (item, plans) for item in items if DRAWING not in item.sensors}
 
 
-def measure(settings: TaskSettings, say: Say) -> list[Row]:
+def measure(settings: TaskSettings, log_line: LogFn) -> list[Row]:
     """Measure the pairs that are missing; of those that can't be made there is no row."""
     split, pairs = settings.data.set or "validation", settings.data.limit or JOINED_PAIRS
     items = {name: (name, split, pairs) for name in load_makers(split, pairs) if settings.data.only in name}
     path = Path(settings.cache) / "evaluation" / f"joined_{split}.jsonl"
-    return [row for row in measure_missing(path, items, measure_pair, say, settings) if "refused" not in row]
+    return [row for row in measure_missing(path, items, measure_pair, log_line, settings) if "refused" not in row]
 
 
 def measure_pair(name: str, split: str, pairs: int) -> Row:
     """Make a pair and join its maps."""
     item, plans = load_makers(split, pairs)[name]
     try:
-        return row_of(BentMaker(item, list(plans_of(item, plans))), name, 1.0)
+        return build_row(DriftedPairMaker(item, list(select_plans(item, plans))), name, 1.0)
     except InputError as error:  # no such parts, or a room that can't be reached
         return {"refused": str(error)}
 
 
-def truth_about(maker: BentMaker, side: int, factor: float) -> tuple[TopometricMap, Truth]:
+def extract_with_truth(maker: DriftedPairMaker, side: int, factor: float) -> tuple[TopometricMap, FloorTruth]:
     """A map of a pair, extracted, and what is true about it, in its frame."""
     building, visited, frames = maker.place
-    cloud, undrift = maker.map(side, factor)
+    cloud, undrift = maker.simulate_map(side, factor)
     frame = frames[side]
     back = frame.inverse()
     turn = Sim3(-frame.yaw).matrix[:3, :3]
     been = np.isin(np.arange(len(building.rooms)), visited[side])
     points = back.apply(cloud.points.astype(np.float64) + cloud.shift)
-    truth = truth_of(building, been, points, back.apply(undrift.places), undrift.shifts @ turn.T)
-    return topomerge.extract(cloud), in_frame(truth, frame)
+    truth = build_truth(building, been, points, back.apply(undrift.places), undrift.shifts @ turn.T)
+    return topomerge.extract(cloud), transform_truth(truth, frame)
 
 
-def scores(map: TopometricMap, truth: Truth) -> dict[str, float]:
+def compute_scores(map: TopometricMap, truth: FloorTruth) -> dict[str, float]:
     """Mean IoU of rooms and F1 of doors."""
-    verdict = judge(map, truth)
+    verdict = evaluate_map(map, truth)
     p, r = verdict.doors.precision, verdict.doors.recall
     return {"iou": verdict.rooms.iou, "doors": 2 * p * r / (p + r) if p + r > 0 else 0.0 if p == p and r == r else float("nan")}
 
 
-def row_of(maker: BentMaker, name: str, factor: float) -> Row:
+def build_row(maker: DriftedPairMaker, name: str, factor: float) -> Row:
     """Both maps, joined rigidly and bent."""
-    (a, truth_a), (b, truth_b) = (truth_about(maker, side, factor) for side in (0, 1))
+    (a, truth_a), (b, truth_b) = (extract_with_truth(maker, side, factor) for side in (0, 1))
     frames = maker.place[2]
     right = frames[0] @ frames[1].inverse()
     sensors = maker.item.sensors
     row: Row = {"name": name, "sensors": sensors, "factor": factor, "building": maker.place[0].name}
-    row |= {side: scores(m, t) for side, m, t in zip("ab", (a, b), (truth_a, truth_b), strict=True)}
+    row |= {side: compute_scores(m, t) for side, m, t in zip("ab", (a, b), (truth_a, truth_b), strict=True)}
     pa, pb = prepare(a), prepare(b)
-    pose = fine(pa, pb, right)[0]
-    bent = bend(pa, pb, pose, drift=(sensor_drift(sensors[0]), sensor_drift(sensors[1])))
+    pose = refine_by_surfaces(pa, pb, right)[0]
+    bent = bend(pa, pb, pose, drift=(get_sensor_drift(sensors[0]), get_sensor_drift(sensors[1])))
     row["bend"] = {**bent.features, "reason": bent.reason}
     for way, transform, bends in (("rigid", pose, {}), ("bent", bent.transform, dict(enumerate(bent.deformations)))):
         began = time.process_time()
         joined = fuse((a, b), [(0, Sim3()), (1, transform)], bends)
         seconds = time.process_time() - began
         lay = Placement.of(Sim3(), bends.get(0)).transform_points, Placement.of(transform, bends.get(1)).transform_points
-        truth = joined_truth(truth_a, truth_b, right, lay)
-        row[way] = {**scores(joined, truth), "doubled": doubled_walls(joined), "rooms": len(joined.rooms), "seconds": seconds}
+        truth = join_truths(truth_a, truth_b, right, lay)
+        row[way] = {
+            **compute_scores(joined, truth),
+            "doubled": measure_doubled_walls(joined),
+            "rooms": len(joined.rooms),
+            "seconds": seconds,
+        }
     return row
 
 

@@ -7,25 +7,25 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from topomerge.evaluation.documents import group_rows, write_table
 from topomerge.evaluation.false_merges import (
     ORIGINS,
     Row,
-    broken,
+    classify_origin,
+    compute_rate,
     errors,
-    false_merge,
-    false_merges,
-    good,
-    headline,
-    negatives,
-    origin,
-    physical_of,
-    rate_at,
+    format_headline,
+    get_physical_building,
+    is_broken,
+    is_false_merge,
+    is_good,
+    is_tellable,
     reliability,
-    tellable,
+    select_negatives,
+    tabulate_false_merges,
 )
-from topomerge.evaluation.markdown import group_rows, write_table
-from topomerge.statistics import interval_text
-from topomerge.training.belief_hypotheses import kind_of
+from topomerge.statistics import format_interval
+from topomerge.training.belief_hypotheses import classify_pair
 
 AREA_NAMES = ("<40", "40-80", "80-200", ">200")
 LARGE = AREA_NAMES[2:]
@@ -47,26 +47,30 @@ def modality(row: Row) -> str:
     return "with a slice" if "laser2d" in row["sensors"] or "phone" in row["sensors"] else "3D–3D"
 
 
-def share(rows: Sequence[Row], hit: Callable[[Row], bool]) -> str:
-    """Per cent with its interval over physical buildings (`interval_text`)."""
-    return interval_text(np.array([float(hit(r)) for r in rows]), np.array([physical_of(r) for r in rows]), 0, 100.0)
+def format_share(rows: Sequence[Row], hit: Callable[[Row], bool]) -> str:
+    """Per cent with its interval over physical buildings (`format_interval`)."""
+    return format_interval(np.array([float(hit(r)) for r in rows]), np.array([get_physical_building(r) for r in rows]), 0, 100.0)
 
 
-def measures(rows: Sequence[Row]) -> list[object]:
+def format_measures(rows: Sequence[Row]) -> list[object]:
     """Number, right, fine, believed among the right ones, believed and wrong, seconds."""
-    true = [r for r in rows if good(r)]
-    wrong = sum(r["believed"] and r["answered"] and not good(r) for r in rows)
+    true = [r for r in rows if is_good(r)]
+    wrong = sum(r["believed"] and r["answered"] and not is_good(r) for r in rows)
     seconds = float(np.median([r["seconds"] for r in rows]))
-    shares = share(rows, good), share(rows, lambda r: good(r, (0.1, 1.0))), share(rows, lambda r: good(r) and r["believed"])
+    shares = (
+        format_share(rows, is_good),
+        format_share(rows, lambda r: is_good(r, (0.1, 1.0))),
+        format_share(rows, lambda r: is_good(r) and r["believed"]),
+    )
     return [len(rows), len(true), *shares, wrong, f"{seconds:.1f}"]
 
 
-def positives(rows: Sequence[Row]) -> list[Row]:
+def select_positives(rows: Sequence[Row]) -> list[Row]:
     """Pairs that share a room."""
-    return [r for r in rows if kind_of(r) in AREA_NAMES]
+    return [r for r in rows if classify_pair(r) in AREA_NAMES]
 
 
-def source_of(row: Row) -> str:
+def describe_source(row: Row) -> str:
     """Where a simulated pair is from, in words."""
     words = {"procedural": "procedural buildings", "campus": "schools (real plans)", "r2v": "flats (real plans)"}
     return words.get(str(row["source"]), str(row["source"]))
@@ -74,14 +78,19 @@ def source_of(row: Row) -> str:
 
 def describe_pairs(rows: Sequence[Row]) -> str:
     """How many pairs of how many buildings the recipe gives, by source."""
-    count = Counter(source_of(r) for r in rows)
-    each = [f"{n} of {len({physical_of(r) for r in rows if source_of(r) == s})} {s}" for s, n in count.most_common()]
-    return f"{len(rows)} simulated pairs of {len({physical_of(r) for r in rows})} physical test buildings: {', '.join(each)}"
+    count = Counter(describe_source(r) for r in rows)
+    each = [
+        f"{n} of {len({get_physical_building(r) for r in rows if describe_source(r) == s})} {s}" for s, n in count.most_common()
+    ]
+    return (
+        f"{len(rows)} simulated pairs of {len({get_physical_building(r) for r in rows})} physical test buildings: "
+        f"{', '.join(each)}"
+    )
 
 
 def name_source(row: Row) -> str:
     """Name source and modality."""
-    return f"{source_of(row)}, {modality(row)}"
+    return f"{describe_source(row)}, {modality(row)}"
 
 
 def name_plan(row: Row) -> str:
@@ -91,44 +100,46 @@ def name_plan(row: Row) -> str:
 
 def merged(mine: Sequence[Row], drawn: Sequence[Row]) -> list[str]:
     """Pairs that share rooms: by kind of pair and area, by source, by sensors, and with floor plans."""
-    whole = positives(mine)
-    large = [r for r in whole if kind_of(r) in LARGE]
+    whole = select_positives(mine)
+    large = [r for r in whole if classify_pair(r) in LARGE]
     groups = [f"{m}, {area}" for m in MODALITIES for area in AREA_NAMES]
     plans = ("a scan", "a scan, no scale", "a slice", "a slice, no scale")
     sensors = sorted({"-".join(sorted(r["sensors"])) for r in large})
-    wrong = [r for r in (*whole, *positives(drawn)) if r["believed"] and not good(r)]
-    storeys = sum(bool(r.get("wrong_storey")) and modality(r) != "3D–3D" for r in (*whole, *positives(drawn)))
+    wrong = [r for r in (*whole, *select_positives(drawn)) if r["believed"] and not is_good(r)]
+    storeys = sum(bool(r.get("wrong_storey")) and modality(r) != "3D–3D" for r in (*whole, *select_positives(drawn)))
     return [
-        tabulate_groups(whole, lambda r: f"{modality(r)}, {kind_of(r)}", groups, "shared area, m²"),
-        f"Believed at a wrong pose: {len(wrong)} of {len(whole) + len(positives(drawn))}, floor plans included. Slices and floor "
+        tabulate_groups(whole, lambda r: f"{modality(r)}, {classify_pair(r)}", groups, "shared area, m²"),
+        f"Believed at a wrong pose: {len(wrong)} of {len(whole) + len(select_positives(drawn))}, floor plans included. "
+        f"Slices and floor "
         f"plans placed on the wrong storey (counted as wrong): {storeys}.",
         "Pairs that share 80 m² or more, by source:",
         tabulate_groups(large, name_source, sorted(set(map(name_source, large))), "pairs of"),
         "The same pairs by sensors:",
         tabulate_groups(large, lambda r: "-".join(sorted(r["sensors"])), sensors, "sensors"),
         "Maps and the floor plan of their own building (a third of the plans have no scale):",
-        tabulate_groups(positives(drawn), name_plan, plans, "floor plan and"),
+        tabulate_groups(select_positives(drawn), name_plan, plans, "floor plan and"),
     ]
 
 
-def real(rows: Sequence[Row]) -> str:
+def tabulate_real(rows: Sequence[Row]) -> str:
     """Real pairs by source and what they show."""
     out = []
     names = [f"{r['source']} {' to '.join(sorted(set(r['sensors']), reverse=True))}" for r in rows]
     for name in sorted(set(names)):
         mine = [r for r, group in zip(rows, names, strict=True) if group == name]
-        scale = [abs(r["scale"] - 1) for r in mine if r["scale"] and good(r)]
+        scale = [abs(r["scale"] - 1) for r in mine if r["scale"] and is_good(r)]
         believed = [r for r in mine if r["believed"]]
-        wrong = [r["name"].split("/")[1] for r in mine if not good(r)]
+        wrong = [r["name"].split("/")[1] for r in mine if not is_good(r)]
         out.append([
-            name, len(mine), len({physical_of(r) for r in mine}), sum(map(good, mine)), sum(good(r, (0.1, 1.0)) for r in mine),
-            sum(good(r) for r in believed), sum(not good(r) for r in believed), f"{100 * max(scale, default=0.0):.1f} %",
+            name, len(mine), len({get_physical_building(r) for r in mine}), sum(map(is_good, mine)), sum(is_good(r, (0.1,
+            1.0)) for r in mine),
+            sum(is_good(r) for r in believed), sum(not is_good(r) for r in believed), f"{100 * max(scale, default=0.0):.1f} %",
             f"{np.median([r['seconds'] for r in mine]):.1f}", ", ".join(wrong),
         ])  # fmt: skip
     return write_table(REAL_HEADS, out)
 
 
-def misnamed(not_to_merge: Sequence[Row]) -> str:
+def format_misnamed(not_to_merge: Sequence[Row]) -> str:
     """How many pairs that the generator draws as two buildings are of one."""
     drawn = [r for r in not_to_merge if r["kind"] == "other-building"]
     same = [r for r in drawn if r["negative"] == "other storey"]
@@ -141,29 +152,31 @@ def misnamed(not_to_merge: Sequence[Row]) -> str:
 def tabulate_groups(rows: Sequence[Row], key: Callable[[Row], str], groups: Sequence[str], name: str) -> str:
     """Tabulate a line a group."""
     grouped = group_rows(rows, key)
-    return write_table((name, *HEADS), [[group, *measures(grouped[group])] for group in groups if group in grouped])
+    return write_table((name, *HEADS), [[group, *format_measures(grouped[group])] for group in groups if group in grouped])
 
 
 def tabulate_merges(rows: Sequence[Row]) -> dict[str, str]:
     """Tabulate what there are rows of, each under the name of its block."""
     boxes = [r for r in rows if r["set"] == "boxes"]
-    rows = [r for r in rows if r.get("kind") and r["set"] != "boxes" and not broken(r)]
+    rows = [r for r in rows if r.get("kind") and r["set"] != "boxes" and not is_broken(r)]
     simulated = [r for r in rows if r["set"] in ("test", "train")]
     drawn = [r for r in rows if r["set"].endswith("_drawings")]
     measured = [r for r in rows if r["set"] in ("real", "development", "storeys")]
-    apart = negatives(rows)
+    apart = select_negatives(rows)
     blocks = {}
     if simulated:
         blocks["merging"] = "\n\n".join([f"{describe_pairs(simulated)}.", *merged(simulated, drawn)])
     if any(r["set"] in NEGATIVE_SETS for r in rows):
-        real_ones = [r for r in apart if origin(r) == ORIGINS[2]]
-        parts = [headline(apart), false_merges(apart), misnamed(apart)]
-        blocks["false-merges"] = "\n\n".join([*parts, *(["Real maps only:", false_merges(real_ones)] if real_ones else [])])
-        groups = {name: [r for r in rows if origin(r) == name] for name in ORIGINS}
-        groups |= {"all": list(rows), "all but indistinguishable pairs": [r for r in rows if tellable(r)]}
+        real_ones = [r for r in apart if classify_origin(r) == ORIGINS[2]]
+        parts = [format_headline(apart), tabulate_false_merges(apart), format_misnamed(apart)]
+        blocks["false-merges"] = "\n\n".join(
+            [*parts, *(["Real maps only:", tabulate_false_merges(real_ones)] if real_ones else [])]
+        )
+        groups = {name: [r for r in rows if classify_origin(r) == name] for name in ORIGINS}
+        groups |= {"all": list(rows), "all but indistinguishable pairs": [r for r in rows if is_tellable(r)]}
         blocks["calibration"] = f"{errors(groups)}\n\n{reliability([r for r in rows if 'probability' in r])}"
     if measured:
-        blocks["real-merges"] = real(measured)
+        blocks["real-merges"] = tabulate_real(measured)
     if boxes:
         blocks["boxes"] = tabulate_boxes(boxes)
     return blocks
@@ -181,20 +194,22 @@ def tabulate_boxes(rows: Sequence[Row]) -> str:
 
 def compute_headline(rows: Sequence[Row], settings: object) -> dict[str, tuple[str, str]]:
     """Compute the figures of the README that there are rows of."""
-    rows = [r for r in rows if r.get("kind") and r["set"] != "boxes" and not broken(r)]
+    rows = [r for r in rows if r.get("kind") and r["set"] != "boxes" and not is_broken(r)]
     large = [
-        r for r in positives([r for r in rows if r["set"] == "test"]) if kind_of(r) in LARGE and modality(r) == MODALITIES[0]
+        r
+        for r in select_positives([r for r in rows if r["set"] == "test"])
+        if classify_pair(r) in LARGE and modality(r) == MODALITIES[0]
     ]
     out = {}
     if large:
-        values = (good, lambda r: good(r, (0.1, 1.0)), lambda r: good(r) and r["believed"])
+        values = (is_good, lambda r: is_good(r, (0.1, 1.0)), lambda r: is_good(r) and r["believed"])
         names = ("merges-right", "merges-fine", "merges-merged")
-        out = {n: (f"{share(large, hit)} %", f"{len(large)} pairs") for n, hit in zip(names, values, strict=True)}
-    apart = negatives(rows)
+        out = {n: (f"{format_share(large, hit)} %", f"{len(large)} pairs") for n, hit in zip(names, values, strict=True)}
+    apart = select_negatives(rows)
     strangers = [r for r in apart if r["negative"] == "stranger"]
     if strangers:
-        out["false-strangers"] = str(sum(map(false_merge, strangers))), f"{len(strangers)} pairs"
+        out["false-strangers"] = str(sum(map(is_false_merge, strangers))), f"{len(strangers)} pairs"
     if {r["set"] for r in rows} >= {"test", "strangers", "lookalikes"}:
-        rate, low, high = (100 * v for v in rate_at(apart))
+        rate, low, high = (100 * v for v in compute_rate(apart))
         out["false-prior"] = f"{rate:.0f} % [{low:.0f}, {high:.0f}]", f"{len(apart)} pairs"
     return out

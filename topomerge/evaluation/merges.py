@@ -22,28 +22,31 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.datasets.core.builder import one_thread
-from topomerge.datasets.core.physical import physical_building
-from topomerge.datasets.pairs.evaluation_pair import sim3_of
+from topomerge.datasets.core.builder import limit_threads
+from topomerge.datasets.core.building import find_physical_building
+from topomerge.datasets.pairs.evaluation_pair import convert_to_sim3
 from topomerge.datasets.pairs.grid_pairs import GridPair, load_grids
 from topomerge.datasets.simulation.box_worlds import BOX_KINDS, is_right, load_pair
 from topomerge.errors import InputError
-from topomerge.evaluation.grid_pairs import (
+from topomerge.evaluation.merge_report import compute_headline, tabulate_merges
+from topomerge.evaluation.tasks import (
     DRAWN,
     SCALELESS,
+    LogFn,
+    Row,
+    TaskSettings,
+    describe_places,
     find_places,
-    hard_of,
     iterate_real_pairs,
+    list_difficulties,
     make_lookalike_files,
     make_pair_files,
-    places_of,
+    measure_missing,
 )
-from topomerge.evaluation.merge_report import compute_headline, tabulate_merges
-from topomerge.evaluation.tasks import Row, Say, TaskSettings, measure_missing
-from topomerge.metrics import on_storey
+from topomerge.metrics import is_on_storey
 from topomerge.registration.pipeline import Registration, register
 from topomerge.registration.prepared import Prepared, prepare
-from topomerge.training.belief_hypotheses import error, right
+from topomerge.training.belief_hypotheses import compute_pose_error, is_hypothesis_right
 from topomerge.types import Sim3
 
 MAKERS = ("topomerge.registration.pipeline", "topomerge.datasets.pairs.grid_pairs", "topomerge.metrics")
@@ -79,14 +82,14 @@ def list_inputs(settings: TaskSettings) -> list[str]:
     return [f"{name} {settings.data.limit}" for name in list_sets(settings)]
 
 
-def measure(settings: TaskSettings, say: Say) -> list[Row]:
+def measure(settings: TaskSettings, log_line: LogFn) -> list[Row]:
     """Measure the pairs of each set that are missing."""
     rows = []
     for name in list_sets(settings):
         find_items, work = SETS[name]
-        items = {k: v for k, v in find_items(name, settings, say).items() if settings.data.only in k}
+        items = {k: v for k, v in find_items(name, settings, log_line).items() if settings.data.only in k}
         path = Path(settings.cache) / "evaluation" / f"merges_{name}.jsonl"
-        rows += [{"set": name, **row} for row in measure_missing(path, items, work, say, settings)]
+        rows += [{"set": name, **row} for row in measure_missing(path, items, work, log_line, settings)]
     return rows
 
 
@@ -98,15 +101,15 @@ def tabulate(rows: Sequence[Row], settings: TaskSettings) -> dict[str, str]:
 # Pairs that share a place
 
 
-def find_pairs(name: str, settings: TaskSettings, say: Say) -> Items:
+def find_pairs(name: str, settings: TaskSettings, log_line: LogFn) -> Items:
     """Find the simulated pairs of a split."""
-    files = make_pair_files(name, settings.cache, settings.jobs, say)
+    files = make_pair_files(name, settings.cache, settings.jobs, log_line)
     if name.endswith(DRAWN):
         files = [file for file in files if load_grids(file).about["kind"] == "overlap"]
     return {file.stem: (file, name) for file in files[: settings.data.limit or None]}
 
 
-def find_real(name: str, settings: TaskSettings, say: Say) -> Items:
+def find_real(name: str, settings: TaskSettings, log_line: LogFn) -> Items:
     """Find the names of the real pairs of a split; each is read again where it is measured."""
     names = [pair.name for pair in iterate_real_pairs(name)]
     return {k: (k, name) for k in names[: settings.data.limit or None]}
@@ -134,7 +137,7 @@ def score_pair(pair: GridPair, split: str) -> Row:
     scaled = pair.about["source"] in SCALELESS or bool(pair.about.get("scaled"))
     row, registration = time_registration(pair.a, pair.b, scaled, pair.free)
     pose = registration.transform
-    outcome = {"common": pair.common, "hard": hard_of(pair), "answered": pose is not None, **compare_pose(pose, pair)}
+    outcome = {"common": pair.common, "hard": list_difficulties(pair), "answered": pose is not None, **compare_pose(pose, pair)}
     return {**row, **about, **find_places(pair, split), **outcome}
 
 
@@ -142,7 +145,7 @@ def time_registration(a: Any, b: Any, scaled: bool, free: Any = None) -> tuple[R
     """Register two maps on one core: what it says, and the seconds."""
     began = time.process_time()
     words = {} if free is None else {"free": free}
-    with one_thread():
+    with limit_threads():
         registration = register(a, b, scale="free" if scaled else "fixed", **words)
     said = {"probability": registration.probability, "believed": registration.accepted, "posterior": registration.posterior}
     return {**said, "seconds": time.process_time() - began}, registration
@@ -151,33 +154,33 @@ def time_registration(a: Any, b: Any, scaled: bool, free: Any = None) -> tuple[R
 def compare_pose(pose: Sim3 | None, pair: GridPair) -> Row:
     """Compare a pose with the truth (``err``: horizontal and vertical, m, and degrees; ``scale``: by a factor): ``right`` and
     ``fine`` within 0.5 m and 5 degrees, 0.1 m and 1 degree, ``wrong_storey`` on another floor."""
-    off = None if pose is None else error(pose, pair)
+    off = None if pose is None else compute_pose_error(pose, pair)
     sensors: Any = pair.about["sensors"]
-    judged = {"right": right(off, sensors), "fine": right(off, sensors, FINE)}
+    judged = {"right": is_hypothesis_right(off, sensors), "fine": is_hypothesis_right(off, sensors, FINE)}
     scale = None if pose is None or pair.truth is None else pose.scale / pair.truth.scale
-    return {"err": off, "scale": scale, **judged, "wrong_storey": off is not None and not on_storey(off[1])}
+    return {"err": off, "scale": scale, **judged, "wrong_storey": off is not None and not is_on_storey(off[1])}
 
 
 # Pairs that must not merge
 
 
-def find_strangers(name: str, settings: TaskSettings, say: Say) -> Items:
+def find_strangers(name: str, settings: TaskSettings, log_line: LogFn) -> Items:
     """Find neighbours in a shuffled order of the pairs of a split: map a of one, b of another."""
-    files = make_pair_files("test", settings.cache, settings.jobs, say)
+    files = make_pair_files("test", settings.cache, settings.jobs, log_line)
     order = np.random.default_rng(0).permutation(len(files))
     blocks = [order[start : start + STRIDE] for start in range(0, len(order), STRIDE)]
     couples = [(files[i], files[j]) for block in blocks for i in block for j in block if i != j]
     return {f"{a.stem}+{b.stem}": (a, b, "test") for a, b in couples[: settings.data.limit or STRANGERS]}
 
 
-def find_drawn_strangers(name: str, settings: TaskSettings, say: Say) -> Items:
+def find_drawn_strangers(name: str, settings: TaskSettings, log_line: LogFn) -> Items:
     """Find maps and floor plans of another building, another storey or another wing."""
-    files = make_pair_files("test_drawings", settings.cache, settings.jobs, say)
+    files = make_pair_files("test_drawings", settings.cache, settings.jobs, log_line)
     apart = [file for file in files if load_grids(file).about["kind"] != "overlap"]
     return {file.stem: (file, "test_drawings") for file in apart[: settings.data.limit or None]}
 
 
-def find_real_strangers(name: str, settings: TaskSettings, say: Say) -> Items:
+def find_real_strangers(name: str, settings: TaskSettings, log_line: LogFn) -> Items:
     """Find real maps of two places, so that each place meets each other one before any does so again."""
     places: dict[str, list[tuple[str, int]]] = {}
     for pair in iterate_real_pairs():
@@ -204,7 +207,11 @@ def load_side(file: Path, split: str, side: int) -> tuple[Prepared, dict[str, An
     """Load and prepare one map of a cached pair, and what is told of it."""
     pair = load_grids(file)
     places, names = find_places(pair, split), ("", "other_")
-    about = {"source": places[f"{names[side]}source"], "building": places[("building", "other")[side]], "hard": hard_of(pair)}
+    about = {
+        "source": places[f"{names[side]}source"],
+        "building": places[("building", "other")[side]],
+        "hard": list_difficulties(pair),
+    }
     sensors: Any = pair.about["sensors"]
     return prepare((pair.a, pair.b)[side], pair.free[side]), {**about, "sensor": sensors[side]}
 
@@ -229,7 +236,7 @@ def measure_real_strangers(first: tuple[str, int], second: tuple[str, int]) -> R
 
 def score_strangers(a: Prepared, b: Prepared, one: Row, other: Row) -> Row:
     """Register maps of two places; of maps that may show one place the kind is empty, and nothing is measured."""
-    about: Row = {**places_of((one["building"], other["building"]), (one["source"], other["source"]))}
+    about: Row = {**describe_places((one["building"], other["building"]), (one["source"], other["source"]))}
     about |= {"sensors": [one["sensor"], other["sensor"]], "hard": sorted({*one["hard"], *other["hard"]})}
     about["kind"] = classify_strangers(one, other)
     if not about["kind"]:
@@ -240,7 +247,7 @@ def score_strangers(a: Prepared, b: Prepared, one: Row, other: Row) -> Row:
 
 def classify_strangers(one: Row, other: Row) -> str:
     """Classify two maps: strangers; other-storey of one physical building; nothing where they may show one place."""
-    if physical_building(one["source"], one["building"]) != physical_building(other["source"], other["building"]):
+    if find_physical_building(one["source"], one["building"]) != find_physical_building(other["source"], other["building"]):
         return "strangers"
     storeys = [set(side["building"].split(" + ")) for side in (one, other)]
     return "other-storey" if one["source"] in STOREYS and storeys[0].isdisjoint(storeys[1]) else ""
@@ -249,10 +256,10 @@ def classify_strangers(one: Row, other: Row) -> str:
 # Places made to be alike
 
 
-def find_lookalikes(name: str, settings: TaskSettings, say: Say) -> Items:
+def find_lookalikes(name: str, settings: TaskSettings, log_line: LogFn) -> Items:
     """Find look-alikes."""
     split = "train" if name.startswith("train") else "test"
-    files = make_lookalike_files(split, settings.cache, settings.jobs, say)
+    files = make_lookalike_files(split, settings.cache, settings.jobs, log_line)
     return {file.stem: (file,) for file in files[: settings.data.limit or None]}
 
 
@@ -261,13 +268,18 @@ def measure_lookalike(file: Path) -> Row:
     pair = load_grids(file)
     row, registration = time_registration(pair.a, pair.b, bool(pair.about["scaled"]), pair.free)
     about = {key: pair.about[key] for key in (*LOOKALIKE, *COPIED) if key in pair.about} | {"common": pair.common}
-    alike = None if pair.about["alike"] is None else sim3_of(np.array(pair.about["alike"]))
+    alike = None if pair.about["alike"] is None else convert_to_sim3(np.array(pair.about["alike"]))
     pose = registration.transform
     at_alike = replace(pair, truth=alike, about={**pair.about, "kind": "overlap"})
-    return {**row, **about, "err": pose and error(pose, pair), "alike_err": pose and error(pose, at_alike)}
+    return {
+        **row,
+        **about,
+        "err": pose and compute_pose_error(pose, pair),
+        "alike_err": pose and compute_pose_error(pose, at_alike),
+    }
 
 
-def find_boxes(name: str, settings: TaskSettings, say: Say) -> Items:
+def find_boxes(name: str, settings: TaskSettings, log_line: LogFn) -> Items:
     """Find worlds of boxes, some of each kind."""
     cache = Path(settings.cache) / "box_worlds"
     return {f"{kind}-{seed}": (kind, seed, cache) for kind in BOX_KINDS for seed in range(settings.data.limit or BOX_SEEDS)}
@@ -280,7 +292,7 @@ def measure_boxes(kind: str, seed: int, cache: Path) -> Row:
     return {**row, "kind": kind, "right": is_right(registration, kind, truth, middle)}
 
 
-SETS: dict[str, tuple[Callable[[str, TaskSettings, Say], Items], Callable[..., Row]]] = {
+SETS: dict[str, tuple[Callable[[str, TaskSettings, LogFn], Items], Callable[..., Row]]] = {
     **dict.fromkeys(("test", "train", "test_drawings", "train_drawings"), (find_pairs, measure_pair)),
     **dict.fromkeys(("real", "development", "storeys"), (find_real, measure_real)),
     "strangers": (find_strangers, measure_strangers),

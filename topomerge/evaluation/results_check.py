@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from topomerge.code_digest import code_digest
+from topomerge.code_digest import compute_code_digest
 from topomerge.errors import InputError
 from topomerge.evaluation.documents import BLOCK, OLD_STAMP, ROOT, Stamp, digest_inputs, list_pages, read_stamp
 from topomerge.evaluation.headline import FIGURES, read_headline
@@ -41,7 +41,7 @@ def find_changes(stamp: Stamp) -> list[str]:
     """Compare a stamp with this state: ``code``, ``data``, both, or nothing has changed."""
     changed = []
     try:
-        now = code_digest(*stamp.modules)
+        now = compute_code_digest(*stamp.modules)
     except ModuleNotFoundError:
         now = ""
     if now != stamp.code:

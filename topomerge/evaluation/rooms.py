@@ -17,14 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.code_digest import code_digest
-from topomerge.datasets.core.builder import one_thread
-from topomerge.datasets.simulation.floor_truth import judge, said
+from topomerge.code_digest import compute_code_digest
+from topomerge.datasets.core.builder import limit_threads
+from topomerge.datasets.simulation.floor_truth import evaluate_map, predict_columns
 from topomerge.errors import InputError
 from topomerge.evaluation.cases import GROUPS, SELECTIONS, select_cases
-from topomerge.evaluation.markdown import compute_mean, write_mean, write_table
+from topomerge.evaluation.documents import compute_mean, write_mean, write_table
 from topomerge.evaluation.scans import Case, Scan, load_scan
-from topomerge.evaluation.tasks import Row, Say, TaskSettings, find_optional_data, measure_missing
+from topomerge.evaluation.tasks import LogFn, Row, TaskSettings, find_optional_data, measure_missing
 from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS
 
@@ -83,7 +83,7 @@ def list_inputs(settings: Settings) -> list[str]:
     return [f"{case.key} {settings.presets}" for case in list_cases(settings)]
 
 
-def measure(settings: Settings, say: Say) -> list[Row]:
+def measure(settings: Settings, log_line: LogFn) -> list[Row]:
     """Measure every case with every preset.
 
     Raises:
@@ -99,7 +99,9 @@ def measure(settings: Settings, say: Say) -> list[Row]:
     items = {f"{case.name} {case.key} {p}{pictures and ' drawn'}": (case, p, scans, data, pictures)
              for case in cases for p in presets}  # fmt: skip
     path = Path(settings.cache) / "evaluation" / "rooms.jsonl"
-    return measure_missing(path, items, measure_case, say, settings, code_digest(*MAKERS, __name__) + digest_presets(presets))
+    return measure_missing(
+        path, items, measure_case, log_line, settings, compute_code_digest(*MAKERS, __name__) + digest_presets(presets)
+    )
 
 
 def digest_presets(presets: Sequence[str]) -> str:
@@ -112,7 +114,7 @@ def digest_presets(presets: Sequence[str]) -> str:
 def measure_case(case: Case, preset: str, scans: Path, data: Path | None, pictures: str) -> Row:
     """Extract a case in this process and compare the map with the truth."""
     row: Row = {"case": case.name, "set": case.set, "place": case.place, "kind": case.building, "preset": preset, "error": ""}
-    with one_thread():
+    with limit_threads():
         load_compiled(preset)
         try:
             scan = load_scan(case, scans, data)
@@ -150,8 +152,8 @@ def load_compiled(preset: str) -> None:
 def score_map(scan: Scan, extracted: Any, name: str, picture: Path | None) -> Row:
     """Score the rooms, doors, edges and storeys of a map; draw them where a file is named."""
     assert scan.truth is not None
-    columns = said(extracted, scan.truth)
-    verdict = judge(extracted, scan.truth, columns)
+    columns = predict_columns(extracted, scan.truth)
+    verdict = evaluate_map(extracted, scan.truth, columns)
     rooms, doors, edges = verdict.rooms, verdict.doors, verdict.edges
     row: Row = {"iou": rooms.iou, "mcc": rooms.mcc, "precision": rooms.precision, "recall": rooms.recall}
     row |= {"door_precision": doors.precision, "door_recall": doors.recall}
@@ -160,7 +162,7 @@ def score_map(scan: Scan, extracted: Any, name: str, picture: Path | None) -> Ro
     order = [i for i in np.argsort(rooms.each, kind="stable") if scan.truth.visited[i]][:4]
     row["worst"] = {scan.rooms[i].name or str(i): round(float(rooms.each[i]), 2) for i in order}
     if picture:
-        from topomerge.evaluation.picture import save_picture
+        from topomerge.evaluation.scans import save_picture
 
         title = f"{name}: IoU {rooms.iou:.2f}, MCC {rooms.mcc:.2f}, doors {doors.precision:.2f}/{doors.recall:.2f}"
         title = f"{title}, rooms {verdict.found_rooms}/{verdict.true_rooms}"

@@ -25,11 +25,11 @@ from pathlib import Path
 
 from topomerge import __version__
 from topomerge.code_digest import read_commit
-from topomerge.datasets.core.script import exit_status
-from topomerge.datasets.plans.sealed import SEALED, sealed_run
+from topomerge.datasets.core.builder import run_script
+from topomerge.datasets.plans.sealed import SEALED, open_sealed_set
 from topomerge.errors import InputError
-from topomerge.evaluation.sealed_measures import SEALED_PARTS, Row, SealedItem, items_of, measured, tables
-from topomerge.io.atomic import replacing
+from topomerge.evaluation.sealed_measures import SEALED_PARTS, Row, SealedItem, format_tables, list_items, measured
+from topomerge.io.archive import replace_on_success
 
 ROOT = Path(__file__).parent.parent.parent
 PAGE = ROOT / "docs" / "results" / "sealed.md"
@@ -40,9 +40,9 @@ once a release by `make sealed`. Blocks are appended, never written again.
 """
 
 
-def sealed_rows(item: SealedItem, split: str) -> list[Row]:
+def measure_sealed_item(item: SealedItem, split: str) -> list[Row]:
     """The rows of an item, in this process; the gate is open for as long as that takes."""
-    with sealed_run() if split == SEALED else nullcontext():
+    with open_sealed_set() if split == SEALED else nullcontext():
         return measured(item)
 
 
@@ -52,12 +52,14 @@ def run(
     """Measure everything of these parts, in the order of the items."""
     from joblib import Parallel, delayed
 
-    with sealed_run() if split == SEALED else nullcontext():
-        items = [item for item in items_of(split, data, public, small) if item.part in parts]
+    with open_sealed_set() if split == SEALED else nullcontext():
+        items = [item for item in list_items(split, data, public, small) if item.part in parts]
     print(f"sealed: {len(items)} items", file=sys.stderr, flush=True)
     if jobs == 1:
-        return [row for item in items for row in sealed_rows(item, split)]
-    made: Iterable[list[Row]] = Parallel(jobs, batch_size=1, pre_dispatch=jobs)(delayed(sealed_rows)(i, split) for i in items)
+        return [row for item in items for row in measure_sealed_item(item, split)]
+    made: Iterable[list[Row]] = Parallel(jobs, batch_size=1, pre_dispatch=jobs)(
+        delayed(measure_sealed_item)(i, split) for i in items
+    )
     return [row for rows in made for row in rows]
 
 
@@ -67,7 +69,7 @@ def commit() -> str:
     return f"{named[:12]} with changes that are not committed" if changed else named[:12]
 
 
-def blocks(text: str) -> list[str]:
+def list_blocks(text: str) -> list[str]:
     """Versions of the blocks of a page."""
     return re.findall(r"(?m)^## \d{4}-\d\d-\d\d \d\d:\d\d UTC: version (\S+?)(?:,|$)", text)
 
@@ -78,11 +80,11 @@ def check_page(page: Path, version: str, again: bool) -> None:
     Raises:
         InputError: it was measured, and nobody asks for it again.
     """
-    if not again and page.is_file() and version in blocks(page.read_text(encoding="utf-8")):
+    if not again and page.is_file() and version in list_blocks(page.read_text(encoding="utf-8")):
         raise InputError(f"{page}: has a block of version {version}; a version is measured once (--again does it once more)")
 
 
-def block(rows: Sequence[Row], version: str, command: str, seconds: float, before: int) -> str:
+def format_block(rows: Sequence[Row], version: str, command: str, seconds: float, before: int) -> str:
     """What is appended.
 
     Args:
@@ -93,17 +95,17 @@ def block(rows: Sequence[Row], version: str, command: str, seconds: float, befor
     title = f"## {now}: version {version}" + (f", commit {source}" if source else "")
     again = f" This version had been measured {before} times before: the set was not sealed for it any more." if before else ""
     took = f"`{command}`, {seconds / 60:.0f} minutes.{again}"
-    return "\n".join(["", title, "", took, "", *tables(rows), ""])
+    return "\n".join(["", title, "", took, "", *format_tables(rows), ""])
 
 
-def append(page: Path, text: str) -> None:
+def append_text(page: Path, text: str) -> None:
     """Add text to the end of a page: what stands there stays as it is, byte for byte, and the page is whole at any time."""
     before = page.read_bytes() if page.is_file() else HEAD.encode()
-    with replacing(page) as beside:
+    with replace_on_success(page) as beside:
         beside.write_bytes(before + text.encode())
 
 
-def public_sets(words: Sequence[str]) -> list[tuple[str, Path]]:
+def parse_public_sets(words: Sequence[str]) -> list[tuple[str, Path]]:
     """Sources and folders of SOURCE=FOLDER.
 
     Raises:
@@ -120,7 +122,7 @@ def public_sets(words: Sequence[str]) -> list[tuple[str, Path]]:
     return out
 
 
-def arguments(words: Sequence[str]) -> argparse.Namespace:
+def parse_arguments(words: Sequence[str]) -> argparse.Namespace:
     """What the command line says."""
     parser = argparse.ArgumentParser(
         prog="python -m topomerge.evaluation.sealed", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -136,27 +138,27 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
 
 def measure_and_append(words: Sequence[str]) -> None:
     """The whole run."""
-    options = arguments(words)
+    options = parse_arguments(words)
     page = options.page or (None if options.small else PAGE)
     if page:
         check_page(page, __version__, options.again)
-    before = blocks(page.read_text(encoding="utf-8")).count(__version__) if page and page.is_file() else 0
+    before = list_blocks(page.read_text(encoding="utf-8")).count(__version__) if page and page.is_file() else 0
     data = Path(os.environ["TOPOMERGE_DATA"]) if os.environ.get("TOPOMERGE_DATA") and not options.small else None
     began = time.time()
-    split, public = "train" if options.small else SEALED, public_sets(options.public)
+    split, public = "train" if options.small else SEALED, parse_public_sets(options.public)
     rows = run(split, data, public, options.jobs, options.small, options.parts)
-    text = block(
+    text = format_block(
         rows, __version__, shlex.join(["python", "-m", "topomerge.evaluation.sealed", *words]), time.time() - began, before
     )
     if page:
-        append(page, text)
+        append_text(page, text)
     print(text)
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Run; the exit status."""
     said = list(sys.argv[1:] if words is None else words)
-    return exit_status("sealed", lambda: measure_and_append(said), "nothing was written")
+    return run_script("sealed", lambda: measure_and_append(said), "nothing was written")
 
 
 if __name__ == "__main__":

@@ -9,13 +9,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from topomerge.datasets.pairs.recipe import Recipe
-from topomerge.embedding.context import CONTEXT_KINDS
-from topomerge.embedding.embedders import EMBEDDERS
-from topomerge.embedding.weights import EMBEDDER_FILE, PRETRAINED, find_embedder, read_embedder_card
+from topomerge.datasets.pairs.items import Recipe
+from topomerge.embedding.engineered import CONTEXT_KINDS
+from topomerge.embedding.learned import EMBEDDER_FILE, EMBEDDERS, PRETRAINED, find_embedder, read_embedder_card
 from topomerge.errors import InputError
 from topomerge.fusion.inputs import POSE_SOURCES
-from topomerge.io.listing import plain
+from topomerge.io.listing import convert_to_plain
 
 LEARNED_METHODS = ("mutual", "attention")  # of a trained embedder only
 EVALUATED_METHODS = ("full", "assignment", "growing", "consistent", *LEARNED_METHODS)
@@ -134,14 +133,14 @@ def check(settings: Evaluation) -> None:
     for run in settings.run:
         if run != PRETRAINED and not Path(run).exists():
             raise InputError(f"run={run}: no such folder or file; name a run that was trained")
-        if not runs_in(run):
+        if not list_runs(run):
             raise InputError(f"run={run}: no run, and no folder of runs; name a run that was trained")
-    names = [v.name for v in variants(settings)]
+    names = [v.name for v in iter_variants(settings)]
     if again := next((name for name in names if names.count(name) > 1), ""):
         raise InputError(f"run: two are called {again!r}; rename a folder, or set titles=true")
 
 
-def variants(settings: Evaluation) -> Iterator[Variant]:
+def iter_variants(settings: Evaluation) -> Iterator[Variant]:
     """Everything that describes rooms: each descriptor at each k (with k = 0 there is one context), then each run."""
     for name in settings.only:
         for k in settings.k:
@@ -150,13 +149,13 @@ def variants(settings: Evaluation) -> Iterator[Variant]:
                 methods = tuple(m for m in methods if m != "consistent" or k in settings.slow_k)
                 title = name if not k else f"{name} k={k} {how}"
                 yield Variant(title, name, k, how, methods)
-    for run in (each for folder in settings.run for each in runs_in(folder)):
-        name = run_title(run) if settings.titles else run_name(run)
+    for run in (each for folder in settings.run for each in list_runs(folder)):
+        name = format_run_title(run) if settings.titles else get_run_name(run)
         yield Variant(name, name, methods=tuple(settings.methods), run=run)
 
 
-def runs_in(run: str) -> list[str]:
-    """The run itself, or those in a folder of runs that have a trained embedder, by name."""
+def list_runs(run: str) -> list[str]:
+    """Return the run itself, or those in a folder of runs that have a trained embedder, by name."""
     path = Path(run)
     runs = sorted(path.glob(f"*/best/{EMBEDDER_FILE}"))
     if not runs or (path / EMBEDDER_FILE).exists() or (path / "best" / EMBEDDER_FILE).exists():
@@ -164,14 +163,14 @@ def runs_in(run: str) -> list[str]:
     return [str(best.parent.parent) for best in runs]
 
 
-def run_name(run: str) -> str:
-    """What a run is called in tables: its folder."""
+def get_run_name(run: str) -> str:
+    """Return the name of a run in tables: that of its folder."""
     path = Path(run)
     return path.parent.name if path.is_file() or path.name in ("best", "last") else path.name
 
 
-def run_title(run: str) -> str:
-    """What a run is made of: geometry, node encoder, loss, and the seed if it is not 0.
+def format_run_title(run: str) -> str:
+    """Describe a run: geometry, node encoder, loss, and the seed if it is not 0.
 
     Node encoders: `bare` has no features of edges, `paper` has them in the attention only, `doors` pairs of doors, `around` the
     rooms nearby, `ways` in which direction they are.
@@ -193,14 +192,14 @@ def run_title(run: str) -> str:
     return f"{' + '.join(network.geometry.parts)}, {' '.join(words)}, {about.get('loss', 'infonce')}{seed}"
 
 
-def folder_of(settings: Evaluation) -> Path:
-    """Where the evaluation is written."""
-    name = settings.name or "-".join([settings.data.name, *(run_name(r) for r in settings.run)])
+def get_folder(settings: Evaluation) -> Path:
+    """Return the folder that the evaluation is written to."""
+    name = settings.name or "-".join([settings.data.name, *(get_run_name(r) for r in settings.run)])
     return Path(settings.folder) / name
 
 
-def prediction_settings(settings: Evaluation) -> dict[str, Any]:
-    """What the predictions depend on, as plain values; the weights of runs as a digest."""
+def collect_prediction_settings(settings: Evaluation) -> dict[str, Any]:
+    """Collect the settings that predictions depend on, as plain values; weights of runs as a digest."""
     keys = ("data", "limit", "descriptors", "k", "context", "methods", "slow_k", "merge", "walls_alone", "mergers")
     options = {k: v for k, v in asdict(settings).items() if k in keys}
     options["data"].pop("trained")
@@ -210,22 +209,22 @@ def prediction_settings(settings: Evaluation) -> dict[str, Any]:
         options["poses"] = settings.poses
     if not settings.run:
         options["methods"] = [m for m in settings.methods if m not in LEARNED_METHODS]
-    runs = {v.name: digest_of(v.run) for v in variants(settings) if v.run}
-    plain_settings: dict[str, Any] = plain({"format": PREDICTIONS_FORMAT, **options, "run": runs})
+    runs = {v.name: compute_digest(v.run) for v in iter_variants(settings) if v.run}
+    plain_settings: dict[str, Any] = convert_to_plain({"format": PREDICTIONS_FORMAT, **options, "run": runs})
     return plain_settings
 
 
-def digest_of(run: str) -> str:
-    """Hash of a trained embedder's weights."""
+def compute_digest(run: str) -> str:
+    """Return hash of a trained embedder's weights."""
     return hashlib.sha256(find_embedder(run).read_bytes()).hexdigest()[:16]
 
 
-def difference(old: Mapping[str, Any], new: Mapping[str, Any], at: str = "") -> str:
-    """The first key in which two settings differ, with both values; empty where they do not."""
+def find_difference(old: Mapping[str, Any], new: Mapping[str, Any], at: str = "") -> str:
+    """Return the first key in which two settings differ, with both values; empty where they do not."""
     for key in sorted({*old, *new}):
         a, b = old.get(key), new.get(key)
         if isinstance(a, Mapping) and isinstance(b, Mapping):
-            if nested_difference := difference(a, b, f"{at}{key}."):
+            if nested_difference := find_difference(a, b, f"{at}{key}."):
                 return nested_difference
         elif json.dumps(a) != json.dumps(b):
             return f"{at}{key}: {json.dumps(a)} there, {json.dumps(b)} now"

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from topomerge.evaluation.groups import Value, gain, value
+from topomerge.evaluation.groups import Value, compute_gain, compute_value
 from topomerge.evaluation.score import Row
 from topomerge.evaluation.settings import Evaluation
-from topomerge.io.atomic import replacing
+from topomerge.io.archive import replace_on_success
 
 BY = {
     "overlap": "Share of rooms in common, or kind of hard negative",
@@ -47,15 +47,15 @@ class Table:
     rows: Sequence[Sequence[str]]
     names: int = 1
 
-    def markdown(self) -> str:
+    def format_markdown(self) -> str:
         lines = ["| " + " | ".join(self.head) + " |", "|" + "---|" * len(self.head)]
         return f"{self.title}\n\n" + "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in self.rows)])
 
-    def latex(self) -> str:
+    def format_latex(self) -> str:
         columns = "l" * self.names + "r" * (len(self.head) - self.names)
-        lines = [" & ".join(_escaped(c) for c in row) + r" \\" for row in (self.head, *self.rows)]
+        lines = [" & ".join(_escape_latex(c) for c in row) + r" \\" for row in (self.head, *self.rows)]
         body = "\n".join([lines[0], r"\midrule", *lines[1:]])
-        caption = f"\\caption{{{_escaped(self.title)}}}"
+        caption = f"\\caption{{{_escape_latex(self.title)}}}"
         opening = [
             r"\begin{table}",
             r"\centering",
@@ -68,14 +68,14 @@ class Table:
         return "\n".join([*opening, r"\end{tabular}", r"\end{table}"])
 
 
-def _escaped(text: str) -> str:
+def _escape_latex(text: str) -> str:
     text = re.sub(r"([&%$#_{}])", r"\\\1", text)
     for plain, tex in (("²", r"$^2$"), ("°", r"$^\circ$"), ("≥", r"$\geq$"), ("<", r"$<$"), (">", r"$>$"), ("–", "--")):
         text = text.replace(plain, tex)
     return text
 
 
-def cell(v: Value, interval: bool = True) -> str:
+def format_value(v: Value, interval: bool = True) -> str:
     """0.52 [0.47, 0.58], or of fewer than eight buildings 0.52, 0.47–0.58 (4 buildings); – where nothing was counted."""
     if not np.isfinite(v.value):
         return "–"
@@ -86,8 +86,8 @@ def cell(v: Value, interval: bool = True) -> str:
     )
 
 
-def by(rows: Sequence[Row], key: str) -> dict[str, list[Row]]:
-    """Rows by what they say under a key, in the order of their names."""
+def group_by(rows: Sequence[Row], key: str) -> dict[str, list[Row]]:
+    """Return rows by what they say under a key, in the order of their names."""
     out: dict[str, list[Row]] = {}
     for row in rows:
         out.setdefault(str(row[key]), []).append(row)
@@ -95,43 +95,46 @@ def by(rows: Sequence[Row], key: str) -> dict[str, list[Row]]:
     return {name: out[name] for name in order if name in out}
 
 
-def ranking(ranks: Sequence[Row], settings: Evaluation) -> Table:
-    """How high the true partner of a room ranks among all rooms of the other map."""
+def tabulate_ranking(ranks: Sequence[Row], settings: Evaluation) -> Table:
+    """Tabulate how high the true partner of a room ranks among all rooms of the other map."""
     first = [r for r in ranks if r["variant"] == settings.baseline]
     rows, after = [], AFTER if any(np.isfinite(r["first_after"]) for r in ranks) else ()
-    for name, variant_rows in by_variant(ranks).items():
-        better = gain(variant_rows, first, "recall@1", settings.rounds) if name != settings.baseline else None
-        cells = [cell(value(variant_rows, m, settings.rounds), m in ("recall@1", "recall@5")) for m in RANKING]
+    for name, variant_rows in group_by_variant(ranks).items():
+        better = compute_gain(variant_rows, first, "recall@1", settings.rounds) if name != settings.baseline else None
+        cells = [format_value(compute_value(variant_rows, m, settings.rounds), m in ("recall@1", "recall@5")) for m in RANKING]
         took = np.median([r["seconds"] for r in variant_rows])
-        cells += [_signed(better), *(cell(value(variant_rows, m, settings.rounds), m == AFTER[0]) for m in after)]
+        cells += [
+            _format_signed(better),
+            *(format_value(compute_value(variant_rows, m, settings.rounds), m == AFTER[0]) for m in after),
+        ]
         rows.append([name, *cells, f"{took:.2f}"])
     more = f"recall@1 gain over {settings.baseline}"
     head = ["descriptor", *(METRIC_NAMES[m] for m in RANKING), more, *(METRIC_NAMES[m] for m in after), "s per pair"]
     return Table("Ranking of rooms: is a room's true partner the nearest?", head, rows)
 
 
-def _signed(v: Value | None) -> str:
+def _format_signed(v: Value | None) -> str:
     if v is None or not np.isfinite(v.value):
         return ""
     ends = f", {v.low:+.2f} to {v.high:+.2f} ({v.counted} buildings)" if v.ranged else f" [{v.low:+.2f}, {v.high:+.2f}]"
     return f"{v.value:+.2f}{ends}"
 
 
-def by_variant(rows: Sequence[Row], key: Callable[[Row], str] = lambda r: r["variant"]) -> dict[str, list[Row]]:
+def group_by_variant(rows: Sequence[Row], key: Callable[[Row], str] = lambda r: r["variant"]) -> dict[str, list[Row]]:
     out: dict[str, list[Row]] = {}
     for row in rows:
         out.setdefault(key(row), []).append(row)
     return out
 
 
-def matching(matches: Sequence[Row], settings: Evaluation) -> Table:
+def tabulate_matching(matches: Sequence[Row], settings: Evaluation) -> Table:
     """Precision, recall and F1 of each descriptor and method where maps share rooms; how many matches there are where not."""
     rows = []
-    for name, variant_rows in by_variant(matches).items():
-        for method, these in by_variant(variant_rows, lambda r: r["method"]).items():
-            sharing, apart = shares(these)
-            cells = [cell(value(sharing, m, settings.rounds), m == "F1") for m in MATCHING]
-            large = cell(value([r for r in these if r["large"]], "F1", settings.rounds))
+    for name, variant_rows in group_by_variant(matches).items():
+        for method, these in group_by_variant(variant_rows, lambda r: r["method"]).items():
+            sharing, apart = split_shared(these)
+            cells = [format_value(compute_value(sharing, m, settings.rounds), m == "F1") for m in MATCHING]
+            large = format_value(compute_value([r for r in these if r["large"]], "F1", settings.rounds))
             wrong = f"{np.mean([r['predicted'] for r in apart]):.1f}" if apart else "–"
             rows.append([name, method, *cells, large, wrong, f"{np.median([r['seconds'] for r in these]):.2f}"])
     metrics = (METRIC_NAMES[m] for m in MATCHING)
@@ -139,76 +142,81 @@ def matching(matches: Sequence[Row], settings: Evaluation) -> Table:
     return Table("Room matches, on pairs that share rooms", head, rows, 2)
 
 
-def beside(matches: Sequence[Row], settings: Evaluation) -> Table:
+def tabulate_methods(matches: Sequence[Row], settings: Evaluation) -> Table:
     """Precision, recall and F1 of the methods beside each other, a line a descriptor: the thesis' table, with recall."""
     methods = list(dict.fromkeys(m["method"] for m in matches))
     rows = []
-    for name, variant_rows in by_variant(shares(matches)[0]).items():
+    for name, variant_rows in group_by_variant(split_shared(matches)[0]).items():
         cells = []
         for method in methods:
             these = [r for r in variant_rows if r["method"] == method]
-            both = " / ".join(cell(value(these, m, settings.rounds), False) for m in ("precision", "recall"))
-            cells += [both if these else "–", cell(value(these, "F1", settings.rounds))]
+            both = " / ".join(format_value(compute_value(these, m, settings.rounds), False) for m in ("precision", "recall"))
+            cells += [both if these else "–", format_value(compute_value(these, "F1", settings.rounds))]
         rows.append([name, *cells])
     head = ["descriptor", *(text for m in methods for text in (f"{m}: P / R", f"{m}: F1"))]
     return Table("Room matches by method, on pairs that share rooms", head, rows)
 
 
-def shares(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
-    """Rows of pairs that share rooms, and of those that share none."""
+def split_shared(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
+    """Return rows of pairs that share rooms, and of those that share none."""
     return [r for r in rows if r["units"]], [r for r in rows if not r["units"]]
 
 
-def grouped(ranks: Sequence[Row], matches: Sequence[Row], key: str, settings: Evaluation) -> Table:
+def tabulate_groups(ranks: Sequence[Row], matches: Sequence[Row], key: str, settings: Evaluation) -> Table:
     """recall@1, and F1 of each method, for each group and descriptor without context or trained one."""
     rows = []
-    matches_by_group = by(matches, key)
-    for group, group_rows in by(ranks, key).items():
-        for name, these in by_variant([r for r in group_rows if r["k"] == 0]).items():
-            sharing = shares([m for m in matches_by_group.get(group, []) if m["variant"] == name])[0]
-            matches_by_method = by_variant(sharing, lambda r: r["method"])
-            cells = [cell(value(matches_by_method.get(m, []), "F1", settings.rounds)) for m in _methods(matches)]
-            pairs = value(these, "recall@1", settings.rounds)
-            rows.append([group, str(pairs.pairs), str(pairs.buildings), name, cell(pairs), *cells])
-    head = [key, "pairs", "buildings", "descriptor", "recall@1", *(f"F1 {m}" for m in _methods(matches))]
+    matches_by_group = group_by(matches, key)
+    for group, group_rows in group_by(ranks, key).items():
+        for name, these in group_by_variant([r for r in group_rows if r["k"] == 0]).items():
+            sharing = split_shared([m for m in matches_by_group.get(group, []) if m["variant"] == name])[0]
+            matches_by_method = group_by_variant(sharing, lambda r: r["method"])
+            cells = [
+                format_value(compute_value(matches_by_method.get(m, []), "F1", settings.rounds)) for m in _list_methods(matches)
+            ]
+            pairs = compute_value(these, "recall@1", settings.rounds)
+            rows.append([group, str(pairs.pairs), str(pairs.buildings), name, format_value(pairs), *cells])
+    head = [key, "pairs", "buildings", "descriptor", "recall@1", *(f"F1 {m}" for m in _list_methods(matches))]
     return Table(BY[key], head, rows, 4)
 
 
-def _methods(matches: Sequence[Row]) -> list[str]:
+def _list_methods(matches: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(m["method"] for m in matches if m["k"] == 0))
 
 
-def curves(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row], settings: Evaluation) -> Table:
+def tabulate_robustness(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row], settings: Evaluation) -> Table:
     """recall@1, F1 and merges against what was changed."""
     rows = []
-    for change, changed in by([m for m in matches if m["change"]], "change").items():
+    for change, changed in group_by([m for m in matches if m["change"]], "change").items():
         for v in sorted({m["value"] for m in changed}):
-            for name in by_variant([m for m in changed if m["k"] == 0]):
+            for name in group_by_variant([m for m in changed if m["k"] == 0]):
                 these = [m for m in changed if m["value"] == v and m["variant"] == name]
-                cells = [cell(value([m for m in these if m["method"] == k], "F1", settings.rounds)) for k in _methods(matches)]
+                cells = [
+                    format_value(compute_value([m for m in these if m["method"] == k], "F1", settings.rounds))
+                    for k in _list_methods(matches)
+                ]
                 there = [r for r in ranks if (r["change"], r["value"], r["variant"]) == (change, v, name)]
                 joined = [r for r in merges if (r["change"], r["value"], r["variant"]) == (change, v, name)]
-                first = value(there, "recall@1", settings.rounds)
-                right = cell(value(joined, "merged", settings.rounds), False)
-                rows.append([change, f"{v:g}", name, str(first.pairs), cell(first), *cells, right])
-    head = ["change", "value", "descriptor", "pairs", "recall@1", *(f"F1 {m}" for m in _methods(matches)), "merged right"]
+                first = compute_value(there, "recall@1", settings.rounds)
+                right = format_value(compute_value(joined, "merged", settings.rounds), False)
+                rows.append([change, f"{v:g}", name, str(first.pairs), format_value(first), *cells, right])
+    head = ["change", "value", "descriptor", "pairs", "recall@1", *(f"F1 {m}" for m in _list_methods(matches)), "merged right"]
     return Table("Robustness", head, rows, 3)
 
 
-def long_rows(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row], settings: Evaluation) -> Iterator[Row]:
+def iter_long_rows(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row], settings: Evaluation) -> Iterator[Row]:
     """Every metric of every group, one a row, for other tools."""
     for rows, metrics in ((ranks, (*RANKING, *AFTER)), (matches, MATCHING), (merges, (*MERGING, "false"))):
-        for (variant, method), variant_rows in _pairs(rows).items():
+        for (variant, method), variant_rows in _group_by_variant_and_method(rows).items():
             for key in ("all", *BY):
-                for group, these in {"all": variant_rows}.items() if key == "all" else by(variant_rows, key).items():
-                    sharing = shares(these)[0] if rows is matches else these
+                for group, these in {"all": variant_rows}.items() if key == "all" else group_by(variant_rows, key).items():
+                    sharing = split_shared(these)[0] if rows is matches else these
                     for metric in metrics:
-                        v = value(sharing, metric, min(settings.rounds, 500))
+                        v = compute_value(sharing, metric, min(settings.rounds, 500))
                         head = {"variant": variant, "method": method, "by": key, "group": group, "metric": metric}
                         yield {**head, "value": v.value, "low": v.low, "high": v.high, "pairs": v.pairs, "buildings": v.buildings}
 
 
-def _pairs(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
+def _group_by_variant_and_method(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
     out: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         out.setdefault((row["variant"], row.get("method", "")), []).append(row)
@@ -220,7 +228,7 @@ def write_csv(rows: Sequence[Row], path: Path) -> None:
     if not rows:
         return
     names = [n for n in rows[0] if not isinstance(rows[0][n], list)]
-    with replacing(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
+    with replace_on_success(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, names, extrasaction="ignore")
         writer.writeheader()
         writer.writerows({n: f"{r[n]:.6g}" if isinstance(r[n], float) else r[n] for n in names} for r in rows)
@@ -233,5 +241,5 @@ def write_section(path: Path, mark: str, text: str) -> None:
     if begin not in page or end not in page:
         page = f"{page.rstrip()}\n\n## {mark.capitalize()}\n\n{begin}\n{end}\n"
     before, rest = page.split(begin, 1)
-    with replacing(path) as beside:
+    with replace_on_success(path) as beside:
         beside.write_text(f"{before}{begin}\n{text}\n{end}{rest.split(end, 1)[1]}", encoding="utf-8")

@@ -8,22 +8,34 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol, cast
 
-from topomerge.code_digest import code_digest
-from topomerge.config import typed
+import numpy as np
+
+from topomerge.code_digest import compute_code_digest
+from topomerge.config import compose, convert_to_dataclass
+from topomerge.datasets.core.building import find_physical_building
+from topomerge.datasets.pairs.build import Build
+from topomerge.datasets.pairs.grid_drawings import build_drawings
+from topomerge.datasets.pairs.grid_pairs import GridPair, build_grids, draw_grid_items
+from topomerge.datasets.pairs.lookalikes import LookalikeRecipe, build_lookalikes
+from topomerge.datasets.real.maps import iter_real_grid_pairs
 from topomerge.errors import InputError
 from topomerge.evaluation.documents import build_stamp, write_blocks
 from topomerge.evaluation.headline import write_headline
-from topomerge.io.atomic import replacing
+from topomerge.io.archive import replace_on_success
+from topomerge.training.tasks import compose_settings
+from topomerge.types import Array, Sim3
 
 Row = dict[str, Any]
-Say = Callable[[str], None]
+LogFn = Callable[[str], None]
 MODULES = {
     "rooms": "rooms",
     "doors": "doors",
@@ -81,7 +93,7 @@ class EvaluationModule(Protocol):
     Settings: type[TaskSettings]
     MAKERS: tuple[str, ...]
 
-    def measure(self, settings: Any, say: Say) -> list[Row]:
+    def measure(self, settings: Any, log_line: LogFn) -> list[Row]:
         """Measure what is missing; all rows."""
 
     def tabulate(self, rows: Sequence[Row], settings: Any) -> dict[str, str]:
@@ -122,22 +134,22 @@ def read_settings(task: str, words: Sequence[str]) -> Any:
             raise InputError(f"{word}: give KEY=VALUE, such as data=dev")
     quoted = [f"{key}='{value}'" if key in ("data.set", "data.only") else word
               for word in plain for key, _, value in [word.partition("=")]]  # fmt: skip
-    return typed(OmegaConf.from_dotlist(quoted), load_task(task).Settings)
+    return convert_to_dataclass(OmegaConf.from_dotlist(quoted), load_task(task).Settings)
 
 
-def run_task(task: str, words: Sequence[str], say: Say) -> Outcome:
+def run_task(task: str, words: Sequence[str], log_line: LogFn) -> Outcome:
     """Measure, tabulate, keep, and write where asked.
 
     Raises:
         InputError: settings that nothing can be made of, or data that is missing.
     """
     module, settings = load_task(task), read_settings(task, words)
-    rows = module.measure(settings, say)
+    rows = module.measure(settings, log_line)
     blocks = module.tabulate(rows, settings)
     summary = "\n\n".join(blocks.values())
     folder = Path(settings.folder) / f"{task}-{(settings.data.set or 'default').replace(',', '-').replace('/', '-')}"
     folder.mkdir(parents=True, exist_ok=True)
-    with replacing(folder / "report.md") as beside:
+    with replace_on_success(folder / "report.md") as beside:
         beside.write_text(f"# {folder.name}\n\n{summary}\n", encoding="utf-8")
     stamp = build_stamp(
         shlex.join(["python", "evaluate.py", f"task={task}", *(w for w in words if not w.startswith("task="))]),
@@ -176,7 +188,7 @@ def list_inputs_of(command: str) -> list[str] | None:
 
 
 def measure_missing(
-    path: Path, items: Mapping[str, Any], work: Callable[..., Row], say: Say, settings: TaskSettings, code: str = ""
+    path: Path, items: Mapping[str, Any], work: Callable[..., Row], log_line: LogFn, settings: TaskSettings, code: str = ""
 ) -> list[Row]:
     """Measure the items that a file of rows does not have, one line of JSON each; the rows of all items.
 
@@ -186,12 +198,12 @@ def measure_missing(
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = {} if settings.remake else read_rows(path)
-    now = code or code_digest(work.__module__)
+    now = code or compute_code_digest(work.__module__)
     older = [name for name in items if name in rows and rows[name].get("code") != now]
     if code:
         rows = {name: row for name, row in rows.items() if name not in set(older)}
     elif older:
-        say(f"{path}: {len(older)} of {len(items)} rows are of another state of the code; remake=true measures them again")
+        log_line(f"{path}: {len(older)} of {len(items)} rows are of another state of the code; remake=true measures them again")
     missing = {name: arguments for name, arguments in items.items() if name not in rows}
     if settings.remake:
         path.unlink(missing_ok=True)
@@ -200,7 +212,7 @@ def measure_missing(
             rows[row["name"]] = row | {"code": now}
             file.write(json.dumps(rows[row["name"]]) + "\n")
             file.flush()
-            say(f"{done} of {len(missing)}: {row['name']}")
+            log_line(f"{done} of {len(missing)}: {row['name']}")
     return [rows[name] for name in items if name in rows]
 
 
@@ -247,3 +259,116 @@ def find_optional_data() -> Path | None:
 def limit_cases(cases: Sequence[Any], settings: TaskSettings) -> list[Any]:
     """Limit cases to those whose name is asked for, and to so many."""
     return [case for case in cases if settings.data.only in case.name][: settings.data.limit or None]
+
+
+SETS = {"train": "grids", "test": "grids_heldout"}
+LOOKALIKE_SETS = {"train": "lookalikes", "test": "lookalikes_heldout"}
+DRAWN = "_drawings"  # of the names of splits
+SCALELESS = ("halmstad",)  # no metres per pixel are known
+# Split -> sources of `datasets.real`; None: all that evaluate.
+REAL_SPLITS = {"real": None, "development": ("office_floor",), "storeys": ("storeys",)}
+
+
+@dataclass
+class LookalikeBuild(Build):
+    """Settings of the build of look-alikes."""
+
+    data: LookalikeRecipe = field(default_factory=LookalikeRecipe)  # type: ignore[assignment]
+
+
+def make_pair_files(split: str, cache: str, jobs: int, log_line: LogFn) -> list[Path]:
+    """Make the files of a split, ``test_drawings`` among them, that are missing; all in their order.
+
+    Raises:
+        InputError: nothing tells where the real plans are, of which many pairs are.
+    """
+    find_real_data()
+    settings = read_recipe(split, (f"cache={cache}", f"jobs={jobs}"))
+    made = build_drawings if split.endswith(DRAWN) else build_grids
+    return list(made(settings.data, settings, log_line)[0])
+
+
+def make_lookalike_files(split: str, cache: str, jobs: int, log_line: LogFn) -> list[Path]:
+    """Make the files of look-alikes of a split that are missing; all in their order."""
+    settings = compose("build", LookalikeBuild, [f"data={LOOKALIKE_SETS[split]}", f"cache={cache}", f"jobs={jobs}"])
+    paths, report = build_lookalikes(settings.data, settings, log_line)
+    log_line(f"{report.items} pairs, {report.made} made now; refused: {report.refused}")
+    return paths
+
+
+def iterate_real_pairs(split: str = "real") -> Iterator[GridPair]:
+    """Iterate over the real pairs, at 0.1 m; of splits ``development`` and ``storeys`` those that one may choose by."""
+    return iter_real_grid_pairs(str(find_real_data()), REAL_SPLITS[split])
+
+
+def convert_to_upright(matrix: Array, pair: GridPair) -> Sim3 | None:
+    """Turn a pose into one under gravity that keeps the place where errors are measured; None where the map was turned over."""
+    if not np.isfinite(matrix).all() or matrix[2, 2] < 0.9:
+        return None
+    yaw = float(np.arctan2(matrix[1, 0], matrix[0, 0]))
+    placed = matrix[:3, :3] @ pair.anchor + matrix[:3, 3] - Sim3(yaw).apply(pair.anchor[None])[0]
+    x, y, z = placed.tolist()
+    return Sim3(yaw, (x, y, z))
+
+
+@cache
+def map_other_buildings(split: str) -> dict[tuple[int, int], str]:
+    """Of pairs of two buildings, by set and number: the name of the second one, which the files do not tell."""
+    items, _ = draw_grid_items(read_recipe(split).data)
+    out = {}
+    for k in items:
+        if k.item.hard == "other-building":
+            name = k.item.other[0]
+            out[k.set, k.number] = f"{k.item.kind}-{name}-{k.item.storeys}" if k.item.source == "procedural" else name
+    return out
+
+
+def find_buildings(pair: GridPair, split: str) -> tuple[str, str]:
+    """Names of the buildings of a and of b of a cached pair."""
+    about: dict[str, Any] = pair.about
+    whole = str(about["building"])
+    if about["kind"] != "other-building":
+        return whole, whole
+    if "item" in about:
+        return whole, map_other_buildings(split.removesuffix(DRAWN))[about["set"], about["item"]]
+    first, _, second = whole.rpartition(" + ")  # of a drawing; storeys of one building are joined so, too
+    return first, second
+
+
+def describe_places(names: tuple[str, str], sources: tuple[str, str] | None = None) -> dict[str, str]:
+    """What a row of results tells of where its maps are from: names, sources and physical buildings of a and of b.
+
+    Args:
+        sources: None: as the names of cached pairs tell them.
+    """
+    sources = sources or (find_source(names[0]), find_source(names[1]))
+    physical = [find_physical_building(*of) for of in zip(sources, names, strict=True)]
+    out = {"source": sources[0], "building": names[0], "physical": physical[0]}
+    return out | {"other_source": sources[1], "other": names[1], "physical_other": physical[1]}
+
+
+def list_difficulties(pair: GridPair) -> list[str]:
+    """What makes a cached pair hard beside its kind (`grid_pairs`: every sixth, every eighth)."""
+    difficulty: dict[str, float] = pair.about.get("difficulty", {})  # type: ignore[assignment]
+    limits = {"much moved furniture": ("moved", 0.6), "glass walls": ("glass", 0.5)}
+    return [title for title, (name, least) in limits.items() if difficulty.get(name, 0.0) >= least]
+
+
+def find_source(name: str) -> str:
+    """Find the source of a building, procedural, campus or r2v: what `grid_pairs.WEIGHTS` draws from."""
+    if re.fullmatch(r"[a-z]+-\d+-\d+", name):
+        return "procedural"
+    return "campus" if name.startswith(("school/", "office/")) else "r2v"
+
+
+def read_recipe(split: str, words: tuple[str, ...] = ()) -> Any:
+    """Read the settings of the task that the pairs of a split are made with."""
+    return compose_settings(["task=merge_belief", f"data={SETS[split.removesuffix(DRAWN)]}", *words])
+
+
+def find_places(pair: GridPair, split: str) -> dict[str, str]:
+    """Find source and buildings of a pair (`describe_places`)."""
+    if split in REAL_SPLITS:
+        name, source = str(pair.about["building"]), str(pair.about["source"])
+        return describe_places((name, name), (source, source))
+    return describe_places(find_buildings(pair, split))

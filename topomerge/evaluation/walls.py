@@ -22,11 +22,11 @@ import shapely
 from scipy.spatial import cKDTree
 
 from topomerge.evaluation.cases import dev
-from topomerge.evaluation.markdown import write_table
+from topomerge.evaluation.documents import write_table
 from topomerge.evaluation.scans import Case, Scan, load_scan
-from topomerge.evaluation.tasks import Row, Say, TaskSettings, find_optional_data, limit_cases
+from topomerge.evaluation.tasks import LogFn, Row, TaskSettings, find_optional_data, limit_cases
 from topomerge.extraction.extract import extract
-from topomerge.structure.face_points import FACE_HEIGHTS
+from topomerge.structure.floors import FACE_HEIGHTS
 from topomerge.types import Array, TopometricMap
 
 MAKERS = ("topomerge.extraction.extract", "topomerge.structure.plan_structure", "topomerge.evaluation.scans")
@@ -76,23 +76,23 @@ def list_inputs(settings: TaskSettings) -> list[str]:
     return [case.key for case in limit_cases(draw_cases(settings.data.set == "dev"), settings)]
 
 
-def measure(settings: TaskSettings, say: Say) -> list[Row]:
+def measure(settings: TaskSettings, log_line: LogFn) -> list[Row]:
     """Measure the walls of each scan."""
     rows = []
     for case in limit_cases(draw_cases(settings.data.set == "dev"), settings):
         scan = load_scan(case, Path(settings.cache) / "scans", find_optional_data())
         rows.append({"name": case.name, **score_walls(scan, extract(scan.cloud, voxel_size=0.1))})
-        say(f"{case.name} {rows[-1]['walls']} walls")
+        log_line(f"{case.name} {rows[-1]['walls']} walls")
     return rows
 
 
 def score_walls(scan: Scan, map: TopometricMap) -> Row:
     """Measure the walls of one map."""
-    from topomerge.structure.plan_structure import plan_structure
+    from topomerge.structure.plan_structure import build_plan_structure
 
     assert scan.truth is not None
     began = process_time()
-    structure = plan_structure(map)
+    structure = build_plan_structure(map)
     row: Row = {"seconds": process_time() - began, "walls": len(structure.walls)}
     parts = [measure_storey(scan, map, structure, level) for level in range(len(scan.truth.floors))]
     row |= {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -124,13 +124,13 @@ def measure_storey(scan: Scan, map: TopometricMap, structure: Any, level: int) -
 
 def find_height(scan: Scan, map: TopometricMap, wall: Array) -> float:
     assert scan.truth is not None
-    return float(scan.truth.place(np.array([[*wall["start"], wall["low"]]]))[0, 2])
+    return float(scan.truth.transform_to_building(np.array([[*wall["start"], wall["low"]]]))[0, 2])
 
 
 def place_points(scan: Scan, points: Array, z: float) -> Array:
     """(n, 2) points of the map in the frame of the building."""
     assert scan.truth is not None
-    return scan.truth.place(np.column_stack([points, np.full(len(points), z)]))[:, :2]
+    return scan.truth.transform_to_building(np.column_stack([points, np.full(len(points), z)]))[:, :2]
 
 
 def sample_own_faces(scan: Scan, walls: Array, floor: float) -> tuple[Array, Array, Array]:
@@ -188,7 +188,7 @@ def measure_distances(at: Array, out: Array, others: Array, outs: Array) -> Arra
 def find_seen(scan: Scan, places: Array, floor: float) -> Array:
     truth = scan.truth
     assert truth is not None
-    points = truth.place(scan.cloud.points.astype(np.float64) + scan.cloud.shift)
+    points = truth.transform_to_building(scan.cloud.points.astype(np.float64) + scan.cloud.shift)
     height = points[:, 2] - floor
     upright = points[(height > FACE_HEIGHTS[0]) & (height < FACE_HEIGHTS[1]), :2]
     if not len(upright):
@@ -224,7 +224,7 @@ def check_openings(scan: Scan, map: TopometricMap, structure: Any, floor: float)
     for opening in structure.openings:
         edge = map.edges[opening["edge"]]
         true = truth.doors[np.abs(truth.doors[:, 4] - floor) < LEVEL, 2:4]
-        placed = truth.place(np.stack([edge["centre"], opening["centre"]]))
+        placed = truth.transform_to_building(np.stack([edge["centre"], opening["centre"]]))
         if not len(true) or abs(placed[0, 2] - floor) > LEVEL:
             continue
         off = np.hypot(*(true - placed[0, :2]).T)
@@ -243,10 +243,10 @@ def measure_overlaps(
     scan: Scan, map: TopometricMap, structure: Any, true: list[shapely.Polygon], floor: float
 ) -> dict[str, Array]:
     """(n,) IoU of each visited room with the outline, and with the floor, that overlaps it most."""
-    from topomerge.structure.floors import floor_polygons
+    from topomerge.structure.floors import build_floor_polygons
 
     out = {}
-    for name, shapes in (("iou", structure.rooms), ("iou_floor", floor_polygons(map))):
+    for name, shapes in (("iou", structure.rooms), ("iou_floor", build_floor_polygons(map))):
         placed = []
         for r, shape in enumerate(shapes):
             z = float(map.rooms["centroid"][r, 2])
@@ -256,7 +256,7 @@ def measure_overlaps(
     return out
 
 
-def summary(row: Row) -> dict[str, float]:
+def format_summary(row: Row) -> dict[str, float]:
     """The figures of a map, or of several whose places were put together."""
     finite = row["off"][np.isfinite(row["off"])]
     none = ~(row["off"] <= NONE)
@@ -277,8 +277,8 @@ def tabulate(rows: Sequence[Row], settings: TaskSettings) -> dict[str, str]:
     """Tabulate the maps, and all of their places together."""
     places = [name for name in rows[0] if name not in ("name", "seconds", "walls")]
     whole = {name: np.concatenate([row[name] for row in rows]) for name in places}
-    lines = [write_cells(row["name"], row["walls"], f"{row['seconds']:.1f}", summary(row)) for row in rows]
-    lines.append(write_cells("all", sum(row["walls"] for row in rows), "", summary(whole)))
+    lines = [write_cells(row["name"], row["walls"], f"{row['seconds']:.1f}", format_summary(row)) for row in rows]
+    lines.append(write_cells("all", sum(row["walls"] for row in rows), "", format_summary(whole)))
     return {"walls": write_table(("map", "walls", "s", *COLUMNS.values()), lines)}
 
 

@@ -16,15 +16,15 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from topomerge.code_digest import code_digest
-from topomerge.datasets.buildings.panes import glazed
+from topomerge.code_digest import compute_code_digest
+from topomerge.datasets.buildings.openings import find_windows
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.core.difficulty import Difficulty
+from topomerge.datasets.core.building import Difficulty
 from topomerge.evaluation import doors
 from topomerge.evaluation.cases import BUILDING_KINDS
-from topomerge.evaluation.markdown import write_medians, write_share, write_table
+from topomerge.evaluation.documents import write_medians, write_share, write_table
 from topomerge.evaluation.scans import Case, Scan, load_scan
-from topomerge.evaluation.tasks import Row, Say, TaskSettings, find_optional_data, limit_cases, measure_missing
+from topomerge.evaluation.tasks import LogFn, Row, TaskSettings, find_optional_data, limit_cases, measure_missing
 from topomerge.extraction.extract import extract
 from topomerge.types import Array, TopometricMap
 
@@ -65,12 +65,12 @@ def list_inputs(settings: TaskSettings) -> list[str]:
     return [case.key for case in limit_cases(draw_cases(settings.data.set == "dev"), settings)]
 
 
-def measure(settings: TaskSettings, say: Say) -> list[Row]:
+def measure(settings: TaskSettings, log_line: LogFn) -> list[Row]:
     """Measure the windows of each scan."""
     scans, data = Path(settings.cache) / "scans", find_optional_data()
     items = {case.key: (case, scans, data) for case in limit_cases(draw_cases(settings.data.set == "dev"), settings)}
     path = Path(settings.cache) / "evaluation" / "windows.jsonl"
-    return measure_missing(path, items, measure_case, say, settings, code_digest(*MAKERS, __name__))
+    return measure_missing(path, items, measure_case, log_line, settings, compute_code_digest(*MAKERS, __name__))
 
 
 def measure_case(case: Case, scans: Path, data: Path | None) -> Row:
@@ -83,18 +83,20 @@ def score_windows(case: Case, scan: Scan, map: TopometricMap) -> Row:
     """Count the windows of one map and measure their errors."""
     assert scan.truth is not None
     building = make_building(case.building, case.seed, case.storeys, Difficulty(**dict(case.difficulty)))
-    true = np.array(glazed(building), float).reshape(-1, 7)
+    true = np.array(find_windows(building), float).reshape(-1, 7)
     own = map.windows[~map.rooms["glimpsed"][map.windows["rooms"][:, 0]]]
-    turned = scan.truth.place(own["centre"] + np.column_stack([compute_normals(own["direction"]), np.zeros(len(own))]))
-    at = scan.truth.place(own["centre"])
+    turned = scan.truth.transform_to_building(
+        own["centre"] + np.column_stack([compute_normals(own["direction"]), np.zeros(len(own))])
+    )
+    at = scan.truth.transform_to_building(own["centre"])
     direction = np.arctan2(*(turned - at)[:, 1::-1].T)
     pairs = pair_windows(true, at, direction, own["width"])
-    wanted = find_in_visited(scan, true)
+    requested = find_in_visited(scan, true)
     there = np.isin(np.arange(len(true)), pairs[:, 0])
     t, m = true[pairs[:, 0]], own[pairs[:, 1]]
     errors = {"off": np.linalg.norm((at[pairs[:, 1]] - t[:, :3])[:, :2], axis=1), "width": np.abs(m["width"] - t[:, 4])}
     errors |= {"sill": np.abs(m["sill"] - t[:, 5]), "head": np.abs(m["head"] - t[:, 6])}
-    counts = {"right": [len(pairs), len(own)], "there": [int((there & wanted).sum()), int(wanted.sum())]}
+    counts = {"right": [len(pairs), len(own)], "there": [int((there & requested).sum()), int(requested.sum())]}
     return {"sensor": case.sensor, **counts, **{name: values.tolist() for name, values in errors.items()}}
 
 

@@ -9,12 +9,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from topomerge.extraction.elevations.doorways import StoreyWalls
-from topomerge.extraction.elevations.wall_doors import with_wall_doors
-from topomerge.extraction.elevations.windows import with_windows
+from topomerge.extraction.elevations.wall_doors import add_wall_doors
+from topomerge.extraction.elevations.windows import add_windows
 from topomerge.extraction.plans.storey_plan import Floor
-from topomerge.extraction.room_odds import with_room_odds
+from topomerge.extraction.room_odds import add_room_probabilities
 from topomerge.extraction.scan import Scan
-from topomerge.types import EDGE_DTYPE, Array, TopometricMap, of_rooms
+from topomerge.types import EDGE_DTYPE, Array, TopometricMap, select_rooms
 
 # A doorway joins the two rooms that lie across it, once (beyond the thesis).
 #
@@ -26,34 +26,34 @@ ONE_DOORWAY = 0.5  # m between the centres of what is one doorway
 SIDES_AT = (0.4, 0.6, 0.8)  # m before and behind a door, where its rooms are looked for
 
 
-def distinct_doors(map: TopometricMap) -> TopometricMap:
+def select_distinct_doors(map: TopometricMap) -> TopometricMap:
     """The map with each doorway once: of edges in one place the one whose rooms lie across it, of these the surest."""
     level = np.flatnonzero(np.isin(map.edges["kind"], LEVEL_KINDS))
     doors = map.edges[level]
     same = cKDTree(doors["centre"]).query_ball_point(doors["centre"], ONE_DOORWAY) if len(doors) else ()
     single = np.ones(len(map.edges), bool)
     single[level] = False
-    for k in np.lexsort((-doors["confidence"], ~_between_its_rooms(map, doors))).tolist():
+    for k in np.lexsort((-doors["confidence"], ~_is_between_rooms(map, doors))).tolist():
         single[level[k]] = not single[level[same[k]]].any()
     return map if single.all() else replace(map, edges=map.edges[single])
 
 
-def _between_its_rooms(map: TopometricMap, doors: Array) -> Array:
+def _is_between_rooms(map: TopometricMap, doors: Array) -> Array:
     """(n,) bool: do the rooms of each door lie before and behind it?"""
     normal = np.column_stack([np.cos(doors["direction"]), np.sin(doors["direction"]), np.zeros(len(doors))])
-    wanted, out = np.sort(doors["rooms"], axis=1), np.zeros(len(doors), bool)
+    requested, out = np.sort(doors["rooms"], axis=1), np.zeros(len(doors), bool)
     for reach in SIDES_AT:
-        sides = [rooms_at(map, doors["centre"] + way * reach * normal) for way in (1, -1)]
-        out |= (np.sort(np.column_stack(sides), axis=1) == wanted).all(axis=1)
+        sides = [find_rooms_at(map, doors["centre"] + way * reach * normal) for way in (1, -1)]
+        out |= (np.sort(np.column_stack(sides), axis=1) == requested).all(axis=1)
     return out
 
 
-def rooms_at(map: TopometricMap, floor: Array) -> Array:
+def find_rooms_at(map: TopometricMap, floor: Array) -> Array:
     """(n,) int64 room of the map at each place (n, 3) m of a floor, -1 none. Floors of two maps differ by up to two cells."""
     cells = map.navigable.locate(floor)
     out = np.full(len(cells), -1, np.int64)
     for up in (0, 1, -1, 2, -2):
-        rows = map.navigable.rows(cells + (0, 0, up))
+        rows = map.navigable.find_rows(cells + (0, 0, up))
         missing = (out < 0) & (rows >= 0)
         out[missing] = map.navigable_room[rows[missing]]
     return out
@@ -61,7 +61,7 @@ def rooms_at(map: TopometricMap, floor: Array) -> Array:
 
 # Doors that somebody walked through: the way of the sensor proves them, whatever stands there now (beyond the thesis).
 
-Crossing = tuple[tuple[int, int], Array, Array]  # as `room_changes` gives them
+Crossing = tuple[tuple[int, int], Array, Array]  # as `find_room_changes` gives them
 WAY_STEP = 1.5  # m between two places of the sensor: farther apart they are no way
 SENSOR_HEIGHT = (0.2, 2.2)  # m of a carried sensor above the floor
 STOOD = 0.35  # m from above: a place this near to a floor stands on it
@@ -78,51 +78,54 @@ FLOOR_BESIDE = 0.4  # m from its middle: the floors of its rooms lie on both sid
 NO_OTHER_DOOR = 1.2  # m about it: a way that drifted leads through the wall beside the door
 
 
-def with_walked_doors(map: TopometricMap, places: Array) -> tuple[TopometricMap, str]:
+def add_walked_doors(map: TopometricMap, places: Array) -> tuple[TopometricMap, str]:
     """The map with the doors through which a sensor was carried, and what the user should know about its way, or nothing.
 
     Args:
         places: (n, 3) m, where the sensor was, in its order.
     """
-    crossings = room_changes(map, places)
+    crossings = find_room_changes(map, places)
     if not crossings:
         return map, ""
-    blocked = [len(_in_the_way(map, a, b)) > 0 for _, a, b in crossings]
+    blocked = [len(_find_obstacles(map, a, b)) > 0 for _, a, b in crossings]
     edges = map.edges.copy()
-    at_edge = [_edge_at(edges, rooms, (a + b) / 2) for rooms, a, b in crossings]
+    at_edge = [_find_edge_at(edges, rooms, (a + b) / 2) for rooms, a, b in crossings]
     strange = [wall and at < 0 for wall, at in zip(blocked, at_edge, strict=True)]
-    later = _shut_later(map, places, [crossing for crossing, odd in zip(crossings, strange, strict=True) if odd])
+    later = _find_shut_door(map, places, [crossing for crossing, odd in zip(crossings, strange, strict=True) if odd])
     if np.mean(strange) > WALL_SHARE and not len(later):
         return map, "the sensor's way leads through walls: it proves no doors (is it of another scan?)"
     edges["open"][[at for at in at_edge if at >= 0]] = True
     edges["confidence"][[at for at in at_edge if at >= 0]] = WALKED_CHANCE
     for (rooms, a, b), at, wall in zip(crossings, at_edge, blocked, strict=True):
-        if at < 0 and not wall and _edge_at(edges, rooms, (a + b) / 2) < 0:
-            edges = np.append(edges, _door(map, rooms, a, b))
+        if at < 0 and not wall and _find_edge_at(edges, rooms, (a + b) / 2) < 0:
+            edges = np.append(edges, _build_door(map, rooms, a, b))
     for door in later:
-        if _edge_at(edges, (int(door["rooms"][0]), int(door["rooms"][1])), door["centre"]) < 0:  # or the way was free once
+        if _find_edge_at(edges, (int(door["rooms"][0]), int(door["rooms"][1])), door["centre"]) < 0:  # or the way was free once
             edges = np.append(edges, door)
     order = np.lexsort((*edges["centre"].T[::-1], edges["rooms"][:, 1], edges["rooms"][:, 0]))
     return replace(map, edges=edges[order]), ""
 
 
-def _shut_later(map: TopometricMap, places: Array, strange: Sequence[Crossing]) -> Array:
+def _find_shut_door(map: TopometricMap, places: Array, strange: Sequence[Crossing]) -> Array:
     """EDGE_DTYPE, one shut door or none: where all changes of rooms through walls are, if that is one thin place away from other
     doors and the way is on floors everywhere. A way that is of another building, or drifted, leads through walls elsewhere, too;
     a wrong door is worse than a missing one."""
     none = np.zeros(0, EDGE_DTYPE)
-    if not strange or np.mean(rooms_under(map, _finite(places)) >= 0) < ON_FLOORS:
+    if not strange or np.mean(find_rooms_under(map, _select_finite(places)) >= 0) < ON_FLOORS:
         return none
     rooms, a, b = strange[0]
-    wall = _in_the_way(map, a, b)
-    door = _door(map, rooms, a, b)
+    wall = _find_obstacles(map, a, b)
+    door = _build_door(map, rooms, a, b)
     door["centre"][0, :2] = (wall[0] + wall[-1])[:2] / 2
     door["lower"] = door["upper"] = door["centre"]
     door["open"], door["confidence"] = False, SHUT_LATER_CHANCE
-    if any(_edge_at(door, other, (c + d) / 2) < 0 for other, c, d in strange) or np.hypot(*(wall[-1] - wall[0])[:2]) > THIN_WALL:
+    if (
+        any(_find_edge_at(door, other, (c + d) / 2) < 0 for other, c, d in strange)
+        or np.hypot(*(wall[-1] - wall[0])[:2]) > THIN_WALL
+    ):
         return none
     beyond = FLOOR_BESIDE * (b - a) / np.hypot(*(b - a)[:2]) * (1, 1, 0)
-    sides = rooms_at(map, door["centre"][0] + [-beyond, beyond])
+    sides = find_rooms_at(map, door["centre"][0] + [-beyond, beyond])
     if sorted(sides.tolist()) != list(rooms):
         return none
     apart = map.edges["centre"] - door["centre"]
@@ -130,11 +133,11 @@ def _shut_later(map: TopometricMap, places: Array, strange: Sequence[Crossing]) 
     return none if beside.any() else door
 
 
-def room_changes(map: TopometricMap, places: Array) -> list[Crossing]:
+def find_room_changes(map: TopometricMap, places: Array) -> list[Crossing]:
     """Rooms (the smaller number first) between which a sensor was carried, with the last place in the one and the first in the
     other, m. Places above no floor are passed over; a way ends where the next place is farther than `WAY_STEP`."""
-    places = _finite(places)
-    room = rooms_under(map, places)
+    places = _select_finite(places)
+    room = find_rooms_under(map, places)
     changes = []
     last, walked = -1, 0.0
     for i in range(len(places)):
@@ -149,13 +152,13 @@ def room_changes(map: TopometricMap, places: Array) -> list[Crossing]:
     return [change for change in changes if len({int(s) for s in map.rooms["storey"][list(change[0])]}) == 1]
 
 
-def rooms_under(map: TopometricMap, places: Array) -> Array:
-    """(n,) the room on whose floor somebody with the sensor at each place (n, 3), m, stood; -1 none."""
+def find_rooms_under(map: TopometricMap, places: Array) -> Array:
+    """Return (n,) the room on whose floor somebody with the sensor at each place (n, 3), m, stood; -1 none."""
     out = np.full(len(places), -1, np.int32)
     rows = np.flatnonzero(map.navigable_room >= 0)
     if not len(rows) or not len(places):
         return out
-    floor = map.navigable.centroids(map.navigable.cells[rows])
+    floor = map.navigable.compute_centroids(map.navigable.cells[rows])
     storey = map.rooms["storey"][map.navigable_room[rows]]
     for s in np.unique(storey):
         own = rows[storey == s]
@@ -166,13 +169,13 @@ def rooms_under(map: TopometricMap, places: Array) -> Array:
     return out
 
 
-def _finite(places: Array) -> Array:
+def _select_finite(places: Array) -> Array:
     places = np.asarray(places, np.float64)
     finite: Array = places[np.isfinite(places).all(axis=1)]
     return finite
 
 
-def _edge_at(edges: Array, rooms: tuple[int, int], place: Array) -> int:
+def _find_edge_at(edges: Array, rooms: tuple[int, int], place: Array) -> int:
     """Row of the edge between two rooms that is nearest to a place, within reach; -1 none."""
     own = np.flatnonzero((np.sort(edges["rooms"], axis=1) == rooms).all(axis=1))
     if not len(own):
@@ -181,7 +184,7 @@ def _edge_at(edges: Array, rooms: tuple[int, int], place: Array) -> int:
     return int(own[apart.argmin()]) if apart.min() <= SAME_DOOR else -1
 
 
-def _in_the_way(map: TopometricMap, a: Array, b: Array) -> Array:
+def _find_obstacles(map: TopometricMap, a: Array, b: Array) -> Array:
     """(k, 3) m: where the straight way between two places of the sensor, at its height, is in occupied cells."""
     steps = max(int(np.ceil(np.linalg.norm(b - a) / (map.grid.edge / 2))), 2)
     way = a + np.linspace(0, 1, steps)[:, None] * (b - a)
@@ -189,7 +192,7 @@ def _in_the_way(map: TopometricMap, a: Array, b: Array) -> Array:
     return inside
 
 
-def _door(map: TopometricMap, rooms: tuple[int, int], a: Array, b: Array) -> Array:
+def _build_door(map: TopometricMap, rooms: tuple[int, int], a: Array, b: Array) -> Array:
     """An edge halfway between two places of the sensor, on the lower of the floors beneath."""
     out = np.zeros(1, EDGE_DTYPE)
     floor = min(float(map.storeys["floor"][map.rooms["storey"][r]]) for r in rooms)
@@ -208,7 +211,7 @@ def _door(map: TopometricMap, rooms: tuple[int, int], a: Array, b: Array) -> Arr
 PATCH_AREA = 3.0  # m2, below which floor without a door is a patch
 
 
-def without_patches(map: TopometricMap, places: Array) -> TopometricMap:
+def remove_patches(map: TopometricMap, places: Array) -> TopometricMap:
     """The map in which patches of floor are of no room. Those that the sensor was on, and rooms that are alone on their storey,
     stay.
 
@@ -216,11 +219,11 @@ def without_patches(map: TopometricMap, places: Array) -> TopometricMap:
         places: (n, 3) m, where the sensor was; may be empty.
     """
     count = len(map.rooms)
-    reached = np.isin(np.arange(count), map.edges["rooms"]) | np.isin(np.arange(count), rooms_under(map, places))
+    reached = np.isin(np.arange(count), map.edges["rooms"]) | np.isin(np.arange(count), find_rooms_under(map, places))
     stays = reached | (map.rooms["area"] >= PATCH_AREA)
     storey = map.rooms["storey"]
     stays |= ~np.isin(storey, storey[stays])
-    return map if stays.all() else of_rooms(map, stays)
+    return map if stays.all() else select_rooms(map, stays)
 
 
 # Attributes of a map, once its rooms are cut: odds of rooms, doors with their kinds and states, windows (beyond the thesis).
@@ -236,11 +239,11 @@ def estimate_attributes(
         walls: with the map's rooms beside them; None of a scan that shows none at heights.
         doors: are the doors of plans weighed with what walls and the plan network show?
     """
-    map = with_room_odds(map, scan.rays, scan.raised)
+    map = add_room_probabilities(map, scan.rays, scan.raised)
     if doors:
-        map = with_wall_doors(map, floor.classified_storeys, walls)
-    map, doubt = with_walked_doors(map, scan.places)
-    map = distinct_doors(map)
+        map = add_wall_doors(map, floor.classified_storeys, walls)
+    map, doubt = add_walked_doors(map, scan.places)
+    map = select_distinct_doors(map)
     if walls is not None:
-        map = without_patches(with_windows(map, walls.elevations, walls.classes), scan.places)
+        map = remove_patches(add_windows(map, walls.elevations, walls.classes), scan.places)
     return map, [doubt] if doubt else []

@@ -7,8 +7,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from topomerge.errors import InputError
-from topomerge.extraction.convolution import convolve, moore
-from topomerge.kernels.voxelise import OFFSET_STEPS
+from topomerge.extraction.convolution import build_moore, convolve
+from topomerge.kernels.voxels import OFFSET_STEPS
 from topomerge.types import Array, VoxelGrid
 
 # Where the points of a cell lie on average: surfaces are known better by it than by the cell alone.
@@ -19,18 +19,18 @@ from topomerge.types import Array, VoxelGrid
 MIDDLE = OFFSET_STEPS // 2  # offset of a cell whose points are not known
 
 
-def cell_middles(grid: VoxelGrid) -> Array:
+def compute_cell_means(grid: VoxelGrid) -> Array:
     """(n, 3) float64 m: the mean of the points of each cell where the grid has it (property ``offset``), else the centroids."""
     offset = grid.properties.get("offset")
     if offset is None:
-        return grid.centroids()
+        return grid.compute_centroids()
     out: Array = grid.origin + (grid.cells + (offset.astype(np.float64) + 0.5) / OFFSET_STEPS) * grid.edge
     return out
 
 
-def with_means(grid: VoxelGrid, points: Array, counts: Array | None = None) -> VoxelGrid:
+def add_means(grid: VoxelGrid, points: Array, counts: Array | None = None) -> VoxelGrid:
     """The grid with the property ``offset`` of points (N, 3), m, that each stand for so many points; others are left out."""
-    rows = grid.rows(grid.locate(points))
+    rows = grid.find_rows(grid.locate(points))
     inside = rows >= 0
     points, rows = np.asarray(points, np.float64)[inside], rows[inside]
     weights = np.ones(len(rows)) if counts is None else np.asarray(counts, np.float64)[inside]
@@ -38,7 +38,7 @@ def with_means(grid: VoxelGrid, points: Array, counts: Array | None = None) -> V
     within = (points - grid.origin) / grid.edge - grid.cells[rows]
     total = np.column_stack([np.bincount(rows, weights * within[:, k], len(grid)) for k in range(3)])
     mean = np.where(many[:, None] > 0, total / np.maximum(many, 1e-9)[:, None], 0.5)
-    return grid.with_properties(offset=np.clip(mean * OFFSET_STEPS, 0, OFFSET_STEPS - 1).astype(np.uint8))
+    return grid.assign_properties(offset=np.clip(mean * OFFSET_STEPS, 0, OFFSET_STEPS - 1).astype(np.uint8))
 
 
 # What stands far from the rest of a cloud: stray points, and places that are no part of one building.
@@ -61,8 +61,8 @@ MOST_NAMED = 3  # places in a message
 AROUND = np.argwhere(np.ones((3, 3, 3), bool))[14:] - 1  # half of the 26 neighbours
 
 
-def without_strays(cells: Array, counts: Array, edge: float) -> tuple[Array, str]:
-    """Which cells to keep, and a warning if some go: strays, where they make the grid much larger.
+def select_without_strays(cells: Array, counts: Array, edge: float) -> tuple[Array, str]:
+    """Select the cells to keep, and warn if some go: strays, where they make the grid much larger.
 
     A wing that was scanned thinly is no stray. Where much would go, the points are not strays: the unit is wrong.
 
@@ -71,18 +71,18 @@ def without_strays(cells: Array, counts: Array, edge: float) -> tuple[Array, str
         counts: (n,) points in each.
         edge: m.
     """
-    volume = box_volume(cells)
+    volume = compute_box_volume(cells)
     if volume <= LARGE_VOLUME:
         return np.ones(len(cells), bool), ""
-    keep = _not_stray(cells, edge)
-    if box_volume(cells[keep]) >= volume / 4 or keep.mean() <= 1 - STRAY_TOTAL_SHARE:
+    keep = _is_not_stray(cells, edge)
+    if compute_box_volume(cells[keep]) >= volume / 4 or keep.mean() <= 1 - STRAY_TOTAL_SHARE:
         return np.ones(len(cells), bool), ""
     dropped = int(counts[~keep].sum())
     subject = "1 stray point lies" if dropped == 1 else f"{dropped} stray points lie"
     return keep, f"{subject} more than {STRAY_DISTANCE:g} m from the rest: left out"
 
 
-def largest_place(cells: Array, counts: Array, edge: float) -> tuple[Array, str]:
+def select_largest_place(cells: Array, counts: Array, edge: float) -> tuple[Array, str]:
     """The cells of the largest place, and a warning if there are others, where the rectangle around all is absurdly large.
 
     Args:
@@ -97,14 +97,14 @@ def largest_place(cells: Array, counts: Array, edge: float) -> tuple[Array, str]
     total = _columns(cells)
     if total <= LARGE_AREA:
         return everything, ""
-    place = grouped(cells, max(int(PLACE_DISTANCE / edge), 1))
+    place = label_groups(cells, max(int(PLACE_DISTANCE / edge), 1))
     size = np.bincount(place)
     order = np.argsort(-size, kind="stable")
     if total <= AREA_RATIO * sum(_columns(cells[place == k]) for k in order[: int(1 / STRAY_SHARE)]):
         return everything, ""
     main = place == order[0]
     dropped = int(counts[~main].sum())
-    where = [_where(cells[place == k], int(size[k]) / len(cells), edge) for k in order[:MOST_NAMED]]
+    where = [_describe_place(cells[place == k], int(size[k]) / len(cells), edge) for k in order[:MOST_NAMED]]
     more = f" and {len(size) - MOST_NAMED} more" if len(size) > MOST_NAMED else ""
     if main.mean() <= 1 - STRAY_TOTAL_SHARE:
         raise InputError(
@@ -115,14 +115,14 @@ def largest_place(cells: Array, counts: Array, edge: float) -> tuple[Array, str]
     return main, f"{dropped:,} points lie more than {PLACE_DISTANCE:g} m from the rest with nothing between ({others}): left out"
 
 
-def box_volume(cells: Array) -> float:
-    """Cells of a box of whole bricks: what the lookup table has to cover."""
+def compute_box_volume(cells: Array) -> float:
+    """Return cells of a box of whole bricks: what the lookup table has to cover."""
     shape = np.ptp(cells, axis=0) + 1
     return float(np.prod(((shape + 7) // 8 * 8).astype(np.float64)))
 
 
-def grouped(cells: Array, block: int, least: int = 1) -> Array:
-    """(n,) int64 group of each cell, numbered from 0: those in blocks that touch each other.
+def label_groups(cells: Array, block: int, least: int = 1) -> Array:
+    """Return (n,) int64 group of each cell, numbered from 0: those in blocks that touch each other.
 
     Args:
         cells: (n, 3) int64.
@@ -130,7 +130,7 @@ def grouped(cells: Array, block: int, least: int = 1) -> Array:
         least: cells in a block that joins its neighbours; of two blocks that touch, one must have as many.
     """
     keys, of_block, size = np.unique(cells // block, axis=0, return_inverse=True, return_counts=True)
-    keys = np.column_stack([_squeezed(keys[:, axis]) for axis in range(3)])
+    keys = np.column_stack([_squeeze_keys(keys[:, axis]) for axis in range(3)])
     span = [int(s) for s in keys.max(axis=0) + 2]
     if span[0] * span[1] * span[2] >= 1 << 62:
         raise InputError("the points are scattered over an extent that no building has: check --unit, or crop the file")
@@ -147,16 +147,16 @@ def grouped(cells: Array, block: int, least: int = 1) -> Array:
     return np.asarray(group, np.int64)[of_block.ravel()]
 
 
-def _squeezed(keys: Array) -> Array:
+def _squeeze_keys(keys: Array) -> Array:
     """Numbers from 1, in the same order, of which those stay neighbours that were: gaps take no more than one."""
     values, inverse = np.unique(keys, return_inverse=True)
     steps = np.minimum(np.diff(values, prepend=values[0] - 1), 2)
     return np.asarray(np.cumsum(steps)[inverse.ravel()])
 
 
-def _not_stray(cells: Array, edge: float) -> Array:
+def _is_not_stray(cells: Array, edge: float) -> Array:
     """(n,) bool: not in a small group of cells far from the rest. One stray return must not decide the size of the grid."""
-    group = grouped(cells, max(int(STRAY_DISTANCE / edge), 1), STRAY_CELLS)
+    group = label_groups(cells, max(int(STRAY_DISTANCE / edge), 1), STRAY_CELLS)
     size = np.bincount(group)
     keep = (size >= STRAY_SHARE * len(cells))[group]
     return keep if keep.any() else group == size.argmax()
@@ -168,7 +168,7 @@ def _columns(cells: Array) -> float:
     return float(size[0]) * float(size[1])
 
 
-def _where(cells: Array, share: float, edge: float) -> str:
+def _describe_place(cells: Array, share: float, edge: float) -> str:
     middle = ", ".join(f"{v:.0f}" for v in (np.median(cells, axis=0) + 0.5) * edge)
     return f"{100 * share:.2g} % around {middle} m"
 
@@ -178,7 +178,7 @@ def _where(cells: Array, share: float, edge: float) -> str:
 COARSEST_CELL = 0.3  # m: in larger ones no door is seen
 
 
-def without_gaps(grid: VoxelGrid, neighbours: float, warnings: list[str]) -> VoxelGrid:
+def coarsen_until_dense(grid: VoxelGrid, neighbours: float, warnings: list[str]) -> VoxelGrid:
     """The grid with cells so large that surfaces hold together: doubled until the median cell has as many neighbours (of 26).
 
     Cells that would be too large to find doors are not made.
@@ -186,10 +186,10 @@ def without_gaps(grid: VoxelGrid, neighbours: float, warnings: list[str]) -> Vox
     Args:
         warnings: what the user should know is appended here.
     """
-    while len(grid) and 2 * grid.edge <= COARSEST_CELL and float(np.median(convolve(grid, moore()))) < neighbours:
-        fine, grid = grid, grid.coarser(2)
+    while len(grid) and 2 * grid.edge <= COARSEST_CELL and float(np.median(convolve(grid, build_moore()))) < neighbours:
+        fine, grid = grid, grid.coarsen(2)
         if "offset" in fine.properties:
-            grid = with_means(grid, cell_middles(fine), fine.properties.get("count"))
+            grid = add_means(grid, compute_cell_means(fine), fine.properties.get("count"))
         warnings.append(f"the points are sparse: cells of {grid.edge:g} m were taken")
     return grid
 
@@ -202,11 +202,11 @@ def without_gaps(grid: VoxelGrid, neighbours: float, warnings: list[str]) -> Vox
 THICK_SURFACE = 17  # neighbours of a cell in a surface that is two cells thick
 
 
-def without_flying_cells(grid: VoxelGrid, share: float) -> VoxelGrid:
-    """The cells that have at least `share` of the usual (median) number of neighbours.
+def remove_flying_cells(grid: VoxelGrid, share: float) -> VoxelGrid:
+    """Return the cells that have at least `share` of the usual (median) number of neighbours.
 
     The limit follows the map: where points are sparse, surfaces have few neighbours, too, and only lonely cells go. In plans
     whose walls are solid most cells have all 26, and the floor 8: there the limit is that of a surface.
     """
-    neighbours = convolve(grid, moore())
-    return grid.subset(neighbours >= share * min(float(np.median(neighbours)), THICK_SURFACE))
+    neighbours = convolve(grid, build_moore())
+    return grid.select_cells(neighbours >= share * min(float(np.median(neighbours)), THICK_SURFACE))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from topomerge.extraction.convolution import Kernel, any_at
-from topomerge.extraction.storeys import lowest_of_column
+from topomerge.extraction.convolution import Kernel, is_any_at
+from topomerge.extraction.storeys import select_lowest_of_column
 from topomerge.types import Array, VoxelGrid
 
 STEP_HEIGHT = 0.3  # m: floor beside a cell may be this much higher or lower
@@ -15,8 +15,8 @@ PLAN_WALL_REACH = 0.15  # m: between a floor and its wall in a plan
 WALL_DISTANCE = 0.25  # m beyond the body's half width
 
 
-def outline_seen(room: Array, inside: Array, wall: Array, edge: float) -> Array:
-    """(R,) share of each room's outline beside which a wall stands, from the plan of a storey.
+def measure_seen_outline(room: Array, inside: Array, wall: Array, edge: float) -> Array:
+    """Return (R,) share of each room's outline beside which a wall stands, from the plan of a storey.
 
     Args:
         room: (nx, ny) room of each column, -1 none.
@@ -33,8 +33,8 @@ def outline_seen(room: Array, inside: Array, wall: Array, edge: float) -> Array:
     return np.where(total > 0, seen / np.maximum(total, 1), 1.0)
 
 
-def completeness(grid: VoxelGrid, navigable: VoxelGrid, label: Array, count: int, body: float) -> Array:
-    """(count,) share of each room's outline at which a wall was seen; 1 for a room without an end of its own.
+def measure_completeness(grid: VoxelGrid, navigable: VoxelGrid, label: Array, count: int, body: float) -> Array:
+    """Return (count,) share of each room's outline at which a wall was seen; 1 for a room without an end of its own.
 
     The outline are the floor cells beside which nobody can stand. A door to another room is no end: the floor goes on.
 
@@ -45,7 +45,7 @@ def completeness(grid: VoxelGrid, navigable: VoxelGrid, label: Array, count: int
         count: number of rooms.
         body: width (m) of the body that the navigable volume was made for.
     """
-    floor = lowest_of_column(navigable)
+    floor = select_lowest_of_column(navigable)
     floor = floor[label[floor] >= 0]
     cells = navigable.cells[floor].astype(np.int64)
     step = int(STEP_HEIGHT / grid.edge)
@@ -55,14 +55,14 @@ def completeness(grid: VoxelGrid, navigable: VoxelGrid, label: Array, count: int
         for dz in range(-step, step + 1):
             goes_on |= navigable.contains(cells + (dx, dy, dz))
         end |= ~goes_on
-    walled = any_at(grid, cells[end], _wall(grid.edge, body))
+    walled = is_any_at(grid, cells[end], _build_wall_kernel(grid.edge, body))
     room = label[floor][end]
     total = np.bincount(room, minlength=count)
     seen = np.bincount(room, walled, minlength=count)
     return np.where(total > 0, seen / np.maximum(total, 1), 1.0)
 
 
-def _wall(edge: float, body: float) -> Kernel:
+def _build_wall_kernel(edge: float, body: float) -> Kernel:
     """Where the wall beside the outline of a floor may stand."""
     reach = int(np.ceil((body / 2 + WALL_DISTANCE) / edge))
     steps = np.arange(-reach, reach + 1)

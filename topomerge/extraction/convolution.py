@@ -48,7 +48,7 @@ class Kernel:
 
     @staticmethod
     def from_offsets(offsets: Array, weights: Array | float = 1.0) -> Kernel:
-        """A kernel from (k, 3) cells relative to the origin."""
+        """Return a kernel from (k, 3) cells relative to the origin."""
         offsets = np.asarray(offsets, np.int32).reshape(-1, 3)
         origin = -offsets.min(axis=0, initial=0)
         return Kernel(offsets + origin, np.broadcast_to(np.asarray(weights, np.float64), len(offsets)), origin)
@@ -83,7 +83,7 @@ class Kernel:
         return np.ascontiguousarray(runs[near]), weights[first][near]
 
 
-def _ball(radius: float, axes: int, edge: float, with_origin: bool) -> Kernel:
+def _build_ball(radius: float, axes: int, edge: float, with_origin: bool) -> Kernel:
     if not (edge > 0 and 0 <= radius < np.inf):
         raise ValueError(f"a kernel needs a radius of 0 m or more and an edge above 0 m, not {radius} and {edge}")
     reach = int(np.floor(radius / edge + LENGTH_SLACK))
@@ -94,42 +94,42 @@ def _ball(radius: float, axes: int, edge: float, with_origin: bool) -> Kernel:
     return Kernel.from_offsets(offsets[inside & (with_origin | (squared > 0))])
 
 
-def _layers(height: float, edge: float) -> int:
+def _count_layers(height: float, edge: float) -> int:
     """Cells that it takes to cover a length: sizes are rounded up, so that a body never fits where it should not."""
     if not (edge > 0 and 0 < height < np.inf):
         raise ValueError(f"sizes of a kernel must be above 0 m, not {height} with an edge of {edge}")
     return int(np.ceil(height / edge - LENGTH_SLACK))
 
 
-def von_neumann(with_origin: bool = False) -> Kernel:
-    """The 6 cells that share a face with the origin; the origin itself only if asked for."""
-    return _ball(1.0, 3, 1.0, with_origin)
+def build_von_neumann(with_origin: bool = False) -> Kernel:
+    """Return the 6 cells that share a face with the origin; the origin itself only if asked for."""
+    return _build_ball(1.0, 3, 1.0, with_origin)
 
 
-def moore(with_origin: bool = False) -> Kernel:
+def build_moore(with_origin: bool = False) -> Kernel:
     """The 26 cells that share a face, an edge or a corner with the origin; the origin itself only if asked for."""
-    return _ball(1.75, 3, 1.0, with_origin)  # sqrt(3) = 1.73 is the corner, 2 the next cell
+    return _build_ball(1.75, 3, 1.0, with_origin)  # sqrt(3) = 1.73 is the corner, 2 the next cell
 
 
-def sphere(radius: float, edge: float, with_origin: bool = True) -> Kernel:
-    """Cells whose centres are within `radius` m of the origin's."""
-    return _ball(radius, 3, edge, with_origin)
+def build_sphere(radius: float, edge: float, with_origin: bool = True) -> Kernel:
+    """Return cells whose centres are within `radius` m of the origin's."""
+    return _build_ball(radius, 3, edge, with_origin)
 
 
-def circle(radius: float, edge: float, with_origin: bool = True) -> Kernel:
-    """Cells of the horizontal plane (x, y: z is up here) within `radius` m of the origin (seeds 2.4.1)."""
-    return _ball(radius, 2, edge, with_origin)
+def build_circle(radius: float, edge: float, with_origin: bool = True) -> Kernel:
+    """Return cells of the horizontal plane (x, y: z is up here) within `radius` m of the origin (seeds 2.4.1)."""
+    return _build_ball(radius, 2, edge, with_origin)
 
 
-def cylinder(radius: float, height: float, edge: float) -> Kernel:
+def build_cylinder(radius: float, height: float, edge: float) -> Kernel:
     """An upright cylinder, `height` m rounded up to cells; the origin is the centre of its lowest layer, weight 1."""
-    disc = circle(radius, edge).offsets
-    up = np.arange(_layers(height, edge))[:, None, None] * (0, 0, 1)
+    disc = build_circle(radius, edge).offsets
+    up = np.arange(_count_layers(height, edge))[:, None, None] * (0, 0, 1)
     return Kernel.from_offsets(disc + up)
 
 
-def stick(stem_height: float, body_width: float, body_height: float, edge: float) -> Kernel:
-    """The room that somebody needs who stands on the origin (seeds 2.3.1; Gorte et al. 2019).
+def build_stick(stem_height: float, body_width: float, body_height: float, edge: float) -> Kernel:
+    """Return the room that somebody needs who stands on the origin (seeds 2.3.1; Gorte et al. 2019).
 
     A stem one cell wide stands on the origin, beside it there is room for a step; above it a square body. Heights are
     rounded up to whole cells and the width to an odd number of them. Every weight is 1 except the origin's, which is 0.
@@ -138,9 +138,9 @@ def stick(stem_height: float, body_width: float, body_height: float, edge: float
         stem_height, body_width, body_height: m; a stem of 0 m leaves the body on the origin.
         edge: edge length of a cell, m.
     """
-    stem = _layers(stem_height, edge) if stem_height else 0
-    half = _layers(body_width, edge) // 2
-    side, up = np.arange(-half, half + 1), np.arange(stem + 1, stem + 1 + _layers(body_height, edge))
+    stem = _count_layers(stem_height, edge) if stem_height else 0
+    half = _count_layers(body_width, edge) // 2
+    side, up = np.arange(-half, half + 1), np.arange(stem + 1, stem + 1 + _count_layers(body_height, edge))
     body = np.stack(np.meshgrid(side, side, up, indexing="ij"), -1).reshape(-1, 3)
     offsets = np.concatenate([np.arange(stem + 1)[:, None] * (0, 0, 1), body])
     return Kernel.from_offsets(offsets, offsets.any(axis=1).astype(np.float64))
@@ -172,7 +172,7 @@ def convolve(
         raise ValueError(f"function must be sum, max or most_common, not {function!r}")
     if function == "sum" and property is None:
         return count_at(grid, grid.cells, kernel)
-    values = _values(grid, property)
+    values = _get_values(grid, property)
     cells = grid.cells.astype(np.int64)
     if function == "most_common":
         if values.ndim != 1 or not np.issubdtype(values.dtype, np.signedinteger):
@@ -184,7 +184,7 @@ def convolve(
     return stencil.weigh(grid._bricks, cells, kernel.stencil, flat, function == "max").reshape(values.shape)
 
 
-def _values(grid: VoxelGrid, property: str | Array | None) -> Array:
+def _get_values(grid: VoxelGrid, property: str | Array | None) -> Array:
     if property is None:
         return np.ones(len(grid), np.int64)
     if isinstance(property, str):
@@ -198,17 +198,17 @@ def _values(grid: VoxelGrid, property: str | Array | None) -> Array:
 
 
 def count_at(grid: VoxelGrid, cells: Array, kernel: Kernel) -> Array:
-    """(m,) float64 sum of occupancy under the kernel placed at any (m, 3) cells, also empty ones or outside."""
-    return stencil.count(grid._bricks[0], grid._columns, _cells(cells), *kernel.runs)
+    """Return (m,) float64 sum of occupancy under the kernel placed at any (m, 3) cells, also empty ones or outside."""
+    return stencil.count(grid._bricks[0], grid._columns, _convert_cells(cells), *kernel.runs)
 
 
-def any_at(grid: VoxelGrid, cells: Array, kernel: Kernel) -> Array:
-    """(m,) bool: is any cell of weight other than 0 occupied, with the kernel placed at each of (m, 3) cells?
+def is_any_at(grid: VoxelGrid, cells: Array, kernel: Kernel) -> Array:
+    """Return (m,) bool: is any cell of weight other than 0 occupied, with the kernel placed at each of (m, 3) cells?
 
     For weights above 0 this is ``count_at(...) > 0``, but it stops at the first occupied cell.
     """
-    return stencil.any_(grid._bricks[0], grid._columns, _cells(cells), kernel.runs[0])
+    return stencil.is_any_occupied(grid._bricks[0], grid._columns, _convert_cells(cells), kernel.runs[0])
 
 
-def _cells(cells: Array) -> Array:
+def _convert_cells(cells: Array) -> Array:
     return np.ascontiguousarray(cells, np.int64).reshape(-1, 3)

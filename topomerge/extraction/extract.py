@@ -4,36 +4,157 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
-from topomerge.blas import one_blas_thread
+import numpy as np
+
+from topomerge.blas import limit_blas_threads
+from topomerge.errors import InputError
 from topomerge.extraction.attributes import estimate_attributes
 from topomerge.extraction.elevations.doorways import StoreyWalls
-from topomerge.extraction.navigable import free_space, navigable_volume, with_crossed_cells
-from topomerge.extraction.parameters import DefaultParameters, Parameters, ThesisParameters, chosen_parameters
-from topomerge.extraction.partition import (
-    FLAT_LEAST,
-    ROOM_LEAST,
-    find_rooms_of_segments,
-    partition_rooms,
-)
-from topomerge.extraction.passages import choose_scorer, find_passages
+from topomerge.extraction.elevations.wall_doors import SUREST, WALL_DOOR_FEATURES, build_door_candidates, compute_door_probability
+from topomerge.extraction.navigable import add_crossed_cells, compute_navigable_volume, find_free_space
+from topomerge.extraction.parameters import DefaultParameters, Parameters, ThesisParameters, resolve_parameters
 from topomerge.extraction.plans.part_rooms import PartRooms
-from topomerge.extraction.plans.storey_floor import floor_of_storeys
+from topomerge.extraction.plans.passages import Pair, Passage, compute_door_features, predict_door, sort_pair
+from topomerge.extraction.plans.storey_floor import build_floor
 from topomerge.extraction.plans.storey_plan import Floor
 from topomerge.extraction.scan import Scan, read_scan
-from topomerge.extraction.segment import RasterisedStoreys, SegmentedStorey, rasterise_storeys, segment_storey
-from topomerge.extraction.slices import is_slice, with_raised_slice
+from topomerge.extraction.segment import (
+    FLAT_LEAST,
+    ROOM_LEAST,
+    RasterisedStoreys,
+    Scorer,
+    SegmentedStorey,
+    find_rooms_of_segments,
+    log_odds,
+    partition_rooms,
+    rasterise_storeys,
+    score_by_plan,
+    segment_storey,
+)
+from topomerge.extraction.slices import is_slice, raise_slice
 from topomerge.extraction.stopwatch import Progress, Stopwatch
-from topomerge.extraction.topology import rooms_with_floor, topometric_map
-from topomerge.extraction.views.view_rooms import rooms_of_views
+from topomerge.extraction.topology import build_topometric_map, select_rooms_with_floor
+from topomerge.extraction.views.view_rooms import segment_views
 from topomerge.extraction.walls import relabel_walls, split_at_doorways, unroll_walls
-from topomerge.types import LEVELLED, Array, PointCloud, TopometricMap, VoxelGrid, with_outline_odds
+from topomerge.io.archive import read_weights_json
+from topomerge.numpy_nn import sigmoid
+from topomerge.types import EDGE_DTYPE, LEVELLED, Array, PointCloud, TopometricMap, VoxelGrid, add_outline_odds
+
+# Of a passage, beside the plan: log odds of a doorway that walls show there, on average along it, 0 where they show none or speak
+# against one; 0 or 1: a doorway split the segment; log odds of a door by plan and plan network, of scans that show no walls.
+EVIDENCE = ("shown", "within", "door")
+SCORE_INPUTS = ("constant", "plan", "shown", "within")  # what the score weighs; of the plan its log odds
+KINDS = ("walls",)  # of scans that have a model: walls show at heights
+PASSAGES_FILE = "passages.json"
+MOST_LOG_ODDS = 8.0
+
+
+def find_passages(storeys: Sequence[SegmentedStorey], walls: StoreyWalls | None, weigh: bool = True) -> list[SegmentedStorey]:
+    """Gather the evidence of every passage of all storeys; they come back with it.
+
+    Args:
+        walls: None of a scan that shows none at heights.
+        weigh: do walls and plan network have a say? Of joined maps the rooms of their parts have it.
+    """
+    told = _score_doors(storeys, walls) if weigh else {}
+    out, first = [], 0
+    for storey in storeys:
+        passages = {}
+        for (a, b), passage in storey.passages.items():
+            pair = (a + first, b + first)
+            odds, within = told.get(pair, 0.0), float((a, b) in storey.split)
+            passages[a, b] = replace(passage, evidence=(0.0, within, odds) if walls is None else (odds, within, 0.0))
+        out.append(replace(storey, passages=passages))
+        first += storey.count
+    return out
+
+
+def score_passages(x: Array, passages: Sequence[Passage], weights: Array) -> Array:
+    """(n,) calibrated probability that a door parts the two sides of each passage, by all evidence.
+
+    Args:
+        x: (n, 17) `DOOR_FEATURES` of the sides as they have grown.
+        weights: (4,) of `SCORE_INPUTS`.
+    """
+    evidence = np.array([passage.evidence for passage in passages], float)
+    return sigmoid(compute_inputs(log_odds(predict_door(x)), evidence) @ weights)
+
+
+def choose_scorer(walls: bool) -> Scorer:
+    """The score of a scan's passages: by all evidence; of slices, raised plans and joined maps by plan and parts.
+
+    Args:
+        walls: does the scan show walls at heights, and is it of one map?
+
+    Raises:
+        InputError: the weights that ship are damaged.
+    """
+    if not walls:
+        return score_by_plan
+    weights = np.array(read_weights_json("topomerge.extraction", PASSAGES_FILE).get("walls", ()), float)
+    if weights.shape != (len(SCORE_INPUTS),) or not np.isfinite(weights).all():
+        numbers = f"walls must be {len(SCORE_INPUTS)} numbers"
+        raise InputError(f"{PASSAGES_FILE}: {numbers}: run train.py task=passages export=package")
+    return partial(score_passages, weights=weights)
+
+
+def compute_inputs(plan: Array, evidence: Array) -> Array:
+    """(n, 4) `SCORE_INPUTS` of passages.
+
+    Args:
+        plan: (n,) log odds of a door by the plan alone.
+        evidence: (n, 3) `EVIDENCE`.
+    """
+    plan = np.clip(plan, -MOST_LOG_ODDS, MOST_LOG_ODDS)
+    return np.column_stack([np.ones(len(plan)), plan, evidence[:, :2]])
+
+
+def _score_doors(storeys: Sequence[SegmentedStorey], walls: StoreyWalls | None) -> dict[Pair, float]:
+    """Log odds of the surest doorway that walls show between each two segments, none below 0; of the likeliest door by plan and
+    plan network, where no walls show."""
+    edges, first = [np.zeros(0, EDGE_DTYPE)], 0
+    for storey in storeys:
+        edges.append(_edges_of(storey, first))
+        first += storey.count
+    complete = np.concatenate([np.zeros(0), *(storey.completeness for storey in storeys)])
+    candidates = build_door_candidates(np.concatenate(edges), complete, [storey.classes for storey in storeys], walls)
+    if walls is None:
+        odds = log_odds(np.clip(compute_door_probability(candidates), SUREST, 1 - SUREST))
+    else:
+        odds = np.maximum(candidates.features[:, WALL_DOOR_FEATURES.index("wall_mean")], 0)
+    told: dict[Pair, float] = {}
+    for rooms, value in zip(candidates.edges["rooms"].tolist(), odds.tolist(), strict=True):
+        told[sort_pair(*rooms)] = max(told.get(sort_pair(*rooms), -np.inf), value)
+    return told
+
+
+def _edges_of(storey: SegmentedStorey, first: int) -> Array:
+    """EDGE_DTYPE of a storey's passages, between segments numbered from `first` on."""
+    out = np.zeros(len(storey.passages), EDGE_DTYPE)
+    if not len(out):
+        return out
+    peak = np.zeros(storey.count)
+    inside = storey.segment >= 0
+    np.maximum.at(peak, storey.segment[inside], storey.clearance[inside])
+    area = storey.areas
+    pairs = list(storey.passages)
+    x = np.array([compute_door_features(storey.passages[p], peak[list(p)], area[list(p)]) for p in pairs])
+    out["confidence"] = predict_door(x)
+    for row, pair in zip(out, pairs, strict=True):
+        passage = storey.passages[pair]
+        row["rooms"], row["centre"], row["width"] = np.array(pair) + first, storey.locate_centre(passage), passage.width
+        row["direction"], row["open"] = np.arctan2(passage.across[0], -passage.across[1]) % np.pi, True
+        row["kind"] = "door"
+    return out
+
 
 COARSE_CELL = 0.15  # m: in larger ones, the walls beside a door leave too little of it
 
 
-@one_blas_thread
+@limit_blas_threads
 def extract(
     source: PointCloud | VoxelGrid | Array | Iterable[PointCloud],
     *,
@@ -59,24 +180,24 @@ def extract(
         InputError: no finite point, an absurd extent, no floor that somebody could stand on, or a parameter that the preset does
             not have.
     """
-    p = chosen_parameters(preset, overrides)
+    p = resolve_parameters(preset, overrides)
     watch = Stopwatch(progress)
     doubts: list[str] = []
     scan, navigable = read_navigable(source, voxel_size, p, watch)
     if isinstance(p, ThesisParameters):
         watch.begin("rooms", 0.4)
-        floor = rooms_of_views(scan.grid, navigable, p, watch)  # 2.4 to 2.6
-        map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7
-        map = replace(map, rooms=with_outline_odds(map.rooms))
+        floor = segment_views(scan.grid, navigable, p, watch)  # 2.4 to 2.6
+        map = build_topometric_map(scan.grid, floor, p.standing_height)  # 2.7
+        map = replace(map, rooms=add_outline_odds(map.rooms))
     else:
         floor, walls = cut_rooms(scan, navigable, p, watch, parts)
         watch.begin("topology", 0.85)
-        map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7
+        map = build_topometric_map(scan.grid, floor, p.standing_height)  # 2.7
         watch.begin("odds of rooms, doors on walls", 0.87)
         map, doubts = estimate_attributes(map, scan, floor, walls, p.walls)
 
     watch.begin("free space", 0.9)
-    free = free_space(scan, navigable, p.range) if p.carve else scan.free
+    free = find_free_space(scan, navigable, p.range) if p.carve else scan.free
 
     chosen = {**asdict(p), **floor.chosen_parameters, "voxel_size": scan.grid.edge}
     if scan.levelling is not None:
@@ -87,7 +208,7 @@ def extract(
         source=scan.source if name is None else name,
         parameters={**chosen, "preset": preset if isinstance(preset, str) else "custom"},
         seconds=watch.end(),
-        warnings=(*scan.warnings, *doubts, *_doubts(map)),
+        warnings=(*scan.warnings, *doubts, *_list_warnings(map)),
     )
 
 
@@ -102,12 +223,12 @@ def read_navigable(
     watch.begin("read and voxelise", 0.0)
     scan = read_scan(source, voxel_size, p.sparse, p.level)  # 2.2
     scan = replace(scan, flat=is_slice(scan.grid))
-    scan = with_raised_slice(scan) if p.assume else scan
+    scan = raise_slice(scan) if p.assume else scan
     watch.begin("navigable volume", 0.3)
-    scan, navigable = navigable_volume(scan, p)  # 2.3
+    scan, navigable = compute_navigable_volume(scan, p)  # 2.3
     if scan.flat or isinstance(p, ThesisParameters):
         return scan, navigable
-    return with_crossed_cells(scan), navigable
+    return add_crossed_cells(scan), navigable
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,13 +276,13 @@ def cut_rooms(
     door = p.slice_door if scan.flat else p.door
     least = FLAT_LEAST if scan.flat else ROOM_LEAST
     cut = [partition_rooms(storey, score, door, least) for storey in found.storeys]  # 2.6
-    floor = floor_of_storeys(scan.grid, navigable, found.rasters.storey, found.rasters.storeys, cut, found.rasters.factor)
+    floor = build_floor(scan.grid, navigable, found.rasters.storey, found.rasters.storeys, cut, found.rasters.factor)
     if found.walls is None:
         return floor, None
-    return floor, relabel_walls(found.walls, find_rooms_of_segments(cut, rooms_with_floor(floor)))
+    return floor, relabel_walls(found.walls, find_rooms_of_segments(cut, select_rooms_with_floor(floor)))
 
 
-def _doubts(map: TopometricMap) -> list[str]:
+def _list_warnings(map: TopometricMap) -> list[str]:
     """What the user should know about the map as a whole."""
     doubts = []
     if map.grid.edge > COARSE_CELL:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from topomerge.types import Array, PointCloud, VoxelGrid, transformed
+from topomerge.types import Array, PointCloud, VoxelGrid, transform_points
 
 # Which way is up in a cloud: the normals of its floors and ceilings say so, and its walls are the witnesses (beyond the thesis).
 #
@@ -57,50 +57,52 @@ def find_up(points: Array, normals: Array | None = None) -> Array | None:
     normals = fit_patches(points) if normals is None else normals
     if len(normals) < LEAST_PATCHES:
         return None
-    up = _refined(normals, _most_agreed(normals))
-    tilt = degrees_from_z(up)
-    if not LEAST_TILT <= tilt <= LARGEST_TILT or _agreement(normals, up[None])[0] < LEAST_AGREEMENT * len(normals):
+    up = _refine_up(normals, _find_most_agreed(normals))
+    tilt = measure_degrees_from_z(up)
+    if not LEAST_TILT <= tilt <= LARGEST_TILT or _count_agreement(normals, up[None])[0] < LEAST_AGREEMENT * len(normals):
         return None
-    walls = _walls_across(normals, up, tilt)
+    walls = _measure_wall_lean(normals, up, tilt)
     witnessed = walls.number >= LEAST_WITNESSES and walls.lean >= max(WITNESSED * tilt, SURE * walls.error)
     if not witnessed:
         return None
-    rotation = rotation_to_z(up)  # borders of cubes that cut noisy planes askew draw their normals to the axes: look once more
-    return np.asarray(_refined(fit_patches(_sample(points) @ rotation.T), np.array([0.0, 0.0, 1.0])) @ rotation)
+    rotation = compute_rotation_to_z(
+        up
+    )  # borders of cubes that cut noisy planes askew draw their normals to the axes: look once more
+    return np.asarray(_refine_up(fit_patches(_sample_points(points) @ rotation.T), np.array([0.0, 0.0, 1.0])) @ rotation)
 
 
-def degrees_from_z(up: Array) -> float:
-    """The angle between a unit vector (3,) and z."""
+def measure_degrees_from_z(up: Array) -> float:
+    """Return the angle between a unit vector (3,) and z."""
     return float(np.degrees(np.arctan2(np.hypot(up[0], up[1]), up[2])))
 
 
-def rotation_to_z(up: Array) -> Array:
-    """(3, 3) float64, the shortest rotation that brings a unit vector above the horizon to z."""
+def compute_rotation_to_z(up: Array) -> Array:
+    """Return (3, 3) float64, the shortest rotation that brings a unit vector above the horizon to z."""
     x, y, z = np.asarray(up, np.float64)
     return np.array([[1 - x * x / (1 + z), -x * y / (1 + z), -x], [-x * y / (1 + z), 1 - y * y / (1 + z), -y], [x, y, z]])
 
 
 def fit_patches(points: Array) -> Array:
-    """(n, 3) float64 unit normals, of either sign, of the cubes of space whose points (N, 3) lie on a plane.
+    """Return (n, 3) float64 unit normals, of either sign, of the cubes of space whose points (N, 3) lie on a plane.
 
     Space is cut twice, half an edge apart: a cube that holds both faces of a wall shows no plane.
     """
-    sample, normals = _sample(points), np.zeros((0, 3))
+    sample, normals = _sample_points(points), np.zeros((0, 3))
     for edge in PATCH_EDGES:
         if len(normals) < ENOUGH_PATCHES and len(sample):
             local = sample - np.median(sample, axis=0)
-            both = np.concatenate([_fit(local, edge), _fit(local + edge / 2, edge)])
+            both = np.concatenate([_fit_planes(local, edge), _fit_planes(local + edge / 2, edge)])
             normals = max(normals, both, key=len)
     return normals
 
 
-def _sample(points: Array) -> Array:
+def _sample_points(points: Array) -> Array:
     """Every n-th point, float64, without what is not finite."""
     sample = np.asarray(points[:: max(len(points) // SAMPLE, 1)], np.float64)
     return sample[np.isfinite(sample).all(axis=1)]
 
 
-def _fit(points: Array, edge: float) -> Array:
+def _fit_planes(points: Array, edge: float) -> Array:
     """The normals of the planes in cubes of one edge length, m; points lie around the origin."""
     cells = np.floor(points / edge)
     near = (np.abs(cells) < 1 << 20).all(axis=1)
@@ -120,14 +122,14 @@ def _fit(points: Array, edge: float) -> Array:
     return np.asarray(vectors[is_plane][:, :, 0])
 
 
-def _agreement(normals: Array, ups: Array) -> Array:
+def _count_agreement(normals: Array, ups: Array) -> Array:
     """(k,) how many patches lie flat or stand upright along each of the directions (k, 3)."""
     square = (normals @ ups.T) ** 2
     off = np.minimum(square, 1 - square)  # squared sines of the angles of walls from upright, of floors from flat
     return np.asarray(np.exp(off * (-0.5 / np.radians(SEARCH_WIDTH) ** 2)).sum(axis=0))
 
 
-def _most_agreed(normals: Array) -> Array:
+def _find_most_agreed(normals: Array) -> Array:
     """(3,) the direction within `LARGEST_TILT` of z with which most patches agree."""
     steps = np.tan(np.radians(np.arange(-LARGEST_TILT, LARGEST_TILT + SEARCH_STEP, SEARCH_STEP)))
     x, y = (v.ravel() for v in np.meshgrid(steps, steps))
@@ -135,10 +137,10 @@ def _most_agreed(normals: Array) -> Array:
     ups /= np.linalg.norm(ups, axis=1)[:, None]
     ups = ups[ups[:, 2] >= np.cos(np.radians(LARGEST_TILT + SEARCH_STEP))]
     some = normals[:: -(-len(normals) // SEARCHED_PATCHES)]
-    return np.asarray(ups[np.argmax(_agreement(some, ups))])
+    return np.asarray(ups[np.argmax(_count_agreement(some, ups))])
 
 
-def _refined(normals: Array, up: Array) -> Array:
+def _refine_up(normals: Array, up: Array) -> Array:
     """(3,) the direction to which the normals of floors are parallel and those of walls perpendicular: least squares in which
     what is far off has no say."""
     for reach in REACHES:
@@ -152,7 +154,7 @@ def _refined(normals: Array, up: Array) -> Array:
     return up
 
 
-def _walls_across(normals: Array, up: Array, tilt: float) -> _Wall:
+def _measure_wall_lean(normals: Array, up: Array, tilt: float) -> _Wall:
     """How far the walls lean that would lean with a cloud that is tilted to a direction."""
     side = up[:2] / np.linalg.norm(up[:2])
     towards = normals[:, :2] @ side
@@ -196,9 +198,9 @@ class LevelledChunks:
             if not isinstance(chunk, PointCloud) or chunk.upright or self._is_settled(held):
                 break
         while held:
-            yield self._levelled(held.pop(0))
+            yield self._level(held.pop(0))
         for chunk in chunks:
-            yield self._levelled(chunk)
+            yield self._level(chunk)
 
     def _is_settled(self, held: Sequence[PointCloud]) -> bool:
         """Do the first chunks show enough floors, ceilings and walls to say which way is up, or are they all that is held?"""
@@ -210,45 +212,45 @@ class LevelledChunks:
         up = find_up(points, normals)
         if up is not None:
             finite = points[np.isfinite(points).all(axis=1)]
-            self.matrix = rotation_about(np.round(np.median(finite, axis=0), DIGITS), rotation_to_z(up))
+            self.matrix = build_rotation_about(np.round(np.median(finite, axis=0), DIGITS), compute_rotation_to_z(up))
             name = f"{held[0].source}: " if held[0].source else ""
-            self.warnings.append(f"{name}tilted by {degrees_from_z(up):.1f} degrees: levelled")
+            self.warnings.append(f"{name}tilted by {measure_degrees_from_z(up):.1f} degrees: levelled")
         return True
 
-    def _levelled(self, chunk: PointCloud) -> PointCloud:
-        return chunk if self.matrix is None or not isinstance(chunk, PointCloud) else levelled_cloud(chunk, self.matrix)
+    def _level(self, chunk: PointCloud) -> PointCloud:
+        return chunk if self.matrix is None or not isinstance(chunk, PointCloud) else transform_cloud(chunk, self.matrix)
 
 
-def rotation_about(middle: Array, rotation: Array) -> Array:
-    """(4, 4) float64: a rotation (3, 3) about a place (3,)."""
+def build_rotation_about(middle: Array, rotation: Array) -> Array:
+    """Return (4, 4) float64: a rotation (3, 3) about a place (3,)."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation
     matrix[:3, 3] = middle - rotation @ middle
     return matrix
 
 
-def levelled_cloud(cloud: PointCloud, matrix: Array) -> PointCloud:
-    """The same cloud, its points, its sensor's poses and its free cells moved by a rigid motion (4, 4). True rooms stay."""
+def transform_cloud(cloud: PointCloud, matrix: Array) -> PointCloud:
+    """Move a cloud, its sensor's poses and its free cells by a rigid motion (4, 4). True rooms stay."""
     points = np.empty(cloud.points.shape, cloud.points.dtype if cloud.points.dtype.kind == "f" else np.float32)
     for first in range(0, len(points), BLOCK):
         block = slice(first, first + BLOCK)
-        points[block] = transformed(matrix, cloud.points[block] + cloud.shift) - cloud.shift
+        points[block] = transform_points(matrix, cloud.points[block] + cloud.shift) - cloud.shift
     poses = None if cloud.poses is None else matrix @ np.asarray(cloud.poses, np.float64)
-    free = None if cloud.free is None else levelled_grid(cloud.free, matrix)
+    free = None if cloud.free is None else transform_grid(cloud.free, matrix)
     return replace(cloud, points=points, poses=poses, free=free)
 
 
-def levelled_grid(grid: VoxelGrid, matrix: Array) -> VoxelGrid:
+def transform_grid(grid: VoxelGrid, matrix: Array) -> VoxelGrid:
     """The cells of a lattice of the same edge length whose middles lie in cells of a grid that is moved by a rigid motion (4, 4);
     without properties."""
     if not len(grid):
         return grid
     back, found = np.linalg.inv(matrix), []
     for first in range(0, len(grid), BLOCK // len(AROUND)):
-        middles = grid.centroids(grid.cells[first : first + BLOCK // len(AROUND)])
-        moved = np.floor(transformed(matrix, middles) / grid.edge).astype(np.int64)
+        middles = grid.compute_centroids(grid.cells[first : first + BLOCK // len(AROUND)])
+        moved = np.floor(transform_points(matrix, middles) / grid.edge).astype(np.int64)
         near = (moved[:, None] + AROUND).reshape(-1, 3)
-        found.append(near[grid.contains(grid.locate(transformed(back, (near + 0.5) * grid.edge)))])
+        found.append(near[grid.contains(grid.locate(transform_points(back, (near + 0.5) * grid.edge)))])
     cells = np.concatenate(found)
     base = cells.min(axis=0)
     return VoxelGrid.from_cells(cells - base, base * grid.edge, grid.edge)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import edt
 import numpy as np
 
-from topomerge.extraction.convolution import LENGTH_SLACK, Kernel, any_at, circle, count_at, von_neumann
-from topomerge.kernels import components as kernel
+from topomerge.extraction.convolution import LENGTH_SLACK, Kernel, build_circle, build_von_neumann, count_at, is_any_at
+from topomerge.kernels import rasters as kernel
 from topomerge.types import Array, VoxelGrid
 
 # Connected components (seeds 2.3.3).
 
 
-def connected_components(grid: VoxelGrid, neighbourhood: Kernel | None = None, group: Array | None = None) -> Array:
+def label_components(grid: VoxelGrid, neighbourhood: Kernel | None = None, group: Array | None = None) -> Array:
     """Component of each cell: two cells share one if a path of neighbours joins them (seeds 2.3.3).
 
     Args:
@@ -23,11 +23,11 @@ def connected_components(grid: VoxelGrid, neighbourhood: Kernel | None = None, g
     Returns:
         (n,) int64, numbered from 0 in the order of their first cells, -1 for cells left out.
     """
-    offsets = (neighbourhood or von_neumann()).stencil[0]
+    offsets = (neighbourhood or build_von_neumann()).stencil[0]
     both = np.unique(np.concatenate([offsets, -offsets]), axis=0)  # a neighbour's neighbour, whichever way it is said
     half = both[[tuple(o) > (0, 0, 0) for o in both.tolist()]]
     group = np.zeros(len(grid), np.int64) if group is None else np.asarray(group, np.int64)
-    return kernel.components(grid.cells, *grid._bricks, half, group)
+    return kernel.label_components(grid.cells, *grid._bricks, half, group)
 
 
 def spread_labels(grid: VoxelGrid, labels: Array, steps: int | None = None, neighbourhood: Kernel | None = None) -> Array:
@@ -37,7 +37,7 @@ def spread_labels(grid: VoxelGrid, labels: Array, steps: int | None = None, neig
         steps: how far labels may travel; no limit by default.
     """
     out = np.array(labels, np.int64)
-    offsets = (neighbourhood or von_neumann()).stencil[0]
+    offsets = (neighbourhood or build_von_neumann()).stencil[0]
     kernel.spread(grid.cells, *grid._bricks, offsets, out, len(grid) if steps is None else steps)
     return out
 
@@ -45,8 +45,8 @@ def spread_labels(grid: VoxelGrid, labels: Array, steps: int | None = None, neig
 # Horizontal distance field (seeds 2.4.1).
 
 
-def horizontal_distance_field(grid: VoxelGrid) -> Array:
-    """How many times a horizontal circle around each cell can grow by one cell before it leaves the grid (seeds 2.4.1).
+def compute_horizontal_distance_field(grid: VoxelGrid) -> Array:
+    """Compute how many cells a horizontal circle around each cell can grow inside the grid (seeds 2.4.1).
 
     The seeds grow a circle-shaped kernel until it holds fewer neighbours than cells. That is the largest whole radius below the
     distance to the nearest missing cell of the same level, so one exact Euclidean transform a level gives the same numbers.
@@ -71,10 +71,11 @@ def horizontal_distance_field(grid: VoxelGrid) -> Array:
     return distance
 
 
-def on_all_sides(grid: VoxelGrid, cells: Array, radius: int) -> Array:
-    """(m,) bool: does the grid hold all cells of the level that are at most so many cells away? As `horizontal_distance_field` at
+def is_surrounded(grid: VoxelGrid, cells: Array, radius: int) -> Array:
+    """(m,) bool: does the grid hold all cells of the level that are at most so many cells away? As
+    `compute_horizontal_distance_field` at
     or above the radius, of some cells and for a small radius."""
-    disc = circle(radius * grid.edge, grid.edge)
+    disc = build_circle(radius * grid.edge, grid.edge)
     inside: Array = count_at(grid, cells, disc) == len(disc)
     return inside
 
@@ -83,21 +84,21 @@ def on_all_sides(grid: VoxelGrid, cells: Array, radius: int) -> Array:
 
 
 def dilate_upwards(grid: VoxelGrid, height: float) -> VoxelGrid:
-    """The cells and those up to `height` m above them, so that the steps of a stair touch (seeds 2.3.2)."""
+    """Dilate cells by `height` m upwards, so that the steps of a stair touch (seeds 2.3.2)."""
     layers = np.arange(int(np.floor(height / grid.edge + 1e-6)) + 1)
     up = (grid.cells[:, None, :] + layers[:, None] * np.array([0, 0, 1])).reshape(-1, 3)
-    return grid.with_cells(up[up[:, 2] < grid.shape[2]].astype(np.int32))
+    return grid.replace_cells(up[up[:, 2] < grid.shape[2]].astype(np.int32))
 
 
 # Cells that somebody could stand on (seeds 2.3.1; Gorte et al. 2019).
 
 
-def unobstructed(grid: VoxelGrid, stick: Kernel) -> VoxelGrid:
+def select_unobstructed(grid: VoxelGrid, stick: Kernel) -> VoxelGrid:
     """Cells whose convolution with the stick kernel is 0: nothing stands in the room that a body needs above them.
 
     The seeds sum occupancy under the kernel and keep sum = 0; as no weight is negative, the search may stop at the first cell.
     """
-    return grid.subset(~any_at(grid, grid.cells, stick))
+    return grid.select_cells(~is_any_at(grid, grid.cells, stick))
 
 
 # Bridging gaps in the floor, without making ceilings or table tops into floor (beyond the thesis: method 2).
@@ -120,25 +121,25 @@ def bridge_gaps(grid: VoxelGrid, standing: VoxelGrid, stick: Kernel, reach: floa
     radius = reach / grid.edge + LENGTH_SLACK
     if radius < 1 or not len(standing):
         return standing
-    levels = np.split(standing.cells[np.argsort(standing.cells[:, 2], kind="stable")], _steps(standing.cells[:, 2]))
+    levels = np.split(standing.cells[np.argsort(standing.cells[:, 2], kind="stable")], _find_steps(standing.cells[:, 2]))
     by_level = {int(level[0, 2]): level[:, :2] for level in levels}
     added: list[Array] = []
     for z in by_level:
         near = np.concatenate([by_level[k] for k in (z - 1, z, z + 1) if k in by_level])
-        columns = _closing(near, radius)
+        columns = _find_closing_columns(near, radius)
         added.append(np.column_stack([columns, np.full(len(columns), z)]).astype(np.int32))
     new = np.concatenate(added)
     new = new[((new >= 0) & (new < grid.shape)).all(axis=1)]
-    new = new[~any_at(grid, new, stick)]
-    return grid.with_cells(np.concatenate([standing.cells, new]))
+    new = new[~is_any_at(grid, new, stick)]
+    return grid.replace_cells(np.concatenate([standing.cells, new]))
 
 
-def _steps(values: Array) -> Array:
+def _find_steps(values: Array) -> Array:
     """Where the sorted values change."""
     return np.flatnonzero(np.diff(np.sort(values))) + 1
 
 
-def _closing(columns: Array, radius: float) -> Array:
+def _find_closing_columns(columns: Array, radius: float) -> Array:
     """(k, 2) columns that closing by a disc of `radius` cells adds to the given ones, tile by tile: most of a building's box is
     empty on most of its levels."""
     margin = 2 * int(np.ceil(radius)) + 1

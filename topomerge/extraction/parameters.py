@@ -71,13 +71,13 @@ Parameters = DefaultParameters | ThesisParameters
 PRESETS: dict[str, Parameters] = {"default": DefaultParameters(), "thesis": ThesisParameters()}
 
 
-def chosen_parameters(preset: str | Parameters, overrides: dict[str, Any]) -> Parameters:
-    """The parameters of a preset, single ones overridden.
+def resolve_parameters(preset: str | Parameters, overrides: dict[str, Any]) -> Parameters:
+    """Return the parameters of a preset, single ones overridden.
 
     Raises:
         InputError: an unknown preset, or a parameter that it does not have.
     """
-    name = preset if isinstance(preset, str) else _name_of(preset)
+    name = preset if isinstance(preset, str) else _get_preset_name(preset)
     if name not in PRESETS:
         raise InputError(f"unknown preset {preset!r}: take one of {', '.join(PRESETS)}")
     parameters = PRESETS[name] if isinstance(preset, str) else preset
@@ -90,6 +90,6 @@ def chosen_parameters(preset: str | Parameters, overrides: dict[str, Any]) -> Pa
     return replace(parameters, **overrides)
 
 
-def _name_of(parameters: object) -> str:
+def _get_preset_name(parameters: object) -> str:
     """The preset of which an instance is a variant; its type's name where it is none."""
     return next((name for name, p in PRESETS.items() if type(p) is type(parameters)), type(parameters).__name__)

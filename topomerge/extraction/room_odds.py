@@ -1,6 +1,7 @@
-"""How likely a room is one, was seen as a whole, was entered, and lies outside: logistic models over `room_features`.
+"""How likely a room is one, was seen as a whole, was entered, and lies outside: logistic models over `compute_room_features`.
 
-Fitted to simulated scans of training buildings by ``train.py task=room_odds``; the weights stand in `room_odds.json`. Where the
+Fitted to simulated scans of training buildings by ``train.py task=compute_room_odds``; the weights stand in `room_odds.json`.
+Where the
 places of the sensor are known, they say who was where; elsewhere, what of each room was seen. Robots' grids and drawings have
 models of their own, as they show neither ceilings nor how high things are, and free floor wherever a ray went.
 """
@@ -19,9 +20,9 @@ from scipy.spatial import cKDTree
 
 from topomerge.errors import InputError
 from topomerge.extraction.completeness import WALL_SIGHT
-from topomerge.extraction.storeys import floor_to_ceiling, lowest_of_column
-from topomerge.io.weight_files import read_weights_json
-from topomerge.kernels.sight import seen_from
+from topomerge.extraction.storeys import measure_floor_to_ceiling, select_lowest_of_column
+from topomerge.io.archive import read_weights_json
+from topomerge.kernels.rays import is_seen_from
 from topomerge.numpy_nn import sigmoid
 from topomerge.types import ROOM_ODDS, Array, TopometricMap
 
@@ -90,8 +91,8 @@ class _StoreyFloor:
     edge: float
 
 
-def room_features(map: TopometricMap, names: Sequence[str] = ROOM_FEATURES) -> Array:
-    """(R, F) features of a map that need no poses.
+def compute_room_features(map: TopometricMap, names: Sequence[str] = ROOM_FEATURES) -> Array:
+    """Return (R, F) features of a map that need no poses.
 
     Args:
         names: of `ROOM_FEATURES` and `GRID_FEATURES`.
@@ -99,15 +100,15 @@ def room_features(map: TopometricMap, names: Sequence[str] = ROOM_FEATURES) -> A
     rooms = map.rooms
     table = {name: np.zeros(len(rooms)) for name in (*ROOM_FEATURES, *GRID_FEATURES)}
     covered = np.zeros((2, len(rooms)))  # columns with a ceiling, and all
-    for storey in _storey_floors(map):
+    for storey in _iter_storey_floors(map):
         hulls = _Hulls(storey)
-        for room, window in _windows(storey):
+        for room, window in _iter_windows(storey):
             own = storey.room[window] == room
             covered[:, room] = storey.ceiling[window][own].sum(), own.sum()
             table["floor_seen"][room] = storey.standing[window][own].mean()
             table["floor_step"][room] = abs(np.median(storey.height[window][own]))
-            table["between"][room] = hulls.share_between(room)
-            for name, value in _outline(storey, own, window).items():
+            table["between"][room] = hulls.measure_share_between(room)
+            for name, value in _measure_outline(storey, own, window).items():
                 table[name][room] = value
     columns = np.maximum(covered[1], 1)
     cells = np.maximum(rooms["cells"], 1) / columns
@@ -120,8 +121,8 @@ def room_features(map: TopometricMap, names: Sequence[str] = ROOM_FEATURES) -> A
     return np.stack([table[name] for name in names], axis=1)
 
 
-def pose_features(map: TopometricMap, rays: tuple[Array, Array] | None) -> Array | None:
-    """(R, 2) `POSE_FEATURES`; None where no place of the sensor is known, or most are over no room's floor.
+def compute_pose_features(map: TopometricMap, rays: tuple[Array, Array] | None) -> Array | None:
+    """Return (R, 2) `POSE_FEATURES`; None where no place of the sensor is known, or most are over no room's floor.
 
     Args:
         rays: (k, 3) places of the sensor and (k, 3) of what it saw, m, in the map's frame.
@@ -132,10 +133,10 @@ def pose_features(map: TopometricMap, rays: tuple[Array, Array] | None) -> Array
     finite = np.isfinite(starts).all(axis=1) & np.isfinite(ends).all(axis=1)
     starts = starts[finite]
     moved = np.append(True, (starts[1:] != starts[:-1]).any(axis=1))[: len(starts)]  # the rays of one place follow each other
-    stood = _rooms_below(map, starts[moved])[np.cumsum(moved) - 1]
+    stood = _find_rooms_below(map, starts[moved])[np.cumsum(moved) - 1]
     if not len(stood) or (stood >= 0).mean() < RAYS_OVER_FLOOR:
         return None
-    cell = map.grid.rows(map.grid.locate(ends[finite]))
+    cell = map.grid.find_rows(map.grid.locate(ends[finite]))
     met = np.where(cell >= 0, map.room[cell], -1)
     count = len(map.rooms)
     of_room = np.bincount(met[met >= 0], minlength=count)
@@ -144,11 +145,11 @@ def pose_features(map: TopometricMap, rays: tuple[Array, Array] | None) -> Array
     return np.stack([entered, from_within / np.maximum(of_room, 1)], axis=1).astype(float)
 
 
-def _rooms_below(map: TopometricMap, places: Array) -> Array:
+def _find_rooms_below(map: TopometricMap, places: Array) -> Array:
     """(n,) room over whose floor each place is, -1 none."""
-    rows = lowest_of_column(map.navigable)
+    rows = select_lowest_of_column(map.navigable)
     rows = rows[map.navigable_room[rows] >= 0]
-    floor = map.navigable.centroids(map.navigable.cells[rows])
+    floor = map.navigable.compute_centroids(map.navigable.cells[rows])
     room = np.full(len(places), -1)
     for storey, level in enumerate(map.storeys["floor"]):
         mine = map.rooms["storey"][map.navigable_room[rows]] == storey
@@ -159,16 +160,16 @@ def _rooms_below(map: TopometricMap, places: Array) -> Array:
     return room
 
 
-def _storey_floors(map: TopometricMap) -> Iterator[_StoreyFloor]:
+def _iter_storey_floors(map: TopometricMap) -> Iterator[_StoreyFloor]:
     """The storeys that have rooms, lowest first."""
     factor = max(round(SIGHT_CELL / map.grid.edge), 1)
-    rows = lowest_of_column(map.navigable)
+    rows = select_lowest_of_column(map.navigable)
     rows = rows[map.navigable_room[rows] >= 0]
     room = map.navigable_room[rows]
-    lowest = map.navigable.subset(rows)
-    above = floor_to_ceiling(map.grid, lowest, BODY) > 0
+    lowest = map.navigable.select_cells(rows)
+    above = measure_floor_to_ceiling(map.grid, lowest, BODY) > 0
     standing = np.asarray(map.navigable.properties.get("standing", np.ones(len(map.navigable), bool)), bool)[rows]
-    z, floor_z = map.grid.centroids()[:, 2], lowest.centroids()[:, 2]
+    z, floor_z = map.grid.compute_centroids()[:, 2], lowest.compute_centroids()[:, 2]
     for storey, level in enumerate(map.storeys["floor"]):
         mine = map.rooms["storey"][room] == storey
         if not mine.any():
@@ -186,7 +187,7 @@ def _storey_floors(map: TopometricMap) -> Iterator[_StoreyFloor]:
         yield _StoreyFloor(label, flags[0], flags[1], flags[2], height, map.grid.edge * factor)
 
 
-def _windows(storey: _StoreyFloor) -> Iterator[tuple[int, tuple[slice, slice]]]:
+def _iter_windows(storey: _StoreyFloor) -> Iterator[tuple[int, tuple[slice, slice]]]:
     """Each room of a storey with the part of the raster from where others look into it."""
     pad = round(VIEWPOINTS / storey.edge)
     for room, box in enumerate(ndimage.find_objects(storey.room + 1)):
@@ -195,7 +196,7 @@ def _windows(storey: _StoreyFloor) -> Iterator[tuple[int, tuple[slice, slice]]]:
             yield room, (x, y)
 
 
-def _outline(storey: _StoreyFloor, own: Array, window: tuple[slice, slice]) -> dict[str, float]:
+def _measure_outline(storey: _StoreyFloor, own: Array, window: tuple[slice, slice]) -> dict[str, float]:
     """What the outline of a room tells.
 
     Args:
@@ -210,7 +211,7 @@ def _outline(storey: _StoreyFloor, own: Array, window: tuple[slice, slice]) -> d
     step = max(round(VIEW_STEP / storey.edge), 1)
     views = np.argwhere(beyond[::step, ::step]) * step
     walls = np.argwhere(end & ~contact & near)
-    hidden = ~seen_from(free, np.ascontiguousarray(walls), np.ascontiguousarray(views), SIGHT_REACH / storey.edge)
+    hidden = ~is_seen_from(free, np.ascontiguousarray(walls), np.ascontiguousarray(views), SIGHT_REACH / storey.edge)
     around = max(int(end.sum()), 1)
     return {
         "log_width": float(np.log(2 * own.sum() / around * storey.edge)),
@@ -218,11 +219,11 @@ def _outline(storey: _StoreyFloor, own: Array, window: tuple[slice, slice]) -> d
         "log_hidden": float(np.log1p(hidden.sum() * storey.edge)),
         "contact": float(contact.sum() / around),
         "open_outline": float((end & ~contact & ~near).sum() / around),
-        "thin": thin_share(own, storey.edge),
+        "thin": measure_thin_share(own, storey.edge),
     }
 
 
-def thin_share(own: Array, edge: float) -> float:
+def measure_thin_share(own: Array, edge: float) -> float:
     """Share of a room's columns (nx, ny) that are farther than `THIN_REACH` from what is `THIN_HALF_WIDTH` from its outline."""
     wide = edt.edt(np.pad(own, 1).view(np.uint8), parallel=1)[1:-1, 1:-1] * edge >= THIN_HALF_WIDTH
     if not wide.any():
@@ -242,7 +243,7 @@ class _Hulls:
         self.columns = dict(zip(numbers.tolist(), np.split(at[order].astype(float), first[1:]), strict=True))
         self.hulls = {n: shapely.convex_hull(shapely.MultiPoint(columns)) for n, columns in self.columns.items()}
 
-    def share_between(self, room: int) -> float:
+    def measure_share_between(self, room: int) -> float:
         """Of a room's columns, those within the convex hull of all other rooms."""
         others = [hull for n, hull in self.hulls.items() if n != room]
         if not others:
@@ -282,8 +283,8 @@ GRIDS = Family("grids", GRID_FEATURES, dict.fromkeys(ROOM_ODDS, _GRID_LENGTH))
 FAMILIES = {"scans": SCANS, "open": OPEN_SCANS, "grids": GRIDS}
 
 
-def with_room_odds(map: TopometricMap, rays: tuple[Array, Array] | None = None, raised: bool = False) -> TopometricMap:
-    """The map with the probabilities of its rooms; those that were probably not entered are `glimpsed`.
+def add_room_probabilities(map: TopometricMap, rays: tuple[Array, Array] | None = None, raised: bool = False) -> TopometricMap:
+    """Return the map with the probabilities of its rooms; those that were probably not entered are `glimpsed`.
 
     Args:
         rays: (k, 3) places of the sensor and (k, 3) of what it saw, m; None where they are unknown.
@@ -293,32 +294,32 @@ def with_room_odds(map: TopometricMap, rays: tuple[Array, Array] | None = None, 
         InputError: the weights that ship are damaged.
     """
     rooms = map.rooms.copy()
-    weights = room_weights()
-    x = room_features(map, GRID_FEATURES if raised else ROOM_FEATURES)
+    weights = load_room_weights()
+    x = compute_room_features(map, GRID_FEATURES if raised else ROOM_FEATURES)
     for family in (GRIDS,) if raised else (SCANS, OPEN_SCANS):
         for name in family.lengths:
             if name in ROOM_ODDS:
-                rooms[name] = odds_of(weights, family, name, x)
-    poses = None if raised else pose_features(map, rays)
+                rooms[name] = compute_probability(weights, family, name, x)
+    poses = None if raised else compute_pose_features(map, rays)
     if poses is not None:
-        rooms["entered"] = odds_of(weights, SCANS, ENTERED_BY_POSES, x, poses)
+        rooms["entered"] = compute_probability(weights, SCANS, ENTERED_BY_POSES, x, poses)
     rooms["glimpsed"] = rooms["entered"] < 0.5
     return replace(map, rooms=rooms)
 
 
-def odds_of(weights: dict[str, Any], family: Family, name: str, x: Array, poses: Array | None = None) -> Array:
-    """(R,) probability by the model of a name.
+def compute_probability(weights: dict[str, Any], family: Family, name: str, x: Array, poses: Array | None = None) -> Array:
+    """Return (R,) probability by the model of a name.
 
     Args:
-        weights: as `room_weights` gives them.
+        weights: as `load_room_weights` gives them.
         x: (R, F) features of the family.
-        poses: (R, 2) of `pose_features`, for the model that takes them.
+        poses: (R, 2) of `compute_pose_features`, for the model that takes them.
     """
     of_family = weights[family.key] if family.key else weights
-    return sigmoid(np.clip(model_inputs(of_family, family, x, poses) @ np.asarray(of_family[name], float), -30, 30))
+    return sigmoid(np.clip(build_model_inputs(of_family, family, x, poses) @ np.asarray(of_family[name], float), -30, 30))
 
 
-def model_inputs(standard: dict[str, Any], family: Family, x: Array, poses: Array | None = None) -> Array:
+def build_model_inputs(standard: dict[str, Any], family: Family, x: Array, poses: Array | None = None) -> Array:
     """(R, 1 + k F) what the models weigh: 1, the features in units of their spread, those times the map's share of ceiling, for
     where no ceiling is seen other things count (not of grids, which have none), and their squares."""
     low, high, mean, scale = (np.asarray(standard[part], float) for part in STANDARD)
@@ -328,8 +329,8 @@ def model_inputs(standard: dict[str, Any], family: Family, x: Array, poses: Arra
     return np.concatenate(columns if poses is None else [*columns, poses], axis=1)
 
 
-def room_weights() -> dict[str, Any]:
-    """The weights that are in use.
+def load_room_weights() -> dict[str, Any]:
+    """Return the weights that are in use.
 
     Raises:
         InputError: damaged, or fitted to other features.

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.extraction.cleaning import COARSEST_CELL, without_gaps
+from topomerge.extraction.cleaning import COARSEST_CELL, coarsen_until_dense
 from topomerge.extraction.levelling import LevelledChunks
 from topomerge.extraction.voxels import LatticeCells, voxelise
 from topomerge.types import Array, PointCloud, VoxelGrid
@@ -60,8 +60,8 @@ class Scan:
         starts = np.asarray(self.rays[0], np.float64)
         return starts[np.concatenate([[True], (starts[1:] != starts[:-1]).any(axis=1)])]
 
-    def with_grid(self, grid: VoxelGrid, warning: str) -> Scan:
-        """The scan with another grid, and with what the user should know about that."""
+    def replace_grid(self, grid: VoxelGrid, warning: str) -> Scan:
+        """Return the scan with another grid, and with what the user should know about that."""
         return replace(self, grid=grid, warnings=(*self.warnings, warning))
 
 
@@ -71,7 +71,7 @@ def read_scan(
     least_neighbours: float = 0.0,
     level: bool = False,
 ) -> Scan:
-    """Points -> cells, so large that surfaces hold together (seeds 2.2). A grid is taken as it is.
+    """Return points -> cells, so large that surfaces hold together (seeds 2.2). A grid is taken as it is.
 
     Args:
         source: a cloud, chunks of one, (N, 3) points, or occupied cells.
@@ -93,24 +93,24 @@ def read_scan(
         return Scan(source, source if "offset" in source.properties and edge <= LEAST_FINE * FINE_CELL else None)
     parts = max(round(edge / FINE_CELL), 1)
     fine = LatticeCells(edge / parts, MOST_FINE_CELLS) if parts > 1 else None
-    clouds = [_cloud_of(source)] if isinstance(source, np.ndarray) else [source] if isinstance(source, PointCloud) else source
+    clouds = [_build_cloud(source)] if isinstance(source, np.ndarray) else [source] if isinstance(source, PointCloud) else source
     levelled = LevelledChunks(clouds) if level else None
     chunks = _Chunks(clouds if levelled is None else levelled, fine)
-    with reasons(chunks.warnings):
+    with add_reasons(chunks.warnings):
         grid = voxelise(chunks, edge, chunks.warnings)
         if len(grid) * edge < SHORTEST_ROW:
             cells = f"{len(grid)} cell{'s' * (len(grid) != 1)} of {edge:g} m"
             raise InputError(f"too few points, or all in one place: they lie in {cells}; check the file and --unit")
-    close = fine.within(grid) if fine is not None else grid
+    close = fine.select_within(grid) if fine is not None else grid
     if close is None:
         chunks.warnings.append("the scan is large: doors are read off its plan alone, not off its walls")
     if least_neighbours:
-        grid = without_gaps(grid, least_neighbours, chunks.warnings)
+        grid = coarsen_until_dense(grid, least_neighbours, chunks.warnings)
     scan = Scan(grid, close, chunks.rays, chunks.free, chunks.source, tuple(chunks.warnings))
     return scan if levelled is None else replace(scan, levelling=levelled.matrix, warnings=(*levelled.warnings, *scan.warnings))
 
 
-def _cloud_of(points: Array) -> PointCloud:
+def _build_cloud(points: Array) -> PointCloud:
     """A cloud of an array from the user."""
     try:
         return PointCloud(points)
@@ -119,7 +119,7 @@ def _cloud_of(points: Array) -> PointCloud:
 
 
 @contextmanager
-def reasons(warnings: Sequence[str]) -> Iterator[None]:
+def add_reasons(warnings: Sequence[str]) -> Iterator[None]:
     """Adds to an error of the input what looked wrong before it: that is often the reason."""
     try:
         yield
@@ -150,12 +150,12 @@ class _Chunks:
             self.free = chunk.free or self.free
             self.warnings += [w for w in chunk.warnings if w not in self.warnings]
             if chunk.poses is not None and chunk.pose_of is not None and len(chunk):
-                self._hold(*_rays(chunk, chunk.poses, chunk.pose_of))
+                self._add_rays(*_select_rays(chunk, chunk.poses, chunk.pose_of))
             if self.fine is not None:
                 self.fine.add(chunk)
             yield chunk
 
-    def _hold(self, starts: Array, ends: Array) -> None:
+    def _add_rays(self, starts: Array, ends: Array) -> None:
         """Take rays in; where there are too many, every second one goes, so that a walk may be of any length."""
         self._rays.append((np.ascontiguousarray(starts[:: self._step]), np.ascontiguousarray(ends[:: self._step])))
         while sum(len(part) for part, _ in self._rays) > MOST_RAYS_HELD:
@@ -170,7 +170,7 @@ class _Chunks:
         return starts, ends
 
 
-def _rays(cloud: PointCloud, poses: Array, pose_of: Array) -> tuple[Array, Array]:
+def _select_rays(cloud: PointCloud, poses: Array, pose_of: Array) -> tuple[Array, Array]:
     """Places of the sensor and of what it saw, m: an even selection of the points whose pose is known."""
     rows = np.arange(0, len(cloud), max(len(cloud) // MOST_RAYS, 1))
     rows = rows[pose_of[rows] >= 0]

@@ -12,30 +12,29 @@ from heapq import heappop, heappush
 import numpy as np
 from scipy import ndimage
 
-from topomerge.extraction.completeness import outline_seen
-from topomerge.extraction.plans.part_rooms import PartRooms, door_log_odds, laid_rooms, parted_columns
+from topomerge.extraction.completeness import measure_seen_outline
+from topomerge.extraction.plans.part_rooms import PartRooms, compute_door_log_odds, find_boundary_columns, rasterise_part_rooms
 from topomerge.extraction.plans.passages import (
     Pair,
     Passage,
-    clearance_of,
-    door_features,
-    door_probability,
+    compute_clearance,
+    compute_door_features,
     find_passages,
     joined,
-    pair_of,
-    regions_of,
+    predict_door,
+    segment_regions,
+    sort_pair,
 )
-from topomerge.extraction.plans.plan import columns_of, storey_plan, without_upper_sides
-from topomerge.extraction.plans.plan_network import column_probabilities, weights, without_furniture
+from topomerge.extraction.plans.plan import build_storey_plan, locate_columns, remove_upper_sides
+from topomerge.extraction.plans.plan_network import compute_column_probabilities, load_weights, remove_furniture
 from topomerge.extraction.plans.storey_plan import ClassifiedStorey, StoreyPlan
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.slices import is_raised
-from topomerge.extraction.storeys import NOWHERE, find_storeys, floor_to_ceiling
+from topomerge.extraction.storeys import NOWHERE, find_storeys, measure_floor_to_ceiling
 from topomerge.numpy_nn import sigmoid
 from topomerge.types import Array, VoxelGrid
 
 Scorer = Callable[[Array, Sequence[Passage]], Array]  # (n, 17) features and passages -> (n,) probability of a door
-
 PLAN_CELL = 0.1  # m: finer grids are looked at with about this
 THINNEST_SLAB = 0.15  # m: a thinner one parts no storeys
 SAME_LEVEL = 1.0  # m between a place and the floor of the storey on which it is
@@ -103,7 +102,7 @@ class SegmentedStorey:
     @property
     def completeness(self) -> Array:
         """(n,) share of each segment's outline at which a wall was seen."""
-        return outline_seen(self.segment, self.plan.inside, self.plan.wall, self.plan.edge)
+        return measure_seen_outline(self.segment, self.plan.inside, self.plan.wall, self.plan.edge)
 
     def locate_centre(self, passage: Passage) -> Array:
         """(3,) m, where a passage lies."""
@@ -119,16 +118,16 @@ def rasterise_storeys(scan: Scan, navigable: VoxelGrid, standing_height: float) 
         standing_height: m, whatever is lower than this above the floor is no ceiling.
     """
     grid = scan.grid
-    storeys, storey = find_storeys(navigable, floor_to_ceiling(grid, navigable, standing_height))
+    storeys, storey = find_storeys(navigable, measure_floor_to_ceiling(grid, navigable, standing_height))
     factor = max(round(PLAN_CELL / grid.edge), 1)
     coarse, floor, of_coarse = _coarsen(grid, navigable, storey, factor)
     numbers = [k for k in range(len(storeys)) if (of_coarse == k).any() and not _is_upper_side(storeys[k], storeys[:k])]
     raised = not scan.flat and is_raised(grid)  # with a floor that was assumed, a scan of the upper half of rooms is none
     plans, probabilities = [], []
     for k in numbers:
-        plan = storey_plan(coarse, floor, of_coarse, k, scan.crossed)
-        probability = column_probabilities(plan, weights(raised))
-        plans.append(without_furniture(plan, probability))
+        plan = build_storey_plan(coarse, floor, of_coarse, k, scan.crossed)
+        probability = compute_column_probabilities(plan, load_weights(raised))
+        plans.append(remove_furniture(plan, probability))
         probabilities.append(probability)
     return RasterisedStoreys(coarse, storeys, storey, factor, tuple(numbers), tuple(plans), tuple(probabilities))
 
@@ -144,13 +143,13 @@ def segment_storey(
         places: (n, 3) m, where the sensor was.
     """
     plan, probability, k = rasters.plans[i], rasters.probabilities[i], rasters.numbers[i]
-    clearance, laid = clearance_of(plan), laid_rooms(plan, parts)
-    region = regions_of(plan, probability, parted_columns(laid) if laid else None)
+    clearance, laid = compute_clearance(plan), rasterise_part_rooms(plan, parts)
+    region = segment_regions(plan, probability, find_boundary_columns(laid) if laid else None)
     if k > 0:
-        region = without_upper_sides(rasters.grid, plan, region, places)
+        region = remove_upper_sides(rasters.grid, plan, region, places)
     passages = find_passages(plan, clearance, region, probability)
     if laid:
-        odds = door_log_odds(region, plan.edge, passages, laid)
+        odds = compute_door_log_odds(region, plan.edge, passages, laid)
         passages = {pair: replace(passage, log_odds=odds[pair]) for pair, passage in passages.items()}
     growing = GrowingRooms(region, clearance, passages, plan.edge, score_by_plan)
     while growing.door_probability and growing.door_probability[pair := growing.weakest()] <= narrow:
@@ -160,7 +159,7 @@ def segment_storey(
     number[names] = np.arange(len(names))
     segment = number[np.append(growing.of_region, -1)[region]]
     passages = {(int(number[a]), int(number[b])): passage for (a, b), passage in growing.passages.items()}
-    low, base = columns_of(plan, rasters.grid)
+    low, base = locate_columns(plan, rasters.grid)
     corner = rasters.grid.origin + np.append(low, np.median(base)) * plan.edge
     classes = ClassifiedStorey(probability, corner[:2], plan.edge, float(corner[2]))
     return SegmentedStorey(k, plan, classes, clearance, segment, passages)
@@ -224,7 +223,7 @@ def score_by_plan(x: Array, passages: Sequence[Passage]) -> Array:
     Args:
         x: (n, 17) `DOOR_FEATURES` of the sides as they have grown.
     """
-    plan, said = door_probability(x), np.array([passage.log_odds for passage in passages])
+    plan, said = predict_door(x), np.array([passage.log_odds for passage in passages])
     return np.where(said == 0, plan, sigmoid(log_odds(plan) + said))
 
 
@@ -247,10 +246,10 @@ def _coarsen(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, factor: int) 
     """Both grids with cells `factor` times as long, and the storey of each navigable one: the lowest of those in it."""
     if factor == 1:
         return grid, navigable, storey
-    coarse = navigable.coarser(factor)
+    coarse = navigable.coarsen(factor)
     coarse_storey = np.full(len(coarse), np.iinfo(np.int32).max, np.int32)
-    np.minimum.at(coarse_storey, coarse.rows(navigable.cells // factor), storey)
-    return grid.coarser(factor), coarse, coarse_storey
+    np.minimum.at(coarse_storey, coarse.find_rows(navigable.cells // factor), storey)
+    return grid.coarsen(factor), coarse, coarse_storey
 
 
 def _is_upper_side(top: Array, below: Array) -> bool:
@@ -280,7 +279,7 @@ class GrowingRooms:
 
     def _score(self, pairs: list[Pair]) -> None:
         if pairs:
-            x = np.array([door_features(self.passages[p], self.peak[list(p)], self.area[list(p)]) for p in pairs])
+            x = np.array([compute_door_features(self.passages[p], self.peak[list(p)], self.area[list(p)]) for p in pairs])
             for pair, probability in zip(pairs, self.score(x, [self.passages[p] for p in pairs]).tolist(), strict=True):
                 self.door_probability[pair] = probability
                 heappush(self.queue, (probability, pair))
@@ -300,7 +299,7 @@ class GrowingRooms:
         self.area[room] += self.area[absorbed]
         self.neighbours[room].discard(absorbed)
         for other in self.neighbours[absorbed] - {room}:
-            old, new = pair_of(absorbed, other), pair_of(room, other)
+            old, new = sort_pair(absorbed, other), sort_pair(room, other)
             self.neighbours[other].discard(absorbed)
             self.neighbours[other].add(room)
             self.neighbours[room].add(other)
@@ -308,4 +307,124 @@ class GrowingRooms:
             del self.door_probability[old]
             known = self.passages.get(new)
             self.passages[new] = passage if known is None else joined(passage, known)
-        self._score(sorted(pair_of(room, other) for other in self.neighbours[room]))
+        self._score(sorted(sort_pair(room, other) for other in self.neighbours[room]))
+
+
+SURE_PARTED = 0.8  # probability of a door from which on what is small, but not tiny, stays a room: toilets and stores
+SURE_SHOWN = 2.3  # log odds, on average along a doorway that walls show: likewise (as `walls.SURE_WITHIN`)
+NO_DOOR = -0.85  # log odds of a door below which there is probably none
+CRACK = 0.45  # m: nobody walks through less; a room behind a crack, of a door that is ajar, stays one
+
+
+@dataclass(frozen=True)
+class LeastSize:
+    """What is too small for a room of its own.
+
+    Args:
+        tiny: m2 of floor that was seen; smaller ones are parts of a neighbour, or of no room.
+        small: m2, smaller ones are parts of a neighbour where no door surely parts them from it.
+        open: m2, smaller ones likewise where there is probably no door.
+        half_width: m, what is nowhere farther from a wall is none.
+    """
+
+    tiny: float
+    small: float
+    open: float
+    half_width: float
+
+
+ROOM_LEAST = LeastSize(0.3, 0.8, 0.0, 0.2)  # narrower ones are the edge of a facade or of a slab
+FLAT_LEAST = LeastSize(0.8, 0.8, 6.0, 0.35)  # in slices, where legs look like walls
+
+
+@dataclass(frozen=True, eq=False)
+class PartitionedStorey:
+    """A storey cut into rooms and areas, both numbered from 0 in the storey; an area is a segment.
+
+    Args:
+        number: of the storey.
+        plan: the storey seen from above, without furniture.
+        classes: what probably stands in its columns.
+        room, area: (nx, ny) of each column, -1 none.
+        room_of_area: (A,).
+        room_of_segment: (n,) -1 none.
+        door_probability: that a door parts two neighbouring rooms.
+    """
+
+    number: int
+    plan: StoreyPlan
+    classes: ClassifiedStorey
+    room: Array
+    area: Array
+    room_of_area: Array
+    room_of_segment: Array
+    door_probability: dict[Pair, float]
+
+
+def partition_rooms(storey: SegmentedStorey, score: Scorer, door: float, least: LeastSize = ROOM_LEAST) -> PartitionedStorey:
+    """Merge the segments of a storey, the least likely door first, until only likely doors part them: this cuts the rooms, once.
+
+    Args:
+        score: tells doors from narrowings of a room, by all evidence.
+        door: probability from which on two rooms stay apart.
+        least: what is smaller is given to a neighbour.
+    """
+    segment, edge = storey.segment, storey.plan.edge
+    rooms = GrowingRooms(segment, storey.clearance, storey.passages, edge, score)
+    while rooms.door_probability and rooms.door_probability[pair := rooms.weakest()] <= door:
+        rooms.merge(pair)
+    while (small := find_too_small(rooms, least)) is not None:
+        rooms.merge(small)
+    large = np.unique(rooms.of_region)
+    large = large[(rooms.area[large] >= least.tiny) & (rooms.peak[large] >= least.half_width)]
+    number = np.full(len(rooms.of_region) + 1, -1)
+    number[large] = np.arange(len(large))
+    room_of_segment = number[rooms.of_region]
+    kept = np.flatnonzero(room_of_segment >= 0)
+    area_of_segment = np.full(len(room_of_segment) + 1, -1)
+    area_of_segment[kept] = np.arange(len(kept))
+    doors = {}
+    for (a, b), probability in rooms.door_probability.items():
+        if number[a] >= 0 and number[b] >= 0:
+            doors[sort_pair(int(number[a]), int(number[b]))] = probability
+    return PartitionedStorey(
+        storey.number,
+        storey.plan,
+        storey.classes,
+        np.append(room_of_segment, -1)[segment],
+        area_of_segment[segment],
+        room_of_segment[kept],
+        room_of_segment,
+        doors,
+    )
+
+
+def find_too_small(rooms: GrowingRooms, least: LeastSize) -> Pair | None:
+    """Find the least surely parted two rooms of which one is too small; None: none is."""
+    found: list[tuple[int, float, Pair]] = []
+    for pair, probability in rooms.door_probability.items():
+        size = min(rooms.area[pair[0]], rooms.area[pair[1]])
+        shown, _, door = rooms.passages[pair].evidence or (0.0, 0.0, 0.0)
+        parted = probability >= SURE_PARTED or shown >= SURE_SHOWN
+        if size < least.tiny or (size < least.small and not parted):
+            found.append((0, probability, pair))
+        elif size < least.open and door < NO_DOOR and rooms.passages[pair].width >= CRACK:
+            found.append((1, door, pair))
+    return min(found)[2] if found else None
+
+
+def find_rooms_of_segments(storeys: Sequence[PartitionedStorey], numbers: Array) -> Array:
+    """(n,) room of the map of each segment of all storeys, -1 none.
+
+    Args:
+        numbers: (R,) of the rooms that have a floor, as they are numbered on from storey to storey
+        (`topology.select_rooms_with_floor`).
+    """
+    of, first = [], 0
+    for storey in storeys:
+        of.append(np.where(storey.room_of_segment >= 0, storey.room_of_segment + first, -1))
+        first += int(storey.room.max(initial=-1)) + 1
+    number = np.full(first + 1, -1)
+    number[numbers] = np.arange(len(numbers))
+    out: Array = number[np.concatenate([np.zeros(0, np.int64), *of])]
+    return out

@@ -11,7 +11,7 @@ from topomerge.errors import InputError
 from topomerge.extraction.cleaning import MIDDLE
 from topomerge.extraction.levelling import SLICE_HEIGHT
 from topomerge.extraction.scan import Scan
-from topomerge.kernels.carve import count_rays
+from topomerge.kernels.rays import count_rays
 from topomerge.types import Array, VoxelGrid
 
 EXTRUDED_HEIGHT = 2.4  # m, of the walls that a slice becomes
@@ -28,7 +28,7 @@ FEW_POINTS = 0.25  # of the usual number in the columns around, where rays are u
 COLUMNS_AROUND = 0.3  # m
 
 
-def with_raised_slice(scan: Scan) -> Scan:
+def raise_slice(scan: Scan) -> Scan:
     """A scan that is a slice gets walls over its columns, and a floor; any other stays as it is, but for the walls of a raised
     plan, at which nobody needs to look closely.
 
@@ -41,14 +41,14 @@ def with_raised_slice(scan: Scan) -> Scan:
         flat = f"only a floor or a ceiling was seen (all within {SLICE_HEIGHT:g} m of height, over whole areas), and no walls"
         raise InputError(f"{flat}: rooms can't be told from it; give a scan that shows walls, too")
     warning = f"the scan is a slice: walls of {EXTRUDED_HEIGHT:g} m and a floor were assumed"
-    return replace(scan.with_grid(_extruded(scan.grid, scan.rays), warning), fine=None)
+    return replace(scan.replace_grid(_extrude_slice(scan.grid, scan.rays), warning), fine=None)
 
 
 def is_slice(grid: VoxelGrid) -> bool:
     """Is the scan flat, but for single points?"""
     if not len(grid):
         return False
-    low, high = _extent(grid)
+    low, high = _measure_extent(grid)
     return (high - low) * grid.edge <= SLICE_HEIGHT
 
 
@@ -66,7 +66,7 @@ def is_raised(grid: VoxelGrid) -> bool:
     """Was the scan a plan, of which every wall was raised alike? Then there are neither lintels nor leaves nor recesses."""
     if not len(grid):
         return False
-    low, high = _extent(grid)
+    low, high = _measure_extent(grid)
     bottom, top = low + round(RAISED_FROM / grid.edge), high - round(BELOW_TOP / grid.edge)
     x, y, z = grid.cells.T
     standing = (z >= bottom) & (z < top)
@@ -76,31 +76,31 @@ def is_raised(grid: VoxelGrid) -> bool:
     return bool(most >= RAISED_LEVELS * (top - bottom) > 0 and (filled == most).mean() >= RAISED_SHARE)
 
 
-def _extent(grid: VoxelGrid) -> tuple[int, int]:
+def _measure_extent(grid: VoxelGrid) -> tuple[int, int]:
     """The lowest and the highest level, but for single points."""
     below = np.cumsum(np.bincount(grid.cells[:, 2]))
     low, high = np.searchsorted(below, (int(0.01 * len(grid)), int(0.99 * (len(grid) - 1))), side="right").tolist()
     return low, high
 
 
-def _extruded(grid: VoxelGrid, rays: tuple[Array, Array] | None) -> VoxelGrid:
+def _extrude_slice(grid: VoxelGrid, rays: tuple[Array, Array] | None) -> VoxelGrid:
     """Walls over the columns of a slice, and a floor where the sensor looked, or where walls are around.
 
     Args:
         grid: occupied cells.
         rays: (k, 3) places of the sensor and (k, 3) of what it saw, m, where they are known.
     """
-    low, _ = _extent(grid)
+    low, _ = _measure_extent(grid)
     columns, column = np.unique(grid.cells[:, :2], axis=0, return_inverse=True)
     points = np.zeros(grid.shape[:2], np.int64)
     count = grid.properties.get("count", np.ones(len(grid), np.int64))
     points[tuple(columns.T)] = np.bincount(column.ravel(), count)
     if rays is not None:
-        passed, met = _rays_of_columns(grid, *rays)
+        passed, met = _count_column_rays(grid, *rays)
         wall, inside = (points > 0) & (passed <= SEEN_THROUGH * np.maximum(met, 1)), passed > 0
     else:
-        wall = _filled_columns(points, grid.edge)
-        inside = enclosed_columns(wall, grid.edge)
+        wall = _find_filled_columns(points, grid.edge)
+        inside = find_enclosed_columns(wall, grid.edge)
     inside = ndimage.binary_closing(np.pad(inside, 2), np.ones((3, 3)))[2:-2, 2:-2] & ~wall
     high = round(EXTRUDED_HEIGHT / grid.edge)
     levels = np.arange(low + 1, low + high)
@@ -117,7 +117,7 @@ def _extruded(grid: VoxelGrid, rays: tuple[Array, Array] | None) -> VoxelGrid:
     return VoxelGrid.from_cells(np.concatenate([walls, floor]), grid.origin, grid.edge, shape, {"offset": offset})
 
 
-def _rays_of_columns(grid: VoxelGrid, starts: Array, ends: Array) -> tuple[Array, Array]:
+def _count_column_rays(grid: VoxelGrid, starts: Array, ends: Array) -> tuple[Array, Array]:
     """(nx, ny) how many rays go through each column and how many end in it, seen from above."""
     passed, met = np.zeros(grid.shape[:2], np.int32), np.zeros(grid.shape[:2], np.int32)
     at, to = ((np.asarray(p, np.float64)[:, :2] - grid.origin[:2]) / grid.edge for p in (starts, ends))
@@ -125,7 +125,7 @@ def _rays_of_columns(grid: VoxelGrid, starts: Array, ends: Array) -> tuple[Array
     return passed, met
 
 
-def _filled_columns(points: Array, edge: float) -> Array:
+def _find_filled_columns(points: Array, edge: float) -> Array:
     """(nx, ny) columns that hold about as many points (nx, ny) as others around them: single ones hang in doorways."""
     size = 2 * round(COLUMNS_AROUND / edge) + 1
     some = points > 0
@@ -134,13 +134,13 @@ def _filled_columns(points: Array, edge: float) -> Array:
     return np.asarray(some & (points >= FEW_POINTS * usual))
 
 
-def enclosed_columns(wall: Array, edge: float) -> Array:
-    """(nx, ny) columns around which walls stand in most directions."""
-    return np.asarray(walled_directions(wall, edge) >= ENCLOSED_SHARE * SIGHT_DIRECTIONS)
+def find_enclosed_columns(wall: Array, edge: float) -> Array:
+    """Return (nx, ny) columns around which walls stand in most directions."""
+    return np.asarray(count_walled_directions(wall, edge) >= ENCLOSED_SHARE * SIGHT_DIRECTIONS)
 
 
-def walled_directions(wall: Array, edge: float) -> Array:
-    """(nx, ny) int32 in how many of `SIGHT_DIRECTIONS` a wall stands, from each column."""
+def count_walled_directions(wall: Array, edge: float) -> Array:
+    """Return (nx, ny) int32 in how many of `SIGHT_DIRECTIONS` a wall stands, from each column."""
     hits = np.zeros(wall.shape, np.int32)
     far = round(SIGHT_RANGE / edge)
     for angle in np.arange(SIGHT_DIRECTIONS) * 2 * np.pi / SIGHT_DIRECTIONS:
@@ -149,13 +149,13 @@ def walled_directions(wall: Array, edge: float) -> Array:
         reach = np.array([np.cos(angle), np.sin(angle)])
         while step < far:
             dx, dy = np.rint(reach * step).astype(int)
-            seen |= _shifted(seen, int(dx), int(dy))
+            seen |= _shift_mask(seen, int(dx), int(dy))
             step *= 2
         hits += seen
     return hits
 
 
-def _shifted(mask: Array, dx: int, dy: int) -> Array:
+def _shift_mask(mask: Array, dx: int, dy: int) -> Array:
     shifted = np.zeros_like(mask)
     nx, ny = mask.shape
     if abs(dx) < nx and abs(dy) < ny:

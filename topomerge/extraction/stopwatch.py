@@ -26,7 +26,7 @@ class Stopwatch:
         self._step, self._began = step, time.perf_counter()
 
     def end(self) -> dict[str, float]:
-        """The last step ends; returns step -> s."""
+        """End the last step; returns step -> s."""
         if self._step is not None:
             self.seconds[self._step] = round(time.perf_counter() - self._began, 4)
         self._step = None
@@ -45,7 +45,7 @@ class Stopwatch:
         yield
         self.seconds[step] = self.seconds.get(step, 0.0) + time.perf_counter() - began
 
-    def part(self, begin: float, end: float) -> Progress | None:
+    def build_part_progress(self, begin: float, end: float) -> Progress | None:
         """News from within a step that takes the work from one share done to another."""
         if self.progress is None:
             return None

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from topomerge.extraction.convolution import Kernel, any_at, moore
-from topomerge.extraction.morphology import connected_components, on_all_sides
-from topomerge.kernels.columns import first_occupied, hollow_below, levels_below
+from topomerge.extraction.convolution import Kernel, build_moore, is_any_at
+from topomerge.extraction.morphology import is_surrounded, label_components
+from topomerge.kernels.rasters import count_levels_below, find_first_occupied, is_hollow_below
 from topomerge.types import STOREY_DTYPE, Array, VoxelGrid
 
 # Storeys: levels at which much floor lies.
@@ -36,7 +36,7 @@ def find_storeys(navigable: VoxelGrid, floor_to_ceiling: Array) -> tuple[Array, 
     """
     if not len(navigable):
         return np.zeros(0, STOREY_DTYPE), np.zeros(0, np.int32)
-    lowest = lowest_of_column(navigable)
+    lowest = select_lowest_of_column(navigable)
     level = navigable.cells[lowest, 2]
     area = np.bincount(level) * navigable.edge**2
     smooth = np.convolve(area, np.ones(3), "same")
@@ -48,19 +48,19 @@ def find_storeys(navigable: VoxelGrid, floor_to_ceiling: Array) -> tuple[Array, 
         if all(abs(int(z) - f) * navigable.edge >= STOREY_LEAST_HEIGHT for f in floors):
             floors.append(int(z))
     floors.sort()
-    storeys, storey, level = _of_floors(navigable, lowest, floors, floor_to_ceiling)
+    storeys, storey, level = _assign_storeys(navigable, lowest, floors, floor_to_ceiling)
     in_the_air = np.append(False, storeys["floor"][1:] < storeys["ceiling"][:-1] - IN_THE_AIR)
     none = in_the_air & (level < np.maximum(GALLERY_LEAST_AREA, LEVEL_SHARE * storeys["area"]))
     if none.any():
         floors = [z for z, gone in zip(floors, none, strict=True) if not gone]
-        storeys, storey, _ = _of_floors(navigable, lowest, floors, floor_to_ceiling)
-    while (half := _stacked_level(navigable, lowest, storey[lowest], floors)) is not None:
+        storeys, storey, _ = _assign_storeys(navigable, lowest, floors, floor_to_ceiling)
+    while (half := _find_stacked_level(navigable, lowest, storey[lowest], floors)) is not None:
         floors = sorted([*floors, half])
-        storeys, storey, _ = _of_floors(navigable, lowest, floors, floor_to_ceiling)
+        storeys, storey, _ = _assign_storeys(navigable, lowest, floors, floor_to_ceiling)
     return storeys, storey
 
 
-def _stacked_level(navigable: VoxelGrid, lowest: Array, storey: Array, floors: list[int]) -> int | None:
+def _find_stacked_level(navigable: VoxelGrid, lowest: Array, storey: Array, floors: list[int]) -> int | None:
     """The level of floor that lies above other floor of the same storey, as the half levels of one side of a house do; None where
     there is less of it than of a gallery, or where it is not level."""
     x, y, z = navigable.cells[lowest].T.astype(np.int64)
@@ -73,7 +73,9 @@ def _stacked_level(navigable: VoxelGrid, lowest: Array, storey: Array, floors: l
     return int(level.argmax()) if level.max() >= max(GALLERY_LEAST_AREA, STACKED_SHARE * area.sum()) else None
 
 
-def _of_floors(navigable: VoxelGrid, lowest: Array, floors: list[int], floor_to_ceiling: Array) -> tuple[Array, Array, Array]:
+def _assign_storeys(
+    navigable: VoxelGrid, lowest: Array, floors: list[int], floor_to_ceiling: Array
+) -> tuple[Array, Array, Array]:
     """The storeys of floors at these levels (ascending), the storey of each navigable cell, and how much of a storey's floor,
     m2, lies at its level."""
     halfway = (np.array(floors[:-1]) + np.array(floors[1:])) / 2
@@ -87,25 +89,25 @@ def _of_floors(navigable: VoxelGrid, lowest: Array, floors: list[int], floor_to_
         level[s] = len(near) * navigable.edge**2
         near = near if len(near) else rows
         height = navigable.origin[2] + (navigable.cells[near, 2].mean() + 0.5) * navigable.edge
-        ceiling = height + (ceiling_height(floor_to_ceiling[near]) or np.nan)
+        ceiling = height + (estimate_ceiling_height(floor_to_ceiling[near]) or np.nan)
         storeys[s] = (height, ceiling, len(rows) * navigable.edge**2)
     return storeys, storey, level
 
 
-def floor_to_ceiling(grid: VoxelGrid, navigable: VoxelGrid, body_height: float) -> Array:
+def measure_floor_to_ceiling(grid: VoxelGrid, navigable: VoxelGrid, body_height: float) -> Array:
     """(m,) m of empty space between each navigable cell and the first occupied one above it; 0 where there is none."""
     start = max(int(body_height / grid.edge), 1)
     limit = int(HIGHEST_CEILING / grid.edge)
-    return first_occupied(*grid._bricks, navigable.cells.astype(np.int64), start, 1, limit) * grid.edge
+    return find_first_occupied(*grid._bricks, navigable.cells.astype(np.int64), start, 1, limit) * grid.edge
 
 
-def ceiling_height(above: Array) -> float:
+def estimate_ceiling_height(above: Array) -> float:
     """Median of the heights above a floor, 0 where less than a third of it has something above: lintels are no ceiling."""
     seen = above[above > 0]
     return float(np.median(seen)) if len(seen) * 3 >= len(above) > 0 else 0.0
 
 
-def lowest_of_column(navigable: VoxelGrid) -> Array:
+def select_lowest_of_column(navigable: VoxelGrid) -> Array:
     """Ascending rows of the cells that have no navigable cell right below them: the floor proper, without its upward dilation."""
     return np.flatnonzero(~navigable.contains(navigable.cells.astype(np.int64) - (0, 0, 1)))
 
@@ -126,8 +128,8 @@ NOWHERE = np.zeros((0, 3))
 WALLED_SHARE = 0.25  # share of a floor's boundary beside which walls rise
 
 
-def without_ceilings(grid: VoxelGrid, standing: VoxelGrid, places: Array = NOWHERE) -> VoxelGrid:
-    """The standing cells less those on the upper side of a ceiling or of a wall.
+def remove_ceilings(grid: VoxelGrid, standing: VoxelGrid, places: Array = NOWHERE) -> VoxelGrid:
+    """Return the standing cells less those on the upper side of a ceiling or of a wall.
 
     A part of the standing cells with nothing above it is a ceiling if below most of it, walls left aside, is empty space and then
     something: of small flats half may lie over walls. The floor of an upper storey whose own ceiling was not scanned looks so,
@@ -139,43 +141,43 @@ def without_ceilings(grid: VoxelGrid, standing: VoxelGrid, places: Array = NOWHE
     cells = standing.cells.astype(np.int64)
     thick = max(int(np.ceil(SHEET_HEIGHT / grid.edge)), 1)
     far = int(np.ceil(STOREY_REACH / grid.edge))
-    bare = first_occupied(*grid._bricks, cells, thick + 1, 1, far) == 0
+    bare = find_first_occupied(*grid._bricks, cells, thick + 1, 1, far) == 0
     if not bare.any():
         return standing
     slab = int(np.ceil(SLAB_HEIGHT / grid.edge))
-    hollow = hollow_below(*grid._bricks, cells, 1, slab, int(np.ceil(HOLLOW_HEIGHT / grid.edge)), far)
-    component = connected_components(standing, moore(), group=np.where(bare, 0, -1))
+    hollow = is_hollow_below(*grid._bricks, cells, 1, slab, int(np.ceil(HOLLOW_HEIGHT / grid.edge)), far)
+    component = label_components(standing, build_moore(), group=np.where(bare, 0, -1))
     count = int(component.max()) + 1
     boundary = np.flatnonzero(bare)
-    boundary = boundary[~on_all_sides(standing, cells[boundary], 1)]
-    walled = any_at(grid, cells[boundary], beside_and_above(grid.edge))
+    boundary = boundary[~is_surrounded(standing, cells[boundary], 1)]
+    walled = is_any_at(grid, cells[boundary], build_overhang_kernel(grid.edge))
     on_boundary = np.bincount(component[boundary], minlength=count)
     with_wall = np.bincount(component[boundary], walled, minlength=count)
-    on_wall = _on_a_wall(grid, cells)
+    on_wall = _is_on_wall(grid, cells)
     between = bare & ~on_wall
     hollow_area, area = (np.bincount(component[rows], minlength=count) for rows in (between & hollow, between))
     ceiling = (hollow_area > HOLLOW_SHARE * area) & (with_wall < WALLED_SHARE * np.maximum(on_boundary, 1))
-    ceiling[component[rows_below(standing, places)]] = False
-    return standing.subset(~(bare & (ceiling[component] | on_wall)))
+    ceiling[component[find_rows_below(standing, places)]] = False
+    return standing.select_cells(~(bare & (ceiling[component] | on_wall)))
 
 
-def rows_below(standing: VoxelGrid, places: Array) -> Array:
-    """Rows of the cells over which the sensor was carried, at (n, 3) places, m."""
+def find_rows_below(standing: VoxelGrid, places: Array) -> Array:
+    """Return rows of the cells over which the sensor was carried, at (n, 3) places, m."""
     steps = np.arange(*np.rint(np.array(CARRIED) / standing.edge).astype(int))
     at = np.floor((places[np.isfinite(places).all(axis=1)] - standing.origin) / standing.edge)
     at = np.unique(at.astype(np.int64), axis=0)
-    rows = standing.rows((at[:, None] - steps[:, None] * (0, 0, 1)).reshape(-1, 3))
+    rows = standing.find_rows((at[:, None] - steps[:, None] * (0, 0, 1)).reshape(-1, 3))
     return rows[rows >= 0]
 
 
-def _on_a_wall(grid: VoxelGrid, cells: Array) -> Array:
+def _is_on_wall(grid: VoxelGrid, cells: Array) -> Array:
     """(m,) bool: is much of the metre below filled, here or in a neighbouring column?"""
     depth = max(int(1.0 / grid.edge), 1)
-    return levels_below(*grid._bricks, cells, 1, depth) >= SOLID_SHARE * depth
+    return count_levels_below(*grid._bricks, cells, 1, depth) >= SOLID_SHARE * depth
 
 
-def beside_and_above(edge: float) -> Kernel:
-    """Cells within 0.35 m horizontally and 0.5 to 1.5 m above."""
+def build_overhang_kernel(edge: float) -> Kernel:
+    """Return cells within 0.35 m horizontally and 0.5 to 1.5 m above."""
     reach = int(np.ceil(0.35 / edge))
     steps = np.arange(-reach, reach + 1)
     heights = np.arange(int(np.ceil(0.5 / edge)), int(np.ceil(1.5 / edge)) + 1)

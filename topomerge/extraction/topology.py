@@ -8,12 +8,12 @@ import edt
 import numpy as np
 from scipy import ndimage
 
-from topomerge.extraction.completeness import completeness
-from topomerge.extraction.convolution import sphere
-from topomerge.extraction.morphology import connected_components
-from topomerge.extraction.plans.storey_plan import Floor, leads_through_wall
-from topomerge.extraction.storeys import ceiling_height, floor_to_ceiling, lowest_of_column
-from topomerge.kernels.grow import steps_from
+from topomerge.extraction.completeness import measure_completeness
+from topomerge.extraction.convolution import build_sphere
+from topomerge.extraction.morphology import label_components
+from topomerge.extraction.plans.storey_plan import Floor, is_through_wall
+from topomerge.extraction.storeys import estimate_ceiling_height, measure_floor_to_ceiling, select_lowest_of_column
+from topomerge.kernels.rasters import count_steps
 from topomerge.types import AREA_DTYPE, EDGE_DTYPE, ROOM_DTYPE, Array, TopometricMap, VoxelGrid
 
 # Where two rooms meet: doors, openings and stairs (seeds 2.7).
@@ -29,7 +29,7 @@ HALF_NEIGHBOURS = np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1)])
 
 
 def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceiling: Array, within: Array | None = None) -> Array:
-    """Edges between rooms that have adjacent navigable cells (seeds 2.7), one for each place where they meet.
+    """Return edges between rooms that have adjacent navigable cells (seeds 2.7), one for each place where they meet.
 
     Args:
         floor: of all storeys.
@@ -45,7 +45,7 @@ def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceilin
     cells = navigable.cells.astype(np.int64)
     first, second = [], []
     for step in HALF_NEIGHBOURS:
-        other = navigable.rows(cells + step)
+        other = navigable.find_rows(cells + step)
         row = np.flatnonzero((other >= 0) & (room >= 0))
         neighbour = other[row]
         meet = (room[neighbour] >= 0) & (room[neighbour] != room[row])
@@ -61,11 +61,11 @@ def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceilin
     order = np.argsort(pair, kind="stable")
     for contacts in np.split(order, np.flatnonzero(np.diff(pair[order])) + 1) if len(order) else []:
         rows = np.unique(np.concatenate([a[contacts], b[contacts]]))
-        meeting = navigable.subset(rows)
-        contact = connected_components(meeting, sphere(2.5 * navigable.edge, navigable.edge))
+        meeting = navigable.select_cells(rows)
+        contact = label_components(meeting, build_sphere(2.5 * navigable.edge, navigable.edge))
         parts = [rows[contact == c] for c in range(int(contact.max()) + 1)]
         passages = [_edge(navigable, room, part, storey_of_room, floor_to_ceiling, body) for part in parts]
-        edges += _distinct_doors(
+        edges += _select_distinct_doors(
             [edge for edge in passages if edge[2] >= PASSAGE_LEAST_WIDTH or (edge[6] and edge[5] != "stairs")]
         )
     table = np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
@@ -81,15 +81,15 @@ def _add_stairs(edges: Array, floor: Floor) -> None:
     stairs = np.flatnonzero(edges["kind"] == "stairs")
     if not len(stairs):
         return
-    z = floor.cells.centroids()[:, 2]
+    z = floor.cells.compute_centroids()[:, 2]
     nearest = np.abs(z[:, None] - floor.storeys["floor"]).min(axis=1)
-    rows = lowest_of_column(floor.cells)
+    rows = select_lowest_of_column(floor.cells)
     rows = rows[nearest[rows] > LANDING_HEIGHT]
     if not len(rows):
         return
-    steps = floor.cells.subset(np.sort(rows))
-    part = connected_components(steps, sphere(2.5 * steps.edge, steps.edge))
-    places = steps.centroids()
+    steps = floor.cells.select_cells(np.sort(rows))
+    part = label_components(steps, build_sphere(2.5 * steps.edge, steps.edge))
+    places = steps.compute_centroids()
     for i in stairs:
         distance = np.linalg.norm(places - edges["centre"][i], axis=1)
         if distance.min() > DOOR_SEARCH:
@@ -98,11 +98,11 @@ def _add_stairs(edges: Array, floor: Floor) -> None:
         low, high = stair[:, 2].min(), stair[:, 2].max()
         edges["lower"][i] = stair[stair[:, 2] <= low + LANDING_HEIGHT].mean(axis=0)
         edges["upper"][i] = stair[stair[:, 2] >= high - LANDING_HEIGHT].mean(axis=0)
-        if _steepness(stair) < RAMP_CLIMB:
+        if _measure_steepness(stair) < RAMP_CLIMB:
             edges["kind"][i] = "ramp"
 
 
-def _steepness(places: Array) -> float:
+def _measure_steepness(places: Array) -> float:
     """Climb of a floor, m per m: the median over tiles of 0.6 m."""
     tile = np.floor(places[:, :2] / 0.6).astype(np.int64)
     _, of = np.unique(tile, axis=0, return_inverse=True)
@@ -113,7 +113,7 @@ def _steepness(places: Array) -> float:
     return float(np.median(high - low)) / 0.6
 
 
-def _distinct_doors(edges: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+def _select_distinct_doors(edges: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
     """The edges of one pair of rooms, without those that lead through the same door as a wider one."""
     distinct: list[tuple[Any, ...]] = []
     for edge in sorted(edges, key=lambda e: (-e[2], e[1])):
@@ -129,10 +129,10 @@ def _edge(
     pair = np.unique(room[rows])
     cells = navigable.cells[rows]
     middle, along, span = _extent(np.unique(cells[:, :2], axis=0))
-    narrow = _narrowest(navigable, room, pair, cells)
+    narrow = _find_narrowest_place(navigable, room, pair, cells)
     if narrow is not None and narrow[2] <= span:
         middle, along, span = narrow
-    under = _under(navigable, middle, cells)
+    under = _find_rows_under(navigable, middle, cells)
     rows = under if len(under) else rows
     above = floor_to_ceiling[rows]
     height = float(np.quantile(above[above > 0], 0.1, method="nearest")) if (above > 0).any() else 0.0
@@ -151,12 +151,12 @@ def _edge(
     return (tuple(int(p) for p in pair), place, width, height, across, kind, passable, False, 1.0, place, place)
 
 
-def _under(navigable: VoxelGrid, middle: Array, contact: Array) -> Array:
+def _find_rows_under(navigable: VoxelGrid, middle: Array, contact: Array) -> Array:
     """Rows of the navigable cells in the middle of a passage, at the height of the contact."""
     reach, rise = int(0.25 / navigable.edge), int(LEVEL_HEIGHT / navigable.edge)
     low = np.rint([*middle, contact[:, 2].mean()]).astype(np.int64) - (reach, reach, rise)
     window = np.argwhere(np.ones((2 * reach + 1, 2 * reach + 1, 2 * rise + 1), bool)) + low
-    rows = navigable.rows(window)
+    rows = navigable.find_rows(window)
     rows = rows[rows >= 0]
     return rows[~navigable.contains(navigable.cells[rows].astype(np.int64) - (0, 0, 1))]  # the floor, not what was dilated
 
@@ -170,7 +170,7 @@ def _extent(plan: Array) -> tuple[Array, Array, float]:
     return middle, along, float(np.ptp(plan @ along)) + 1
 
 
-def _narrowest(navigable: VoxelGrid, room: Array, pair: Array, contact: Array) -> tuple[Array, Array, float] | None:
+def _find_narrowest_place(navigable: VoxelGrid, room: Array, pair: Array, contact: Array) -> tuple[Array, Array, float] | None:
     """Middle, direction and width (cells) of the narrowest place on the widest way between two rooms, near their contact.
 
     Borders between clusters of views lie somewhere near a door, not in it; the floor itself is narrowest in the door.
@@ -178,7 +178,7 @@ def _narrowest(navigable: VoxelGrid, room: Array, pair: Array, contact: Array) -
     reach = int(np.ceil(DOOR_SEARCH / navigable.edge))
     low = contact[:, :2].min(axis=0) - reach
     size = contact[:, :2].max(axis=0) + reach + 1 - low
-    owner = _owners(navigable, room, low, size, contact)
+    owner = _rasterise_rooms(navigable, room, low, size, contact)
     free = np.pad(owner >= 0, 1)
     clearance = np.sqrt(edt.edtsq(free.view(np.uint8), parallel=1))[1:-1, 1:-1]
     # Each room is represented by its widest place away from the border, which may lie on the wrong side of the door.
@@ -194,14 +194,14 @@ def _narrowest(navigable: VoxelGrid, room: Array, pair: Array, contact: Array) -
         sides.append(np.argmax(np.where(away_enough, clearance, -1.0)))
     if clearance.flat[sides[0]] <= 1 or clearance.flat[sides[1]] <= 1:
         return None
-    pass_parts = _at_the_pass(clearance, int(sides[0]), int(sides[1]))
+    pass_parts = _split_at_pass(clearance, int(sides[0]), int(sides[1]))
     if pass_parts is None:
         return None
-    saddle = _between(*pass_parts)
+    saddle = _find_middle_cell(*pass_parts)
     return None if saddle is None else _across(owner >= 0, clearance, saddle, low)
 
 
-def _at_the_pass(clearance: Array, first: int, second: int) -> tuple[Array, Array, Array] | None:
+def _split_at_pass(clearance: Array, first: int, second: int) -> tuple[Array, Array, Array] | None:
     """The parts of the first and of the second of two columns where the widest body passes that does not get from the one to the
     other, and the part of both where the next smaller one does; None where none or all do."""
     levels = np.unique(clearance[clearance > 0])[::-1]
@@ -224,21 +224,21 @@ def _at_the_pass(clearance: Array, first: int, second: int) -> tuple[Array, Arra
     return parts == a, parts == b, joined == both
 
 
-def _owners(navigable: VoxelGrid, room: Array, low: Array, size: Array, contact: Array) -> Array:
+def _rasterise_rooms(navigable: VoxelGrid, room: Array, low: Array, size: Array, contact: Array) -> Array:
     """(size) room of each column of a window at `low`, at the height of the contact; -1 where nobody can stand."""
     reach = int(LEVEL_HEIGHT / navigable.edge)
     middle = round(float(contact[:, 2].mean()))
     levels = np.arange(middle - reach, middle + reach + 1)
     columns = np.argwhere(np.ones(size, bool)) + low
     cells = np.column_stack([np.tile(columns, (len(levels), 1)), np.repeat(levels, len(columns))])
-    row = navigable.rows(cells)
+    row = navigable.find_rows(cells)
     label = np.where(row >= 0, room[np.maximum(row, 0)], -1)
     return label.reshape(len(levels), *size).max(axis=0)
 
 
-def _between(first: Array, second: Array, way: Array) -> Array | None:
+def _find_middle_cell(first: Array, second: Array, way: Array) -> Array | None:
     """The cell of `way` halfway between two parts on the shortest connection."""
-    steps = [steps_from(part, way) for part in (first, second)]
+    steps = [count_steps(part, way) for part in (first, second)]
     total = np.where((steps[0] > 0) & (steps[1] > 0), steps[0] + steps[1], np.iinfo(np.int64).max)
     if not (total < np.iinfo(np.int64).max).any():
         return None
@@ -267,8 +267,8 @@ def _across(free: Array, clearance: Array, saddle: Array, low: Array) -> tuple[A
 # Rooms and edges with their measures: the topometric map (seeds 2.7).
 
 
-def topometric_map(grid: VoxelGrid, floor: Floor, body_height: float) -> TopometricMap:
-    """The graph of rooms over the voxel grid (seeds 2.7).
+def build_topometric_map(grid: VoxelGrid, floor: Floor, body_height: float) -> TopometricMap:
+    """Build the graph of rooms over the voxel grid (seeds 2.7).
 
     A room without a floor has no place in the graph: its cells lose their label.
 
@@ -277,51 +277,55 @@ def topometric_map(grid: VoxelGrid, floor: Floor, body_height: float) -> Topomet
         floor: of all storeys, cut into rooms.
         body_height: m, whatever is lower than this above the floor is no ceiling.
     """
-    old_number = rooms_with_floor(floor)
+    old_number = select_rooms_with_floor(floor)
     number = np.full(int(max(floor.label.max(initial=-1), floor.room.max(initial=-1))) + 2, -1, np.int32)
     number[old_number] = np.arange(len(old_number))
     room, label = number[floor.label], number[floor.room]
-    above = floor_to_ceiling(grid, floor.cells, body_height)
-    rooms = _measured_rooms(grid, room, floor, label, above, old_number)
+    above = measure_floor_to_ceiling(grid, floor.cells, body_height)
+    rooms = _measure_rooms(grid, room, floor, label, above, old_number)
     edges = find_edges(floor, label, rooms["storey"], above)
-    edges = edges[~_leads_through_wall(floor, edges)]
+    edges = edges[~_is_through_wall(floor, edges)]
     for edge in edges:
         a, b = old_number[edge["rooms"]].tolist()
         edge["confidence"] = floor.door_probability.get((min(a, b), max(a, b)), 1.0)
     area = np.where(number[floor.room_of_area][floor.area] >= 0, floor.area, -1) if len(floor.room_of_area) else floor.area
-    areas, area = _areas(floor, label, area)
+    areas, area = _build_areas(floor, label, area)
     narrows = find_edges(floor, area, rooms["storey"][areas["room"]], above, areas["room"])
     return TopometricMap(grid, room, floor.cells, label, rooms, edges, floor.storeys, areas, area, narrows)
 
 
-def rooms_with_floor(floor: Floor) -> Array:
-    """(R,) numbers of those rooms of a floor that are rooms of its map, in its order."""
-    lowest = floor.room[lowest_of_column(floor.cells)]
+def select_rooms_with_floor(floor: Floor) -> Array:
+    """Return (R,) numbers of those rooms of a floor that are rooms of its map, in its order."""
+    lowest = floor.room[select_lowest_of_column(floor.cells)]
     return np.unique(lowest[lowest >= 0])
 
 
-def _leads_through_wall(floor: Floor, edges: Array) -> Array:
+def _is_through_wall(floor: Floor, edges: Array) -> Array:
     """(E,) bool: is a door or an opening where there is probably a wall?"""
     level = np.isin(edges["kind"], ("door", "opening"))
-    through = [leads_through_wall(floor.classified_storeys, centre) for centre in edges["centre"]]
+    through = [is_through_wall(floor.classified_storeys, centre) for centre in edges["centre"]]
     return np.asarray(level & np.array(through, bool))
 
 
-def _areas(floor: Floor, label: Array, area: Array) -> tuple[Array, Array]:
+def _build_areas(floor: Floor, label: Array, area: Array) -> tuple[Array, Array]:
     """(A,) AREA_DTYPE and the areas renumbered."""
     numbers = np.unique(area[area >= 0])
     number = np.append(np.searchsorted(numbers, np.arange(int(area.max(initial=-1)) + 1)), -1)
     area = number[area].astype(np.int32)
     areas = np.zeros(len(numbers), AREA_DTYPE)
-    lowest = lowest_of_column(floor.cells)
+    lowest = select_lowest_of_column(floor.cells)
     for a in range(len(numbers)):
         rows = lowest[area[lowest] == a]
         rows = rows if len(rows) else np.flatnonzero(area == a)
-        areas[a] = (label[rows[0]], floor.cells.centroids(floor.cells.cells[rows]).mean(axis=0), len(rows) * floor.cells.edge**2)
+        areas[a] = (
+            label[rows[0]],
+            floor.cells.compute_centroids(floor.cells.cells[rows]).mean(axis=0),
+            len(rows) * floor.cells.edge**2,
+        )
     return areas, area
 
 
-def _measured_rooms(grid: VoxelGrid, room: Array, floor: Floor, label: Array, above: Array, numbers: Array) -> Array:
+def _measure_rooms(grid: VoxelGrid, room: Array, floor: Floor, label: Array, above: Array, numbers: Array) -> Array:
     """(R,) ROOM_DTYPE; `numbers` (R,) are those of the floor's rooms."""
     count = int(label.max(initial=-1)) + 1
     cells = floor.cells
@@ -329,8 +333,8 @@ def _measured_rooms(grid: VoxelGrid, room: Array, floor: Floor, label: Array, ab
     if floor.completeness is not None:
         rooms["completeness"] = floor.completeness[numbers]
     else:
-        rooms["completeness"] = completeness(grid, cells, label, count, floor.body_width)
-    lowest = lowest_of_column(cells)
+        rooms["completeness"] = measure_completeness(grid, cells, label, count, floor.body_width)
+    lowest = select_lowest_of_column(cells)
     order = lowest[np.argsort(label[lowest], kind="stable")]
     floor_of = np.split(order, np.searchsorted(label[order], np.arange(count + 1)))[1:-1]
     order = np.argsort(room, kind="stable")
@@ -338,9 +342,9 @@ def _measured_rooms(grid: VoxelGrid, room: Array, floor: Floor, label: Array, ab
     for r in range(count):
         rows, occupied = floor_of[r], grid.cells[cells_of[r]]
         rooms["storey"][r] = np.bincount(floor.storey[rows]).argmax()
-        rooms["centroid"][r] = cells.centroids(cells.cells[rows]).mean(axis=0)
-        rooms["area"][r] = _area(cells.cells[rows, :2], cells.edge, floor.body_width)
-        rooms["height"][r] = ceiling_height(above[rows])
+        rooms["centroid"][r] = cells.compute_centroids(cells.cells[rows]).mean(axis=0)
+        rooms["area"][r] = _measure_area(cells.cells[rows, :2], cells.edge, floor.body_width)
+        rooms["height"][r] = estimate_ceiling_height(above[rows])
         rooms["volume"][r] = rooms["area"][r] * rooms["height"][r]
         box = occupied if len(occupied) else cells.cells[rows]
         rooms["lo"][r] = grid.origin + box.min(axis=0) * grid.edge
@@ -349,7 +353,7 @@ def _measured_rooms(grid: VoxelGrid, room: Array, floor: Floor, label: Array, ab
     return rooms
 
 
-def _area(columns: Array, edge: float, body_width: float) -> float:
+def _measure_area(columns: Array, edge: float, body_width: float) -> float:
     """m2 of floor: the navigable columns, the strip along the walls in which the body does not fit, and half a cell more along
     the boundary, because a wall's face lies on average in the middle of its cell."""
     reach = int(np.ceil(body_width / edge - 1e-6)) // 2

@@ -9,9 +9,9 @@ from numbers import Real
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.extraction.cleaning import box_volume, largest_place, without_strays
-from topomerge.kernels import lookup, morton
-from topomerge.kernels import voxelise as kernel
+from topomerge.extraction.cleaning import compute_box_volume, select_largest_place, select_without_strays
+from topomerge.kernels import voxels
+from topomerge.kernels import voxels as kernel
 from topomerge.types import Array, PointCloud, VoxelGrid
 
 # Lattice cells of a cloud that comes in chunks: 40 bytes a cell, and at most two and a half times that while runs are united.
@@ -19,7 +19,9 @@ from topomerge.types import Array, PointCloud, VoxelGrid
 RUN_RATIO = 4  # a run is united with the one before it unless that is more than so many times as long
 FAR_RATIO = 2  # likewise for cells that no code numbers
 BLOCK = 1_000_000  # cells that are looked at together
-_Cells = tuple[Array, Array, Array]  # cells (n, 3) or their codes (n,), counts (n,), sums (n, 3): `kernels.voxelise.occupied`
+_Cells = tuple[
+    Array, Array, Array
+]  # cells (n, 3) or their codes (n,), counts (n,), sums (n, 3): `kernels.voxelise.find_occupied_cells`
 
 
 class LatticeCells:
@@ -44,44 +46,44 @@ class LatticeCells:
         """Take in the cells of a chunk."""
         if self.too_many:
             return
-        base, cells, counts, sums = kernel.occupied(chunk.points, np.asarray(chunk.shift, np.float64), self.edge)
+        base, cells, counts, sums = kernel.find_occupied_cells(chunk.points, np.asarray(chunk.shift, np.float64), self.edge)
         if not len(cells):
             return
         cells += base
         if self._origin is None:
-            self._origin = np.median(cells, axis=0).astype(np.int64) - morton.AXIS_LIMIT // 2
+            self._origin = np.median(cells, axis=0).astype(np.int64) - voxels.AXIS_LIMIT // 2
         numbers = cells - self._origin
-        near = bool(numbers.min() >= 0 and numbers.max() < morton.AXIS_LIMIT)
+        near = bool(numbers.min() >= 0 and numbers.max() < voxels.AXIS_LIMIT)
         if not near:
-            inside = ((numbers >= 0) & (numbers < morton.AXIS_LIMIT)).all(axis=1)
+            inside = ((numbers >= 0) & (numbers < voxels.AXIS_LIMIT)).all(axis=1)
             self._far.append((cells[~inside], counts[~inside], sums[~inside]))
             if sum(len(part[0]) for part in self._far[1:]) * FAR_RATIO > len(self._far[0][0]):
-                self._far = [_united_cells(self._far)]
+                self._far = [_unite_cells(self._far)]
             numbers, counts, sums = numbers[inside], counts[inside], sums[inside]
-        codes = morton.encode(numbers)
-        order = morton.unique_rows(codes)
+        codes = voxels.encode(numbers)
+        order = voxels.find_unique_rows(codes)
         self._runs.append((codes[order], counts[order], sums[order]))
         while len(self._runs) > 1 and len(self._runs[-2][0]) <= RUN_RATIO * len(self._runs[-1][0]):
-            self._runs[-2:] = [kernel.united(self._runs[-2], self._runs[-1])]
+            self._runs[-2:] = [kernel.unite_runs(self._runs[-2], self._runs[-1])]
         if self.most and len(self._runs[0][0]) > self.most:
             self.too_many, self._runs, self._far = True, [], []
 
-    def all(self) -> _Cells:
+    def get_cells(self) -> _Cells:
         """Cells (n, 3), counts (n,) and sums (n, 3) of the places of points within them, in `OFFSET_STEPS` parts."""
         if self._origin is None:
             return np.zeros((0, 3), np.int64), np.zeros(0, np.int64), np.zeros((0, 3), np.int64)
-        codes, counts, sums = self._one_run()
-        near = morton.decode(codes) + self._origin, counts, sums
+        codes, counts, sums = self._unite_runs()
+        near = voxels.decode(codes) + self._origin, counts, sums
         if not self._far:
             return near
-        cells, counts, sums = (np.concatenate(part) for part in zip(near, _united_cells(self._far), strict=True))
+        cells, counts, sums = (np.concatenate(part) for part in zip(near, _unite_cells(self._far), strict=True))
         return cells, counts, sums
 
-    def within(self, grid: VoxelGrid) -> VoxelGrid | None:
-        """The cells in the box of a grid of whole multiples of them; None where they were too many."""
+    def select_within(self, grid: VoxelGrid) -> VoxelGrid | None:
+        """Return the cells in the box of a grid of whole multiples of them; None where they were too many."""
         if self.too_many or self._origin is None:
             return None
-        codes, counts, sums = self._one_run()
+        codes, counts, sums = self._unite_runs()
         if self.most and len(codes) > self.most:
             return None
         base = np.rint(grid.origin / self.edge).astype(np.int64) - self._origin
@@ -89,7 +91,7 @@ class LatticeCells:
         cells, offsets = [np.zeros((0, 3), np.int32)], [np.zeros((0, 3), np.uint8)]
         for first in range(0, len(codes), BLOCK):
             block = slice(first, first + BLOCK)
-            numbers = morton.decode(codes[block]) - base
+            numbers = voxels.decode(codes[block]) - base
             inside = ((numbers >= 0) & (numbers < size)).all(axis=1)
             count = counts[block][inside, None]
             cells.append(numbers[inside].astype(np.int32))
@@ -97,13 +99,13 @@ class LatticeCells:
         shape = (int(size[0]), int(size[1]), int(size[2]))
         return VoxelGrid.from_cells(np.concatenate(cells), grid.origin, self.edge, shape, {"offset": np.concatenate(offsets)})
 
-    def _one_run(self) -> _Cells:
+    def _unite_runs(self) -> _Cells:
         while len(self._runs) > 1:
-            self._runs[-2:] = [kernel.united(self._runs[-2], self._runs[-1])]
+            self._runs[-2:] = [kernel.unite_runs(self._runs[-2], self._runs[-1])]
         return self._runs[0]
 
 
-def _united_cells(parts: list[_Cells]) -> _Cells:
+def _unite_cells(parts: list[_Cells]) -> _Cells:
     """Cells that may be in several parts, each once."""
     cells, counts, sums = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     cells, row = np.unique(cells, axis=0, return_inverse=True)
@@ -140,16 +142,16 @@ def voxelise(cloud: PointCloud | Array | Iterable[PointCloud], edge: float = 0.1
     lattice = LatticeCells(edge)
     for chunk in chunks:
         lattice.add(chunk)
-    cells, counts, sums = lattice.all()
+    cells, counts, sums = lattice.get_cells()
     if not len(cells):
         raise InputError("no finite point: nothing to voxelise")
-    for told_apart in (without_strays, largest_place):
+    for told_apart in (select_without_strays, select_largest_place):
         kept, warning = told_apart(cells, counts, edge)
         if warning:
             warn(warnings, warning)
             cells, counts, sums = cells[kept], counts[kept], sums[kept]
-    base, shape = _box(cells)
-    if (shape > morton.AXIS_LIMIT).any() or box_volume(cells) / 512 > lookup.MAX_BRICKS:
+    base, shape = _compute_box(cells)
+    if (shape > voxels.AXIS_LIMIT).any() or compute_box_volume(cells) / 512 > voxels.MAX_BRICKS:
         extent = " x ".join(f"{s * edge:.0f}" for s in shape)
         raise InputError(f"the points span {extent} m: too large for {edge:g} m voxels; check --unit, or crop the file")
     size = (int(shape[0]), int(shape[1]), int(shape[2]))
@@ -157,7 +159,7 @@ def voxelise(cloud: PointCloud | Array | Iterable[PointCloud], edge: float = 0.1
     return VoxelGrid.from_cells(cells - base, base * edge, edge, size, {"count": counts, "offset": offset.astype(np.uint8)})
 
 
-def _box(cells: Array) -> tuple[Array, Array]:
+def _compute_box(cells: Array) -> tuple[Array, Array]:
     low = cells.min(axis=0)
     return low, cells.max(axis=0) - low + 1
 

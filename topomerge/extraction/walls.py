@@ -13,15 +13,21 @@ from itertools import pairwise
 import numpy as np
 from scipy import ndimage
 
-from topomerge.extraction.elevations.doorways import DOORWAY_DTYPE, StoreyWalls, door_places, doorways, place_classes
+from topomerge.extraction.elevations.doorways import (
+    DOORWAY_DTYPE,
+    StoreyWalls,
+    classify_places,
+    compute_door_probabilities,
+    detect_doorways,
+)
 from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, PLACES, Elevations, build_face_rows, unroll
 from topomerge.extraction.plans.storey_floor import WALL_REACH, find_cells_of_storey
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.segment import RasterisedStoreys, SegmentedStorey, find_segments, split_segments
 from topomerge.extraction.topology import DOOR_MOST_WIDTH
-from topomerge.kernels.voxelise import OFFSET_STEPS
-from topomerge.structure.face_points import FACE_HEIGHTS, FULL_COLUMN, LEAST_CELLS
-from topomerge.structure.lines import main_direction, straight_lines
+from topomerge.kernels.voxels import OFFSET_STEPS
+from topomerge.structure.floors import FACE_HEIGHTS, FULL_COLUMN, LEAST_CELLS
+from topomerge.structure.lines import detect_lines, estimate_main_direction
 from topomerge.types import Array, VoxelGrid
 
 Locate = Callable[[Array], Array]  # (n, 3) m places on floors -> (n,) int64 segment or room there, -1 none
@@ -47,8 +53,8 @@ def unroll_walls(
         rows += _faces_of(scan.grid, rasters, storey, first)
         first += storey.count
     elevations = unroll(np.array(rows, FACE_DTYPE), navigable, scan.fine, scan.crossed)
-    classes = place_classes(elevations)
-    doors = door_places(elevations, classes)
+    classes = classify_places(elevations)
+    doors = compute_door_probabilities(elevations, classes)
     return StoreyWalls(
         elevations, classes, doors, find_doorways(elevations, doors, lambda places: find_segments(storeys, places))
     )
@@ -58,12 +64,12 @@ def find_doorways(elevations: Elevations, doors: Array, locate: Locate) -> Array
     """Find the doorways (D,) DOORWAY_DTYPE on walls, with what lies on their two sides; the second -1 where that is nothing else.
 
     Args:
-        doors: (n / 2, 3) of `door_places`.
+        doors: (n / 2, 3) of `compute_door_probabilities`.
     """
-    found = doorways(elevations, doors, _sides_before(elevations, locate))
+    found = detect_doorways(elevations, doors, _sides_before(elevations, locate))
     found = found[found["rooms"][:, 0] >= 0].copy()
     for k in np.flatnonzero(found["rooms"][:, 1] < 0).tolist():
-        behind = locate(_places_behind(found[k]))
+        behind = locate(_sample_places_behind(found[k]))
         other = behind[(behind >= 0) & (behind != found["rooms"][k, 0])]
         if len(other):
             found["rooms"][k, 1] = np.bincount(other).argmax()
@@ -78,7 +84,7 @@ def find_doorways_within(walls: StoreyWalls, storeys: Sequence[SegmentedStorey])
     within: list[list[Array]] = [[] for _ in storeys]
     ends = np.cumsum([storey.count for storey in storeys])
     for way in ways[sure]:
-        behind = find_segments(storeys, _places_behind(way))
+        behind = find_segments(storeys, _sample_places_behind(way))
         if np.mean(behind == way["rooms"][0]) >= SAME_SIDE:
             within[int(np.searchsorted(ends, way["rooms"][0], side="right"))].append(way)
     return [np.array(some, DOORWAY_DTYPE) for some in within]
@@ -137,10 +143,10 @@ def _faces_of(grid: VoxelGrid, rasters: RasterisedStoreys, storey: SegmentedStor
     owner, middle = of[start][full], middle[full]
     weight = np.minimum(cells[full] / (FULL_COLUMN * scale), 1.0) * grid.edge
     columns = [(middle[owner == s], weight[owner == s]) for s in range(count)]
-    main = main_direction([line for points in columns for line in straight_lines(*points)])
+    main = estimate_main_direction([line for points in columns for line in detect_lines(*points)])
     faces: list[tuple[object, ...]] = []
     for s, points in enumerate(columns):
-        faces += build_face_rows(first + s, straight_lines(*points, main), floors[ends[s] : ends[s + 1]], float(level[s]))
+        faces += build_face_rows(first + s, detect_lines(*points, main), floors[ends[s] : ends[s + 1]], float(level[s]))
     return faces
 
 
@@ -153,7 +159,7 @@ def _sides_before(elevations: Elevations, locate: Locate) -> Array:
     return np.stack([locate(np.column_stack([at - off * face["out"], face["floor"]])) for off in SPOTS_BEFORE], axis=1)
 
 
-def _places_behind(way: Array) -> Array:
+def _sample_places_behind(way: Array) -> Array:
     """(k, 3) m, behind a doorway as its first side sees it."""
     steps = np.arange(BEYOND[0], BEYOND[1] + 0.05, 0.1)
     aside = np.array([-way["out"][1], way["out"][0]]) * float(way["width"]) / 4

@@ -17,26 +17,26 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.errors import InputError
-from topomerge.extraction.attributes import rooms_at
-from topomerge.extraction.cleaning import with_means
-from topomerge.extraction.convolution import convolve, moore
+from topomerge.extraction.attributes import find_rooms_at
+from topomerge.extraction.cleaning import add_means
+from topomerge.extraction.convolution import build_moore, convolve
 from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.plans.part_rooms import PartRooms
 from topomerge.extraction.scan import COARSEST_CELL, FINEST_CELL
-from topomerge.fusion.resampling import copies, decoded, encoded, laid_means, resampled
+from topomerge.fusion.resampling import decode_cells, encode_cells, find_wall_copies, resample_cells, transform_means
 from topomerge.fusion.transfer import (
-    laid_floor,
-    laid_part,
-    laid_windows,
-    with_doors,
-    with_joined_windows,
-    with_part_odds,
+    add_joined_windows,
+    add_part_doors,
+    add_part_odds,
+    transform_floor,
+    transform_part,
+    transform_windows,
 )
-from topomerge.kernels.voxelise import OFFSET_STEPS
-from topomerge.matching.consistency import matches_under
-from topomerge.matching.room_plans import room_plans
-from topomerge.registration.storeys import extruded
+from topomerge.kernels.voxels import OFFSET_STEPS
+from topomerge.matching.consistency import find_matches
+from topomerge.matching.room_plans import build_room_plans
+from topomerge.registration.storeys import is_extruded
 from topomerge.types import JOINED, LEVELLED, Array, Deformation, Placement, Sim3, TopometricMap, VoxelGrid, is_level
 
 ALIKE_EDGES = 0.8  # ratio of edge lengths: cells of another map that are not smaller than that keep those of the first
@@ -51,7 +51,7 @@ class MapSequence(Protocol):
 
 
 def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[int, Deformation] | None = None) -> TopometricMap:
-    """The joined map in the frame of the first one, at its edge length unless another one's cells are clearly finer.
+    """Fuse maps in the frame of the first, at its edge length unless another one's cells are clearly finer.
 
     Each cell carries the bit set of the maps that saw it: bit k for the kth pose; maps that are joined already keep their bits,
     those of the next map follow. What one map saw empty and another one occupied is occupied: what moves (doors, chairs, people)
@@ -65,25 +65,25 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
     Raises:
         InputError: more maps than provenance can tell apart.
     """
-    parts = [_Part.of(maps[k], pose) for k, pose in poses]
+    parts = [_Part.from_map(maps[k], pose) for k, pose in poses]
     first_bits = np.cumsum([0, *(part.bits for part in parts)])
     if first_bits[-1] > PROVENANCE_BITS:
         raise InputError(
             f"{len(poses)} maps are joined of {first_bits[-1]}; at most {PROVENANCE_BITS} can be told apart in one; merge fewer"
         )
-    cells = _JoinedCells(maps[poses[0][0]].grid.origin, _edge(parts))
+    cells = _JoinedCells(maps[poses[0][0]].grid.origin, _choose_edge(parts))
     order = sorted(range(len(poses)), key=lambda n: parts[n].assumed)  # what was assumed comes last
     placements = [Placement.of(pose, (bends or {}).get(k), maps[k].grid.edge) for k, pose in poses]
     windows, laid = [], []
     for n in order:
         map = maps[poses[n][0]]
         cells.add_map(map, placements[n], int(first_bits[n]), parts[n].assumed and n != order[0])
-        windows.append(laid_windows(map, placements[n]))
-        laid.append(laid_part(map, placements[n]))
+        windows.append(transform_windows(map, placements[n]))
+        laid.append(transform_part(map, placements[n]))
     name = JOINED.join(maps[k].source or "map" for k, _ in poses)
     rooms = [part.rooms for part in laid]
-    joined = _extracted(cells, min(part.neighbours for part in parts), name, rooms)
-    joined = with_joined_windows(with_doors(with_part_odds(joined, rooms), laid), windows)
+    joined = _extract_joined(cells, min(part.neighbours for part in parts), name, rooms)
+    joined = add_joined_windows(add_part_doors(add_part_odds(joined, rooms), laid), windows)
     first = maps[poses[0][0]].levelling
     if not is_level(first):  # the frame of the joined map is that of the first one
         joined = replace(joined, parameters={**joined.parameters, LEVELLED: first.tolist()})
@@ -101,12 +101,12 @@ class _Part:
     assumed: bool
 
     @classmethod
-    def of(cls, map: TopometricMap, pose: Sim3) -> _Part:
+    def from_map(cls, map: TopometricMap, pose: Sim3) -> _Part:
         bits = 1 if map.provenance is None else max(int(np.bitwise_or.reduce(map.provenance, initial=0)).bit_length(), 1)
-        return cls(_usual_neighbours(map.grid), bits, pose.scale * map.grid.edge, extruded(map.grid))
+        return cls(_estimate_neighbours(map.grid), bits, pose.scale * map.grid.edge, is_extruded(map.grid))
 
 
-def _edge(parts: Sequence[_Part]) -> float:
+def _choose_edge(parts: Sequence[_Part]) -> float:
     """m, of the joined cells: of the first map, unless another one's are clearly finer."""
     edge = parts[0].edge
     for part in parts:
@@ -134,24 +134,24 @@ class _JoinedCells:
     def add_map(self, map: TopometricMap, placement: Placement, first_bit: int, assumed: bool) -> None:
         """Add a map; of one whose heights were assumed only what no other saw."""
         provenance = np.ones(len(map.grid), np.uint32) if map.provenance is None else map.provenance.astype(np.uint32)
-        cells, rows = resampled(map.grid, placement, self.origin, self.edge)
+        cells, rows = resample_cells(map.grid, placement, self.origin, self.edge)
         provenance = provenance[rows] << np.uint32(first_bit)
-        means, points = laid_means(map.grid, placement, rows, cells, self.origin, self.edge)
+        means, points = transform_means(map.grid, placement, rows, cells, self.origin, self.edge)
         if assumed and len(cells):
-            added = self._contains(cells) | ~(self._surveyed(cells) | self._seen_through(cells))
+            added = self._is_occupied(cells) | ~(self._is_surveyed(cells) | self._is_seen_through(cells))
             cells, provenance, means, points = cells[added], provenance[added], means[added], points[added]
-        free_cells = None if map.free is None else resampled(map.free, placement, self.origin, 2 * self.edge)[0]
+        free_cells = None if map.free is None else resample_cells(map.free, placement, self.origin, 2 * self.edge)[0]
         if free_cells is not None and len(self.free_codes) and len(cells):
-            occupied = decoded(self.codes)
-            copy_of = copies((occupied, decoded(self.free_codes)), (cells, free_cells), self.edge)
+            occupied = decode_cells(self.codes)
+            copy_of = find_wall_copies((occupied, decode_cells(self.free_codes)), (cells, free_cells), self.edge)
             cells = np.where(copy_of[:, None] >= 0, occupied[copy_of], cells)
             points = np.where(copy_of >= 0, 0.0, points)  # they lie beside the wall
         self._add(cells, provenance, means, points)
         if free_cells is not None:
-            self.free_codes = np.union1d(self.free_codes, encoded(free_cells))
+            self.free_codes = np.union1d(self.free_codes, encode_cells(free_cells))
 
     def _add(self, cells: Array, provenance: Array, means: Array, points: Array) -> None:
-        self.codes, row = np.unique(np.concatenate([self.codes, encoded(cells)]), return_inverse=True)
+        self.codes, row = np.unique(np.concatenate([self.codes, encode_cells(cells)]), return_inverse=True)
         joined = np.zeros(len(self.codes), np.uint32)
         np.bitwise_or.at(joined, row, np.concatenate([self.provenance, provenance]))
         self.provenance = joined
@@ -160,23 +160,23 @@ class _JoinedCells:
         total = np.column_stack([np.bincount(row, points * means[:, k], len(joined)) for k in range(3)])
         self.means = np.where(self.points[:, None] > 0, total / np.maximum(self.points, 1e-9)[:, None], 0.5)
 
-    def means_in_metres(self) -> Array:
+    def convert_means(self) -> Array:
         """(n, 3) where the points of each cell lie on average, never on its border: rounding may take that for the next cell."""
         steps = np.minimum(self.means * OFFSET_STEPS, OFFSET_STEPS - 1).astype(np.int64)
-        middles: Array = self.origin + (decoded(self.codes) + (steps + 0.5) / OFFSET_STEPS) * self.edge
+        middles: Array = self.origin + (decode_cells(self.codes) + (steps + 0.5) / OFFSET_STEPS) * self.edge
         return middles
 
-    def _contains(self, cells: Array) -> Array:
+    def _is_occupied(self, cells: Array) -> Array:
         """(n,) bool: is a cell there already?"""
-        return np.isin(encoded(cells), self.codes)
+        return np.isin(encode_cells(cells), self.codes)
 
-    def _seen_through(self, cells: Array) -> Array:
+    def _is_seen_through(self, cells: Array) -> Array:
         """(n,) bool: do cells lie where rays went?"""
-        return np.isin(encoded(cells // 2), self.free_codes)
+        return np.isin(encode_cells(cells // 2), self.free_codes)
 
-    def _surveyed(self, cells: Array) -> Array:
+    def _is_surveyed(self, cells: Array) -> Array:
         """(n,) bool: have the columns of cells, at the heights between the lowest and the highest of them, anything near?"""
-        occupied = decoded(self.codes)
+        occupied = decode_cells(self.codes)
         low, high = cells[:, 2].min(), cells[:, 2].max()
         occupied = occupied[(occupied[:, 2] >= low - 3) & (occupied[:, 2] <= high + 3)]
         if not len(occupied):
@@ -190,7 +190,7 @@ class _JoinedCells:
         return surveyed
 
 
-def _extracted(joined: _JoinedCells, neighbours: float, name: str, rooms: Sequence[PartRooms]) -> TopometricMap:
+def _extract_joined(joined: _JoinedCells, neighbours: float, name: str, rooms: Sequence[PartRooms]) -> TopometricMap:
     """Rooms and doors of what was joined.
 
     Args:
@@ -198,40 +198,40 @@ def _extracted(joined: _JoinedCells, neighbours: float, name: str, rooms: Sequen
             floors that only the sparsest one saw must not count as noise beside them.
         rooms: of the maps, as they lie in the joined one.
     """
-    cells = decoded(joined.codes)
+    cells = decode_cells(joined.codes)
     base = 2 * (cells.min(axis=0) // 2)  # even: free cells are twice as long
     grid = VoxelGrid.from_cells(cells - base, joined.origin + base * joined.edge, joined.edge)
     provenance = np.zeros(len(grid), np.uint32)
-    provenance[grid.rows(cells - base)] = joined.provenance
+    provenance[grid.find_rows(cells - base)] = joined.provenance
     free = None
     if len(joined.free_codes):
-        free_cells = decoded(joined.free_codes) - base // 2
+        free_cells = decode_cells(joined.free_codes) - base // 2
         free_cells = free_cells[((free_cells >= 0) & (free_cells < -(-np.array(grid.shape) // 2))).all(axis=1)]
         x, y, z = (-(-s // 2) for s in grid.shape)
         free = VoxelGrid.from_cells(free_cells, grid.origin, 2 * grid.edge, (x, y, z))
-        free = free.subset(~grid.coarser(2).contains(free.cells))
-    noise = PRESETS["default"].noise * min(neighbours / max(_usual_neighbours(grid), 1.0), 1.0)
+        free = free.select_cells(~grid.coarsen(2).contains(free.cells))
+    noise = PRESETS["default"].noise * min(neighbours / max(_estimate_neighbours(grid), 1.0), 1.0)
     map = extract(grid, name=name, carve=free is None, noise=noise, parts=rooms)
     # Floors that the extraction assumes under slices are cells that no map saw.
-    rows = grid.rows(grid.locate(map.grid.centroids()))
+    rows = grid.find_rows(grid.locate(map.grid.compute_centroids()))
     seen_by = np.where(rows >= 0, provenance[rows], 0).astype(np.uint32)
     # Not before: doors that are read off the means of two maps are worse than those of the plan and of the maps (docs/adr/0014).
-    middles = map.grid if not joined.points.any() else with_means(map.grid, joined.means_in_metres(), joined.points)
+    middles = map.grid if not joined.points.any() else add_means(map.grid, joined.convert_means(), joined.points)
     return replace(map, grid=middles, provenance=seen_by, free=map.free if free is None else free)
 
 
-def _usual_neighbours(grid: VoxelGrid) -> float:
+def _estimate_neighbours(grid: VoxelGrid) -> float:
     """Median number of occupied neighbours of a cell."""
-    return float(np.median(convolve(grid, moore()))) if len(grid) else 0.0
+    return float(np.median(convolve(grid, build_moore()))) if len(grid) else 0.0
 
 
-def rooms_in_common(
+def match_common_rooms(
     a: TopometricMap,
     b: TopometricMap,
     transform: Sim3,
     bends: tuple[Deformation | None, Deformation | None] = (None, None),
 ) -> tuple[Array, Array]:
-    """(M, 2) rooms of a and of b that are one room under T_ab, and (M,) 0..1 how much of their floor they share.
+    """Return (M, 2) rooms of a and of b that are one room under T_ab, and (M,) 0..1 how much of their floor they share.
 
     A room that is cut in two in the other map is in two rows.
 
@@ -242,21 +242,23 @@ def rooms_in_common(
         return np.zeros((0, 2), np.int64), np.zeros(0)
     to, moved = Placement.of(Sim3(), bends[0]), Placement.of(transform, bends[1])
     bent = to.bend is not None or moved.bend is not None
-    return matches_under(
-        transform, (room_plans(a), room_plans(b)), (lambda p: to.invert_points(moved.transform_points(p))) if bent else None
+    return find_matches(
+        transform,
+        (build_room_plans(a), build_room_plans(b)),
+        (lambda p: to.invert_points(moved.transform_points(p))) if bent else None,
     )
 
 
-def room_of_rooms(part: TopometricMap, joined: TopometricMap, pose: Sim3, bend: Deformation | None = None) -> Array:
-    """(R,) room of the joined map in which most of the floor of each room of a part lies, -1 none.
+def find_joined_rooms(part: TopometricMap, joined: TopometricMap, pose: Sim3, bend: Deformation | None = None) -> Array:
+    """Return (R,) room of the joined map in which most of the floor of each room of a part lies, -1 none.
 
     Args:
         pose: of the part in the joined map.
         bend: of the part, in its own frame, before it is posed; None: rigid.
     """
     rooms = np.full(len(part.rooms), -1, np.int64)
-    floor, part_room = laid_floor(part, Placement.of(pose, bend))
-    joined_room = rooms_at(joined, floor)
+    floor, part_room = transform_floor(part, Placement.of(pose, bend))
+    joined_room = find_rooms_at(joined, floor)
     for i in range(len(part.rooms)):
         votes = joined_room[part_room == i]
         votes = votes[votes >= 0]

@@ -10,8 +10,8 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.maps import load_map
-from topomerge.registration.posterior import threshold_of
-from topomerge.registration.verify import model
+from topomerge.registration.posterior import find_threshold
+from topomerge.registration.verify import load_model
 from topomerge.types import TopometricMap
 
 MERGE_SCALES = ("fixed", "free")
@@ -32,8 +32,8 @@ def check_list(maps: object, taker: str) -> None:
         raise InputError(f"{taker} takes two maps or more, {len(maps)} given; give another one")
 
 
-def loaded(map: object) -> TopometricMap:
-    """A map, read where it is a `.tmap` file.
+def load_input(map: object) -> TopometricMap:
+    """Return a map, read where it is a `.tmap` file.
 
     Raises:
         InputError: the file can't be read, or it is no map, as a cloud or the file of one.
@@ -52,19 +52,19 @@ def check_scale(scale: str) -> None:
         raise InputError(f"scale must be {' or '.join(MERGE_SCALES)}, not {scale!r}")
 
 
-def checked_threshold(threshold: float | None) -> float:
-    """The probability from which a merge is believed; that of the calibration if None.
+def resolve_threshold(threshold: float | None) -> float:
+    """Return the probability from which a merge is believed; that of the calibration if None.
 
     Raises:
         InputError: not between 0 and 1.
     """
-    share = float(model()["threshold"]) if threshold is None else float(threshold)
+    share = float(load_model()["threshold"]) if threshold is None else float(threshold)
     if not 0 <= share <= 1:
         raise InputError(f"threshold must be a probability between 0 and 1, not {threshold}")
     return share
 
 
-def link_threshold(threshold: float | None, maps: int = 2) -> float:
+def resolve_link_threshold(threshold: float | None, maps: int = 2) -> float:
     """The probability from which a link of an atlas is believed: at least `LINK_BELIEVED` where none is asked for, as a wrong
     link drags all that hangs on it.
 
@@ -75,17 +75,17 @@ def link_threshold(threshold: float | None, maps: int = 2) -> float:
         InputError: not between 0 and 1.
     """
     believed = LINK_BELIEVED[maps > FEW_MAPS]
-    return max(checked_threshold(None), believed) if threshold is None else checked_threshold(threshold)
+    return max(resolve_threshold(None), believed) if threshold is None else resolve_threshold(threshold)
 
 
-def risk_threshold(risk: float) -> float:
+def find_risk_threshold(risk: float) -> float:
     """The probability from which a merge is believed so that at most `risk` of a thousand pairs, drawn by the stated priors
     (docs/method.md), are merged falsely, as left-out training pairs show it.
 
     Raises:
         InputError: a risk that no threshold can promise.
     """
-    return threshold_of(float(risk), model()["risk"])
+    return find_threshold(float(risk), load_model()["risk"])
 
 
 def check_poses(poses: str, count: int, scale: str) -> None:
@@ -116,7 +116,7 @@ class Extent:
     edge: float
 
     @classmethod
-    def of(cls, map: TopometricMap) -> Extent:
+    def from_map(cls, map: TopometricMap) -> Extent:
         """That of a map."""
         cells, edge = map.grid.cells, map.grid.edge
         return cls(map.source, len(cells), float(np.hypot(*np.ptp(cells[:, :2], axis=0))) * edge if len(cells) else 0.0, edge)
@@ -138,7 +138,7 @@ def check_different(a: TopometricMap, b: TopometricMap) -> None:
 
 def check_units(one: TopometricMap | Extent, other: TopometricMap | Extent) -> None:
     """Raise InputError where a map is far larger than any neighbour of the other: it is in centimetres or millimetres."""
-    a, b = (m if isinstance(m, Extent) else Extent.of(m) for m in (one, other))
+    a, b = (m if isinstance(m, Extent) else Extent.from_map(m) for m in (one, other))
     spans = [a.span, b.span]
     large, small = (a, b) if a.span >= b.span else (b, a)
     ratio = max(spans) / max(min(spans), small.edge)
@@ -161,26 +161,26 @@ def check_pair(a: TopometricMap, b: TopometricMap, scale: str) -> None:
         check_units(a, b)
 
 
-def pair_warnings(a: TopometricMap, b: TopometricMap, scale: str) -> Iterator[str]:
-    """What may be wrong with two maps."""
+def iter_pair_warnings(a: TopometricMap, b: TopometricMap, scale: str) -> Iterator[str]:
+    """Yield warnings about two maps that are to be merged."""
     for map, name in ((a, "the first map"), (b, "the second map")):
         if len(map.rooms) == 0:
-            yield without_rooms(map.source or name)
+            yield format_no_rooms_warning(map.source or name)
         elif len(map.rooms) == 1:
             yield f"{map.source or name}: has one room: little can be compared"
-    heights = [_storey_height(m) for m in (a, b)]
+    heights = [_estimate_storey_height(m) for m in (a, b)]
     if scale == "fixed" and min(heights) > 0 and max(heights) > TALL_RATIO * min(heights):
         tall, low = (a, b) if heights[0] >= heights[1] else (b, a)
         names = tall.source or "one map", low.source or "the other"
         yield f"{names[0]}: storeys are {max(heights):.1f} m high, in {names[1]} {min(heights):.1f} m: the units may differ"
 
 
-def without_rooms(name: str) -> str:
-    """The warning about a map without rooms."""
+def format_no_rooms_warning(name: str) -> str:
+    """Return the warning about a map without rooms."""
     return f"{name}: has no rooms: only walls and empty space can be compared"
 
 
-def _storey_height(map: TopometricMap) -> float:
+def _estimate_storey_height(map: TopometricMap) -> float:
     """m, median floor to ceiling; 0 where none was seen."""
     heights = map.storeys["ceiling"] - map.storeys["floor"]
     heights = heights[np.isfinite(heights)]

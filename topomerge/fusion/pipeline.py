@@ -1,5 +1,6 @@
 """Maps -> one map, or an honest refusal: poses of walls and of matched rooms judged on the whole maps, cells fused (seeds 3.3;
-method 4)."""
+method 4).
+"""
 
 from __future__ import annotations
 
@@ -13,29 +14,159 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.blas import one_blas_thread
-from topomerge.embedding.embedders import DEFAULT, descriptor_name
-from topomerge.embedding.embedders import embedder as make_embedder
-from topomerge.embedding.room_cells import Descriptor
-from topomerge.embedding.turns import Rows
+from topomerge.blas import limit_blas_threads
+from topomerge.embedding.learned import DEFAULT, get_descriptor_name
+from topomerge.embedding.learned import build_embedder as make_embedder
+from topomerge.embedding.quarter_turns import Descriptor, Rows
 from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.fusion.atlas.solve import AtlasSettings, RegistrationsByPair, solve
-from topomerge.fusion.explanation import why
-from topomerge.fusion.fuse import fuse, rooms_in_common
-from topomerge.fusion.inputs import check_list, check_pair, check_poses, check_scale, checked_threshold, loaded, pair_warnings
+from topomerge.fusion.fuse import fuse, match_common_rooms
+from topomerge.fusion.inputs import (
+    check_list,
+    check_pair,
+    check_poses,
+    check_scale,
+    iter_pair_warnings,
+    load_input,
+    resolve_threshold,
+)
 from topomerge.fusion.result import MERGE_STEPS, MergeResult, RoomMatch
-from topomerge.matching.match import match
-from topomerge.matching.odds import match_probability
-from topomerge.matching.result import Matching
+from topomerge.matching.consistency import compute_match_probability
+from topomerge.matching.match import Matching, match
+from topomerge.matching.poses import PoseHypothesis
 from topomerge.registration.bend.bend import NEITHER_BENDS
 from topomerge.registration.pipeline import FallbackProposals, Registration, register
-from topomerge.registration.posterior import check_same
-from topomerge.registration.prepared import registration_order
-from topomerge.registration.surfaces import check_open3d, room_poses
+from topomerge.registration.posterior import POSTERIOR, WORDS, check_same, compute_evidence_limit, describe_posterior
+from topomerge.registration.prepared import compute_registration_order
+from topomerge.registration.surfaces import check_open3d, estimate_room_poses
 from topomerge.types import Deformation, Sim3, TopometricMap
 
+Row = tuple[str, str, str]  # evidence, value, meaning
 
-@one_blas_thread
+
+def explain_verdict(registration: Registration, threshold: float, force: bool = False) -> str:
+    """One sentence: the verdict, what speaks for it and what against."""
+    if registration.transform is None:
+        return f"not merged: {registration.reason}"
+    believed = registration.probability >= threshold
+    f = registration.features
+    sign = "reaches" if believed else "is below"
+    words = [
+        f"{'merged' if believed else 'not merged'}: probability {format_probability(registration.probability)} {sign} "
+        f"{threshold:.2f}"
+    ]
+    words.append(f"{f['walls']:.0f} m2 of walls agree, {f['free']:.0f} m2 of free floor seen by both")
+    words.append(f"{100 * f['conflict_share']:.1f} % of the walls stand on free floor of the other map")
+    if not believed:
+        if compute_evidence_limit(f) < 1:
+            words.append("the maps share too little area for a verdict")
+        elif registration.posterior and (beside := describe_posterior(registration.posterior, threshold)):
+            words.append(beside)
+    if force and not believed:
+        words.append("joined anyway (--force)")
+    return "; ".join(words)
+
+
+def format_probability(probability: float) -> str:
+    """Return a probability as text that never says that something is certain."""
+    return "over 0.99" if probability > 0.99 else "below 0.01" if probability < 0.01 else f"{probability:.2f}"
+
+
+def list_evidence(registration: Registration) -> list[Row]:
+    """List the evidence for the best hypothesis: (evidence, value, meaning)."""
+    if registration.transform is None:
+        return []
+    f = registration.features
+    conflicts = (
+        f"{_format_percent(f['conflict_share'])} of the walls compared, {_format_percent(f['worst_conflict'])} in the worse map"
+    )
+    furniture = (
+        f"{_format_percent(f['met'])} of it matches furniture of the other map; expected by chance: "
+        f"{_format_percent(f['chance'])}"
+    )
+    rows = [
+        (
+            "matching walls",
+            f"{f['walls']:.1f} m²",
+            f"{_format_percent(f['ratio'])} of the walls both could have seen; evidence for",
+        ),
+        ("shared free floor", f"{f['free']:.0f} m²", "seen empty by both maps; evidence for"),
+        ("walls on free floor", f"{f['conflict']:.1f} m²", f"{conflicts}; evidence against"),
+        (
+            "walls back to back",
+            _format_percent(f["opposed"]),
+            "of the matching walls face opposite ways, as between neighbouring rooms",
+        ),
+        ("furniture", f"{f['clutter']:.1f} m²", furniture),
+        ("floors", f"{f['level']:.2f} m", "largest step between floors or ceilings that should coincide"),
+    ]
+    if f.get("ceiling_area", 0) > 0:
+        words = f"difference over {f['ceiling_area']:.0f} m²; storeys with the same plan often differ here"
+        rows.append(("ceilings", f"{f['ceilings']:.2f} m", words))
+    rows += _list_winner_evidence(f)
+    if np.isfinite(f.get("rmse", np.nan)):
+        rows.append(("surfaces", f"{100 * f['rmse']:.1f} cm", "RMS distance of matching surfaces"))
+    if registration.places is not None and len(registration.places):
+        odds = registration.places.log_odds
+        words = f"{(odds > 0).sum()} look like the same place, {(odds <= 0).sum()} more like another one; coloured on the plan"
+        rows.append(("places compared", f"{len(odds)}", words))
+    if len(registration.alternatives) > 1:
+        times = np.exp(min(f["margin"], 15.0))
+        words = f"{times:,.0f} times as probable" if times >= 1.5 else "about as probable"
+        rows.append(("lead over the next pose", words, "the best hypothesis against the next one, each judged alone"))
+    return rows
+
+
+def list_posterior(registration: Registration) -> list[tuple[str, str]]:
+    """List the alternatives in words with their probabilities; most probable first."""
+    each = registration.posterior
+    names = sorted((n for n in POSTERIOR if each.get(n, 0.0) > 0), key=lambda n: -each[n])
+    return [(WORDS[n], format_probability(each[n])) for n in names]
+
+
+def _list_winner_evidence(f: Mapping[str, float]) -> list[Row]:
+    """What only the best hypothesis was asked (`compute_winner_features`); joined maps of older versions do not have it."""
+    if "moved_walls" not in f:
+        return []
+    rows = [
+        (
+            "walls in one direction",
+            _format_percent(f["worst_ratio"]),
+            "of the walls match along the worse of the two main directions",
+        ),
+        (
+            "squares of 3 m",
+            f"{f['squares']:.0f}",
+            f"with matching walls; {_format_percent(f['bad_squares'])} of all match poorly",
+        ),
+        ("local misfit", _format_percent(f["moved_walls"]), "more walls match if squares of 6 m are moved separately"),
+    ]
+    if f["tall_conflict"] > 0:
+        rows.append(("high walls on free floor", f"{f['tall_conflict']:.1f} m²", "higher than furniture; evidence against"))
+    if f["hanging"] >= 1:
+        words = f"of {f['hanging']:.0f} pieces of lamps, beams and ducts match; storeys do not share theirs"
+        rows.append(("under the ceiling", f"{f['hanging_met']:.0f}", words))
+    return rows
+
+
+def format_hypothesis(
+    rank: int, other: PoseHypothesis, best: PoseHypothesis, middle: Mapping[str, float] | np.ndarray
+) -> list[str]:
+    """Return a hypothesis as text: rank, turn, distance from the best one, odds against it, walls, conflict."""
+    at = np.asarray(middle, float)[None]
+    away = float(np.linalg.norm(other.transform.apply(at) - best.transform.apply(at)))
+    turn = (np.degrees(other.transform.yaw) + 180) % 360 - 180
+    odds = np.exp(np.clip(other.score - best.score, -15, 15))
+    f = other.features
+    share = f"{100 * f['conflict_share']:.1f} %"
+    return [str(rank), f"{turn:.1f}", f"{away:.1f}", f"{odds:.2g}", f"{f['walls']:.1f}", f"{f['free']:.0f}", share]
+
+
+def _format_percent(share: float) -> str:
+    return f"{100 * share:.0f} %"
+
+
+@limit_blas_threads
 def merge(
     maps: Sequence[TopometricMap | str | Path],
     *,
@@ -54,7 +185,8 @@ def merge(
             one.
         scale: "fixed", or "free" where the scale of the second map is unknown.
         force: give the best transform and its joined map, too, where it is not believed; the status stays "abstained".
-        threshold: probability from which a merge is believed; that of the calibration if None; `fusion.inputs.risk_threshold`
+        threshold: probability from which a merge is believed; that of the calibration if None;
+        `fusion.inputs.find_risk_threshold`
             gives that of a stated risk.
         embedder: "learned" (default), "engineered", "shapedna", "feather", the folder of a trained one, or a callable
             map -> (R, D), for the matching of rooms.
@@ -76,10 +208,10 @@ def merge(
     check_scale(scale)
     check_same(same)
     config = MergeConfig(scale, threshold, embedder, rigid, same, force, poses)
-    loaded_maps = [loaded(map) for map in maps]
+    loaded_maps = [load_input(map) for map in maps]
     began = time.perf_counter()
     placed = (_place_pair if len(loaded_maps) == 2 else _place_set)(loaded_maps, config)
-    result = replace(_join(placed), descriptor=descriptor_name(embedder))
+    result = replace(_join(placed), descriptor=get_descriptor_name(embedder))
     return replace(result, seconds=_split_seconds(placed.seconds, time.perf_counter() - began))
 
 
@@ -95,11 +227,11 @@ def _place_pair(maps: Sequence[TopometricMap], config: MergeConfig) -> MergeResu
     """Register two maps; where nothing is believed, matched rooms propose poses, too."""
     a, b = maps
     check_pair(a, b, config.scale)
-    threshold = checked_threshold(config.threshold)
+    threshold = resolve_threshold(config.threshold)
     watch = Stopwatch()
     describe = _TimedDescriptor(config.embedder or DEFAULT, watch, config.poses == "rooms")
     searched = config.poses == "search"
-    proposals = FallbackProposals(partial(_room_hypotheses, a, b, config, describe), threshold if searched else np.inf)
+    proposals = FallbackProposals(partial(_propose_room_poses, a, b, config, describe), threshold if searched else np.inf)
     choices: dict[str, Any] = {"rigid": config.rigid, "same": config.same}
     registration = register(a, b, scale=config.scale, proposed=proposals, searched=searched, **choices)
     accepted = registration.transform is not None and registration.probability >= threshold
@@ -108,17 +240,17 @@ def _place_pair(maps: Sequence[TopometricMap], config: MergeConfig) -> MergeResu
     return MergeResult(
         "merged" if accepted else "abstained",
         registration.probability,
-        why(registration, threshold, config.force),
+        explain_verdict(registration, threshold, config.force),
         transforms=transforms,
         bends={k: d for k, d in enumerate(deformations) if len(d)},
         seconds=watch.seconds,
         maps=(a, b),
         registration=registration,
-        warnings=(*pair_warnings(a, b, config.scale), *_not_bent(registration)),
+        warnings=(*iter_pair_warnings(a, b, config.scale), *_iter_rigid_reasons(registration)),
     )
 
 
-def _not_bent(registration: Registration) -> Iterator[str]:
+def _iter_rigid_reasons(registration: Registration) -> Iterator[str]:
     """Why maps that could have been bent were not."""
     if registration.bend is not None and registration.bend.reason not in ("", NEITHER_BENDS):
         yield f"the maps were not bent: {registration.bend.reason}"
@@ -130,17 +262,17 @@ def _place_set(maps: Sequence[TopometricMap], config: MergeConfig) -> MergeResul
     if config.embedder == DEFAULT:  # of sets, the default only says which pairs to try first
         config = replace(config, embedder=None)
     atlas = solve(maps, config, registrations)
-    members, reason = atlas.components[atlas.component_of(0)], atlas.words()
+    members, reason = atlas.components[atlas.find_component(0)], atlas.format_summary()
     status = "merged" if members[1:] else "abstained"
     if status == "abstained" and atlas.status != "abstained":
         reason = f"not merged: {atlas.names[0]} stands apart; {reason}"
     if config.force and atlas.status != "merged":
         reason += "; joined anyway (--force)"
         atlas = solve(maps, replace(config, threshold=0.0), registrations)
-        members = atlas.components[atlas.component_of(0)]
+        members = atlas.components[atlas.find_component(0)]
     return MergeResult(
         status,
-        atlas.probability(atlas.component_of(0)),
+        atlas.get_probability(atlas.find_component(0)),
         reason,
         transforms={k: atlas.transforms[k] for k in members[1:]},
         bends={k: atlas.bends[k] for k in members if k in atlas.bends},
@@ -159,17 +291,17 @@ def _join(result: MergeResult) -> MergeResult:
     matches: list[RoomMatch] = []
     for k, m in combinations(poses, 2):
         pose = poses[m] if k == 0 else poses[k].inverse() @ poses[m]
-        matches += _room_matches(result.maps, (k, m), pose, result.probability, result.bends)
+        matches += _iter_room_matches(result.maps, (k, m), pose, result.probability, result.bends)
     return replace(result, matches=tuple(matches), map=joined)
 
 
-def _room_matches(
+def _iter_room_matches(
     maps: Sequence[TopometricMap], pair: tuple[int, int], pose: Sim3, merge_probability: float, bends: Mapping[int, Deformation]
 ) -> Iterator[RoomMatch]:
-    """Rooms of two maps that lie in each other; a match is as probable as the merge times `match_probability`."""
+    """Rooms of two maps that lie in each other; a match is as probable as the merge times `compute_match_probability`."""
     a, b = maps[pair[0]], maps[pair[1]]
-    rooms, shared_floor = rooms_in_common(a, b, pose, (bends.get(pair[0]), bends.get(pair[1])))
-    probabilities = merge_probability * match_probability(a, b, rooms, shared_floor)
+    rooms, shared_floor = match_common_rooms(a, b, pose, (bends.get(pair[0]), bends.get(pair[1])))
+    probabilities = merge_probability * compute_match_probability(a, b, rooms, shared_floor)
     for (i, j), p in zip(rooms.tolist(), probabilities.tolist(), strict=True):
         yield RoomMatch(pair, (i, j), p)
 
@@ -182,19 +314,19 @@ def _split_seconds(seconds: Mapping[str, float], total: float) -> dict[str, floa
     return split
 
 
-def _room_hypotheses(a: TopometricMap, b: TopometricMap, config: MergeConfig, describe: _TimedDescriptor) -> list[Sim3]:
+def _propose_room_poses(a: TopometricMap, b: TopometricMap, config: MergeConfig, describe: _TimedDescriptor) -> list[Sim3]:
     """Poses T_ab of matched rooms: under which sets of them lie on each other, or (`poses` "surfaces") of each by itself."""
     if not len(a.rooms) or not len(b.rooms):
         return []
-    if registration_order(b) < registration_order(a):  # as registration: nothing may depend on which comes first
-        return [h.inverse() for h in _room_hypotheses(b, a, config, describe)]
+    if compute_registration_order(b) < compute_registration_order(a):  # as registration: nothing may depend on which comes first
+        return [h.inverse() for h in _propose_room_poses(b, a, config, describe)]
     with describe.watch.measure("match"):
         if config.poses == "surfaces":
-            return _surface_hypotheses(a, b, match(a, b, describe, "growing"))
+            return _propose_surface_poses(a, b, match(a, b, describe, "growing"))
         return [h.transform for h in match(a, b, describe, scale_free=config.scale == "free").alternatives]
 
 
-def _surface_hypotheses(a: TopometricMap, b: TopometricMap, matching: Matching) -> list[Sim3]:
+def _propose_surface_poses(a: TopometricMap, b: TopometricMap, matching: Matching) -> list[Sim3]:
     """Poses T_ab of the pairs of rooms that any hypothesis holds, each pair by its surfaces."""
     probabilities: dict[tuple[int, ...], float] = {}
     for h in matching.alternatives:
@@ -202,7 +334,7 @@ def _surface_hypotheses(a: TopometricMap, b: TopometricMap, matching: Matching) 
             probabilities[tuple(pair)] = probabilities.get(tuple(pair), 0.0) + h.probability
     rooms = np.array(sorted(probabilities), np.int64).reshape(-1, 2)
     weights = np.array([probabilities[i, j] for i, j in rooms.tolist()])
-    return [pose for pose, _ in room_poses(a, b, rooms, weights)]
+    return [pose for pose, _ in estimate_room_poses(a, b, rooms, weights)]
 
 
 class _TimedDescriptor:

@@ -16,7 +16,15 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from topomerge.fusion.atlas.link_evidence import Hypotheses, Link, LinkEvidence, Poses, across, parted, support_of
+from topomerge.fusion.atlas.link_evidence import (
+    Hypotheses,
+    Link,
+    LinkEvidence,
+    Poses,
+    compute_support,
+    place_component,
+    split_component,
+)
 from topomerge.fusion.atlas.pairs import Check, Checks
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Array, Sim3
@@ -48,8 +56,8 @@ class Measured:
     weight: float = 1.0
 
 
-def residual(edge: Measured, poses: Mapping[int, Sim3]) -> float:
-    """How far a measurement is from the poses: root mean square over its points, m."""
+def compute_residual(edge: Measured, poses: Mapping[int, Sim3]) -> float:
+    """Compute the root mean square misfit of a measurement over its points, m."""
     i, j = edge.maps
     gap = poses[i].apply(edge.pose.apply(edge.points)) - poses[j].apply(edge.points)
     return float(np.sqrt((gap**2).sum(axis=1).mean()))
@@ -58,7 +66,7 @@ def residual(edge: Measured, poses: Mapping[int, Sim3]) -> float:
 def optimise(
     start: Mapping[int, Sim3], edges: Sequence[Measured], scaled: bool = False, anchor: int | None = None
 ) -> dict[int, Sim3]:
-    """Poses that agree best with all measurements.
+    """Return poses that agree best with all measurements.
 
     Args:
         start: map -> T_0k, near the solution (of a spanning tree).
@@ -76,7 +84,7 @@ def optimise(
     for _ in range(POSE_GRAPH_ROUNDS if edges and moving else 0):
         h, g = 1e-9 * np.eye(width * len(moving)), np.zeros(width * len(moving))
         for edge in edges:
-            _gather(edge, poses, place, free, h, g)
+            _add_measurement(edge, poses, place, free, h, g)
         step = np.linalg.solve(h, -g)
         for name, at in place.items():
             poses[name] = _moved(poses[name], step[at : at + width])
@@ -85,7 +93,9 @@ def optimise(
     return poses
 
 
-def _gather(edge: Measured, poses: Mapping[int, Sim3], place: Mapping[int, int], free: Array, h: Array, g: Array) -> None:
+def _add_measurement(
+    edge: Measured, poses: Mapping[int, Sim3], place: Mapping[int, int], free: Array, h: Array, g: Array
+) -> None:
     """Add a measurement to the normal equations."""
     i, j = edge.maps
     points_i, points_j = edge.pose.apply(edge.points), edge.points
@@ -95,7 +105,7 @@ def _gather(edge: Measured, poses: Mapping[int, Sim3], place: Mapping[int, int],
     parts = []
     for name, points, sign in ((i, points_i, 1.0), (j, points_j, -1.0)):
         if name in place:
-            parts.append((place[name], sign * _jacobian(poses[name], points)[:, :, free].reshape(-1, int(free.sum()))))
+            parts.append((place[name], sign * _compute_jacobian(poses[name], points)[:, :, free].reshape(-1, int(free.sum()))))
     flat = gap.reshape(-1)
     for at, jac in parts:
         rows = slice(at, at + jac.shape[1])
@@ -104,7 +114,7 @@ def _gather(edge: Measured, poses: Mapping[int, Sim3], place: Mapping[int, int],
             h[rows, other : other + jac_other.shape[1]] += weight * jac.T @ jac_other
 
 
-def _jacobian(pose: Sim3, points: Array) -> Array:
+def _compute_jacobian(pose: Sim3, points: Array) -> Array:
     """(k, 3, 5) of the placed points by x, y, z, yaw and the logarithm of the scale."""
     turned = pose.apply(points) - np.array(pose.translation)
     jacobian = np.zeros((len(points), 3, 5))
@@ -121,7 +131,7 @@ def _moved(pose: Sim3, step: Array) -> Sim3:
     return Sim3(yaw, (x, y, z), grown)
 
 
-def sets_of_maps(
+def iter_map_sets(
     count: int, joining: Collection[tuple[int, int]], of_pairs: Mapping[tuple[int, int], Of]
 ) -> Iterator[tuple[tuple[int, ...], dict[tuple[int, int], Of]]]:
     """Sets of maps that pairs join, directly or by others, each with what there is of the pairs within it.
@@ -153,8 +163,8 @@ class Assembly:
     links: list[Link] = field(default_factory=list)
     rejected: list[Link] = field(default_factory=list)
 
-    def of(self, k: int) -> dict[int, Sim3]:
-        """The component of a map."""
+    def find_component(self, k: int) -> dict[int, Sim3]:
+        """Return the component of a map."""
         return next(c for c in self.components if k in c)
 
 
@@ -184,15 +194,15 @@ class Assembler:
         self._built: dict[tuple[int, ...], tuple[set[tuple[int, int]], Assembly]] = {}  # of sets of maps, with their pairs
 
     def build(self) -> Assembly:
-        """The most probable assembly without contradictions."""
+        """Return the most probable assembly without contradictions."""
         built = {}
-        candidates = {pair for pair, _ in self._candidates(set())}
-        for maps, within in sets_of_maps(len(self.maps), candidates, self.hypotheses):
+        candidates = {pair for pair, _ in self._list_candidates(set())}
+        for maps, within in iter_map_sets(len(self.maps), candidates, self.hypotheses):
             pairs, assembly = self._built.get(maps, (set(), None))
             if assembly is None or pairs != set(within):
                 part = Assembler(0, within, self.checks, self.limit, self.scaled, maps)
                 part._settled = self._settled
-                assembly = part._assembled()
+                assembly = part._assemble()
             built[maps] = set(within), assembly
         self._built = built
         whole = Assembly([])
@@ -202,36 +212,36 @@ class Assembler:
             whole.rejected += assembly.rejected
         return whole
 
-    def _assembled(self) -> Assembly:
+    def _assemble(self) -> Assembly:
         """`build`, of all maps at once."""
         banned: set[tuple[int, int]] = set()
         while True:  # ends: each time one more pair is banned
-            assembly = self._grown(banned)
+            assembly = self._grow(banned)
             self._exchange(assembly)
-            links = self._rescored(assembly)
+            links = self._rescore_links(assembly)
             weak = [link for link in links if link.log_odds < self.limit]
             if not weak:
                 break
             banned.add(min(weak, key=lambda link: link.log_odds).maps)
         assembly.links = links
-        assembly.rejected = self._rejected(assembly)
+        assembly.rejected = self._list_rejected(assembly)
         return assembly
 
-    def _candidates(self, banned: set[tuple[int, int]]) -> list[tuple[tuple[int, int], PoseHypothesis]]:
+    def _list_candidates(self, banned: set[tuple[int, int]]) -> list[tuple[tuple[int, int], PoseHypothesis]]:
         """Hypotheses that could be believed if everything else spoke for them, most probable first."""
         candidates = [(pair, h) for pair, hs in self.hypotheses.items() if pair not in banned for h in hs]
-        candidates = [(pair, h) for pair, h in candidates if self.evidence.greatest_log_odds(pair, h) >= self.limit]
+        candidates = [(pair, h) for pair, h in candidates if self.evidence.bound_log_odds(pair, h) >= self.limit]
         return sorted(candidates, key=lambda e: (-e[1].log_odds, e[0]))
 
-    def _grown(self, banned: set[tuple[int, int]]) -> Assembly:
+    def _grow(self, banned: set[tuple[int, int]]) -> Assembly:
         assembly = Assembly([{k: Sim3()} for k in self.maps])
-        candidates = self._candidates(banned)
+        candidates = self._list_candidates(banned)
         refused: dict[int, tuple[Poses, Poses]] = {}  # by the components that stood there then, and mostly still do
         again = True
         while again:
             again = False
             for n, (pair, h) in enumerate(candidates):
-                a, b = assembly.of(pair[0]), assembly.of(pair[1])
+                a, b = assembly.find_component(pair[0]), assembly.find_component(pair[1])
                 if a is b or (n in refused and refused[n][0] is a and refused[n][1] is b):
                     continue
                 link = self.evidence.score_link(a, b, pair, h, least=self.limit)
@@ -244,33 +254,33 @@ class Assembler:
 
     def _join(self, assembly: Assembly, a: dict[int, Sim3], b: dict[int, Sim3], link: Link) -> None:
         """Bring component b into a's frame, and settle all poses."""
-        move = across(a, b, link.maps, link.hypothesis.transform)
+        move = place_component(a, b, link.maps, link.hypothesis.transform)
         joined = {**a, **{k: move @ pose for k, pose in b.items()}}
         assembly.components = [c for c in assembly.components if c is not a and c is not b]
         assembly.links.append(link)
         assembly.components.append(self.settle(joined, assembly.links)[0])
 
-    def _rescored(self, assembly: Assembly) -> list[Link]:
+    def _rescore_links(self, assembly: Assembly) -> list[Link]:
         """The links as they are seen now that everything is in its place."""
         return [self._rescore(assembly, link) for link in assembly.links]
 
     def _rescore(self, assembly: Assembly, link: Link) -> Link:
-        a, b = parted(assembly.of(link.maps[0]), assembly.links, link)
+        a, b = split_component(assembly.find_component(link.maps[0]), assembly.links, link)
         return self.evidence.score_link(a, b, link.maps, link.hypothesis, Sim3())
 
-    def _contradicted(self, assembly: Assembly) -> Iterator[tuple[tuple[int, int], PoseHypothesis]]:
+    def _iter_contradicted(self, assembly: Assembly) -> Iterator[tuple[tuple[int, int], PoseHypothesis]]:
         """Best hypotheses of pairs that lie elsewhere in their component."""
         for (i, j), hypotheses in sorted(self.hypotheses.items()):
-            poses = assembly.of(i)
+            poses = assembly.find_component(i)
             if not hypotheses or j not in poses or hypotheses[0].probability < BELIEVED:
                 continue
-            if not self.evidence.agrees(i, j, hypotheses[0].transform, poses[i].inverse() @ poses[j]):
+            if not self.evidence.is_same_pose(i, j, hypotheses[0].transform, poses[i].inverse() @ poses[j]):
                 yield (i, j), hypotheses[0]
 
     def _exchange(self, assembly: Assembly) -> None:
         """Put contradicted hypotheses in the place of links, where everything agrees better then."""
         for _ in range(2 * len(self.maps)):
-            change = next(self._better(assembly), None)
+            change = next(self._iter_exchanges(assembly), None)
             if change is None:
                 return
             old, new, (a, b) = change
@@ -279,11 +289,11 @@ class Assembler:
             first, second = (a, b) if new.maps[0] in a else (b, a)
             self._join(assembly, first, second, new)
 
-    def _better(self, assembly: Assembly) -> Iterator[tuple[Link, Link, tuple[dict[int, Sim3], dict[int, Sim3]]]]:
-        for pair, h in self._contradicted(assembly):
+    def _iter_exchanges(self, assembly: Assembly) -> Iterator[tuple[Link, Link, tuple[dict[int, Sim3], dict[int, Sim3]]]]:
+        for pair, h in self._iter_contradicted(assembly):
             for link in assembly.links:
-                component = assembly.of(link.maps[0])
-                a, b = parted(component, assembly.links, link) if pair[0] in component else ({}, {})
+                component = assembly.find_component(link.maps[0])
+                a, b = split_component(component, assembly.links, link) if pair[0] in component else ({}, {})
                 first, second = (a, b) if pair[0] in a else (b, a)
                 if pair[0] not in first or pair[1] not in second:
                     continue
@@ -294,35 +304,37 @@ class Assembler:
                 if then.log_odds >= max(now.log_odds + EXCHANGE_GAIN, self.limit):
                     yield link, then, (a, b)
 
-    def _rejected(self, assembly: Assembly) -> list[Link]:
+    def _list_rejected(self, assembly: Assembly) -> list[Link]:
         """Hypotheses that were believed by themselves and contradict the rest."""
-        rejected = [Link(pair, h, -h.log_odds, self._weakest(assembly, pair)) for pair, h in self._contradicted(assembly)]
+        rejected = [
+            Link(pair, h, -h.log_odds, self._find_weakest_link(assembly, pair)) for pair, h in self._iter_contradicted(assembly)
+        ]
         for (i, j), hypotheses in sorted(self.hypotheses.items()):
-            a, b = assembly.of(i), assembly.of(j)
+            a, b = assembly.find_component(i), assembly.find_component(j)
             if a is not b and hypotheses and hypotheses[0].log_odds >= self.limit:
                 rejected.append(self.evidence.score_link(a, b, (i, j), hypotheses[0]))
         return rejected
 
-    def _weakest(self, assembly: Assembly, pair: tuple[int, int]) -> tuple[int, int] | None:
+    def _find_weakest_link(self, assembly: Assembly, pair: tuple[int, int]) -> tuple[int, int] | None:
         """The link on the way between two maps that says most against their hypothesis."""
-        component = assembly.of(pair[0])
+        component = assembly.find_component(pair[0])
         links = [link for link in assembly.links if link.maps[0] in component]
-        between = [link for link in links if len(set(pair) & set(parted(component, assembly.links, link)[0])) == 1]
+        between = [link for link in links if len(set(pair) & set(split_component(component, assembly.links, link)[0])) == 1]
         return min(between, key=lambda link: link.log_odds).maps if between else None
 
     def settle(self, poses: Poses, links: Sequence[Link], fine: bool = False) -> tuple[dict[int, Sim3], list[Measured]]:
-        """Poses of a component that agree best with all that is measured between its maps, and that."""
+        """Return poses of a component that agree best with all that is measured between its maps, and that."""
         within = tuple((link.maps, link.hypothesis.transform) for link in links if link.maps[0] in poses)
         best = ((p, h) for p, of in self.hypotheses.items() for h in of[:1] if p[0] in poses and p[1] in poses)
         claims = tuple((pair, h.transform, h.probability) for pair, h in best)
         question = (tuple(poses.items()), within, claims, fine)
         if question not in self._settled:  # the same is asked again whenever one more pair was registered
-            edges = list(self._measured(poses, links, fine))
+            edges = list(self._iter_measured(poses, links, fine))
             self._settled[question] = optimise(poses, edges, self.scaled, min(poses)), edges
         solved, edges = self._settled[question]
         return dict(solved), edges
 
-    def _measured(self, poses: Poses, links: Sequence[Link], fine: bool) -> Iterator[Measured]:
+    def _iter_measured(self, poses: Poses, links: Sequence[Link], fine: bool) -> Iterator[Measured]:
         link_poses = {link.maps: link.hypothesis.transform for link in links}
         names = sorted(poses)
         for i in names:
@@ -330,13 +342,13 @@ class Assembler:
                 check = self.checks(i, j, poses[i].inverse() @ poses[j])
                 if (i, j) in link_poses and not check.overlap:
                     check = Check(link_poses[i, j], 0.0, True, {"walls": 1.0})
-                if check.overlap and ((i, j) in link_poses or self._supports(i, j, poses[i].inverse() @ poses[j], check)):
-                    pose = self.checks.fine(i, j, check.pose) if fine else check.pose
+                if check.overlap and ((i, j) in link_poses or self._is_supported(i, j, poses[i].inverse() @ poses[j], check)):
+                    pose = self.checks.refine_pose(i, j, check.pose) if fine else check.pose
                     weight = float(np.clip(check.features["walls"], 0.5, HEAVIEST_WALLS))
-                    yield Measured((i, j), pose, self.checks.place(i, j, pose), weight)
+                    yield Measured((i, j), pose, self.checks.locate_place(i, j, pose), weight)
 
-    def _supports(self, i: int, j: int, pose: Sim3, check: Check) -> bool:
+    def _is_supported(self, i: int, j: int, pose: Sim3, check: Check) -> bool:
         """Does a pair (i < j) speak for T_ij, by its walls or by its own registration?"""
         best = next(iter(self.hypotheses.get((i, j), ())), None)
-        same = best is not None and self.evidence.agrees(i, j, best.transform, pose)
-        return check.log_odds > 0 or (same and best is not None and support_of(best.log_odds) > 0)
+        same = best is not None and self.evidence.is_same_pose(i, j, best.transform, pose)
+        return check.log_odds > 0 or (same and best is not None and compute_support(best.log_odds) > 0)

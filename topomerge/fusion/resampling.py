@@ -10,13 +10,12 @@ from itertools import product
 
 import numpy as np
 
-from topomerge.extraction.cleaning import cell_middles
-from topomerge.kernels import copies as kernel
-from topomerge.kernels import morton
-from topomerge.kernels.lookup import build
-from topomerge.kernels.resample import filled
+from topomerge.extraction.cleaning import compute_cell_means
+from topomerge.kernels import registration as kernel
+from topomerge.kernels import voxels
+from topomerge.kernels.voxels import build, find_filled_cells
 from topomerge.types import Array, Placement, Sim3, VoxelGrid
-from topomerge.types.deformation import BETWEEN_STOREYS, Deformation
+from topomerge.types.placement import BETWEEN_STOREYS, Deformation
 
 RESAMPLED_AT_ONCE = 200_000  # cells
 SLACK = 0.02  # of a bent cell, by which neighbours overlap: each is taken as linear by itself
@@ -28,8 +27,8 @@ AROUND = 8  # cells about the walls, of which free ones are asked for
 Seen = tuple[Array, Array]
 
 
-def resampled(grid: VoxelGrid, placement: Placement | Sim3, origin: Array, edge: float) -> tuple[Array, Array]:
-    """Cells (n, 3) int64 of a lattice that the moved cells of a grid fill, and the row (n,) of one that does.
+def resample_cells(grid: VoxelGrid, placement: Placement | Sim3, origin: Array, edge: float) -> tuple[Array, Array]:
+    """Return cells (n, 3) int64 of a lattice that the moved cells of a grid fill, and the row (n,) of one that does.
 
     Args:
         placement: of the grid in the frame of the lattice.
@@ -44,24 +43,25 @@ def resampled(grid: VoxelGrid, placement: Placement | Sim3, origin: Array, edge:
     if not len(grid):
         return np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
     parts = [
-        _filled(grid, slice(n, n + RESAMPLED_AT_ONCE), placement, origin, edge) for n in range(0, len(grid), RESAMPLED_AT_ONCE)
+        _find_filled_cells(grid, slice(n, n + RESAMPLED_AT_ONCE), placement, origin, edge)
+        for n in range(0, len(grid), RESAMPLED_AT_ONCE)
     ]
     cells, rows = (np.concatenate(p) for p in zip(*parts, strict=True))
-    _, first = np.unique(encoded(cells), return_index=True)
+    _, first = np.unique(encode_cells(cells), return_index=True)
     return cells[first], rows[first]
 
 
-def _filled(grid: VoxelGrid, chosen: slice, placement: Placement, origin: Array, edge: float) -> tuple[Array, Array]:
+def _find_filled_cells(grid: VoxelGrid, chosen: slice, placement: Placement, origin: Array, edge: float) -> tuple[Array, Array]:
     """`resampled` of some cells; cells may come twice."""
     pose, ratio = placement.pose, placement.pose.scale * grid.edge / edge
     wide = ratio * _find_stretch(placement.bend) * np.sqrt(0.5) + pose.scale * _find_slant(placement.bend, grid.edge) / edge
-    places = grid.centroids(grid.cells[chosen])
+    places = grid.compute_centroids(grid.cells[chosen])
     bent, local = _linearise(placement.bend, places, grid)
     holding = np.floor((pose.apply(bent) - origin) / edge).astype(np.int64)  # the cells that the middles lie in
     back = pose.inverse().matrix
     matrix = np.column_stack([back[:3, :3] * edge, back[:3, :3] @ origin + back[:3, 3] - grid.origin]) / grid.edge
     slack = SLACK if len(local) else 0.0
-    cells, rows = filled(grid.cells[chosen], holding, matrix, local, slack, int(wide + 0.5), int(ratio / 2 + 0.5))
+    cells, rows = find_filled_cells(grid.cells[chosen], holding, matrix, local, slack, int(wide + 0.5), int(ratio / 2 + 0.5))
     return np.concatenate([cells, holding]), np.concatenate([rows, np.arange(len(holding))]) + chosen.start
 
 
@@ -96,7 +96,7 @@ def _find_slant(bend: Deformation | None, edge: float) -> float:
     return 2 * bend.farthest * min(edge / (2 * BETWEEN_STOREYS), 1.0)
 
 
-def laid_means(
+def transform_means(
     grid: VoxelGrid, placement: Placement, rows: Array, cells: Array, origin: Array, edge: float
 ) -> tuple[Array, Array]:
     """(n, 3) 0..1 where in the cells of a lattice the points of moved cells lie on average, and (n,) how many points say so.
@@ -109,24 +109,24 @@ def laid_means(
     """
     if "offset" not in grid.properties:
         return np.full((len(cells), 3), 0.5), np.zeros(len(cells))
-    within = (placement.transform_points(cell_middles(grid))[rows] - origin) / edge - cells
+    within = (placement.transform_points(compute_cell_means(grid))[rows] - origin) / edge - cells
     inside = np.clip(within, 0, 1)
     points = np.asarray(grid.properties.get("count", np.ones(len(grid))), np.float64)[rows]
     return inside, points * np.where((inside == within).all(axis=1), 1.0, FILLED_WEIGHT)
 
 
-def encoded(cells: Array) -> Array:
-    """(n,) uint64, one code for each cell within a million of the origin."""
-    return morton.encode((cells + CODE_OFFSET).astype(np.int32))
+def encode_cells(cells: Array) -> Array:
+    """Return (n,) uint64, one code for each cell within a million of the origin."""
+    return voxels.encode((cells + CODE_OFFSET).astype(np.int32))
 
 
-def decoded(codes: Array) -> Array:
-    """(n, 3) int64, the cells of `encoded`."""
-    cells: Array = morton.decode(codes).astype(np.int64) - CODE_OFFSET
+def decode_cells(codes: Array) -> Array:
+    """Return (n, 3) int64, the cells of `encoded`."""
+    cells: Array = voxels.decode(codes).astype(np.int64) - CODE_OFFSET
     return cells
 
 
-def copies(first: Seen, second: Seen, edge: float) -> Array:
+def find_wall_copies(first: Seen, second: Seen, edge: float) -> Array:
     """(n,) int64 row of the cell of the first map's wall of which each cell of the second map is a copy, -1 none.
 
     Args:
@@ -142,12 +142,12 @@ def copies(first: Seen, second: Seen, edge: float) -> Array:
     offsets = np.array(sorted(beside, key=lambda o: (o[0] ** 2 + o[1] ** 2, o)), np.int64)
     low = 2 * ((np.minimum(first[0].min(axis=0), second[0].min(axis=0)) - AROUND) // 2)
     high = np.maximum(first[0].max(axis=0), second[0].max(axis=0)) + AROUND + 1 - low
-    tables = [_table(cells - low, high) for cells in (first[0], second[0])]
-    tables += [_table(cells - low // 2, high // 2 + 1) for cells in (first[1], second[1])]
-    return kernel.copied(np.ascontiguousarray(second[0] - low), offsets, *tables)
+    tables = [_build_table(cells - low, high) for cells in (first[0], second[0])]
+    tables += [_build_table(cells - low // 2, high // 2 + 1) for cells in (first[1], second[1])]
+    return kernel.find_copied_cells(np.ascontiguousarray(second[0] - low), offsets, *tables)
 
 
-def _table(cells: Array, size: Array) -> tuple[Array, Array]:
+def _build_table(cells: Array, size: Array) -> tuple[Array, Array]:
     """`kernels.lookup` of those cells that lie in a volume of so many cells."""
     inside = ((cells >= 0) & (cells < size)).all(axis=1)
     x, y, z = size.tolist()

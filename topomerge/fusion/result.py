@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.pairs import contradiction_to_json
-from topomerge.io.listing import plain
-from topomerge.matching.listing import map_to_entry
+from topomerge.fusion.atlas.pairs import serialise_contradiction
+from topomerge.io.listing import convert_to_plain
+from topomerge.matching.match import describe_map
 from topomerge.registration.evidence.places import Places
 from topomerge.registration.pipeline import Registration
-from topomerge.types import Array, Deformation, Placement, Sim3, TopometricMap, between_files
+from topomerge.types import Array, Deformation, Placement, Sim3, TopometricMap, convert_pose_to_files
 from topomerge.writers import WRITERS
 
 if TYPE_CHECKING:
@@ -45,11 +45,11 @@ class RoomMoves:
     covariance: Array
 
 
-def room_moves(map: TopometricMap, bend: Deformation) -> RoomMoves:
-    """The rigid move that fits the bending of each room's floor best (least squares)."""
+def fit_room_moves(map: TopometricMap, bend: Deformation) -> RoomMoves:
+    """Return the rigid move that fits the bending of each room's floor best (least squares)."""
     count = len(map.rooms)
     inside = map.navigable_room >= 0
-    room, places = map.navigable_room[inside], map.navigable.centroids(map.navigable.cells[inside])
+    room, places = map.navigable_room[inside], map.navigable.compute_centroids(map.navigable.cells[inside])
     bare = np.setdiff1d(np.arange(count), room)
     room = np.concatenate([room, np.repeat(bare, len(AROUND))])
     places = np.concatenate([places, (map.rooms["centroid"][bare][:, None] + AROUND).reshape(-1, 3)])
@@ -71,10 +71,10 @@ def room_moves(map: TopometricMap, bend: Deformation) -> RoomMoves:
     return RoomMoves(centre, there - centre, np.arctan2(cross, dot), covariance)
 
 
-def bend_to_json(map: TopometricMap, placement: Placement) -> dict[str, Any]:
-    """How a map was bent, as plain values: the pieces in its own frame, and each room in the joined one (docs/outputs.md)."""
+def serialise_bend(map: TopometricMap, placement: Placement) -> dict[str, Any]:
+    """Serialise how a map was bent: its pieces, and each room in the joined map (docs/outputs.md)."""
     assert placement.bend is not None
-    moves, pose = room_moves(map, placement.bend), placement.pose
+    moves, pose = fit_room_moves(map, placement.bend), placement.pose
     turning = np.eye(3)
     turning[:2, :2] = pose.matrix[:2, :2]
     shifts = moves.shift @ turning[:2, :2].T
@@ -96,7 +96,7 @@ def bend_to_json(map: TopometricMap, placement: Placement) -> dict[str, Any]:
     return {**placement.bend.to_json(), "rooms": rooms}
 
 
-def with_bends(joined: TopometricMap, placements: Mapping[int, Placement], sources: Sequence[str]) -> TopometricMap:
+def add_bends(joined: TopometricMap, placements: Mapping[int, Placement], sources: Sequence[str]) -> TopometricMap:
     """Let the joined map remember how the maps it was joined of were bent; as it is where all are rigid.
 
     Args:
@@ -111,8 +111,8 @@ def with_bends(joined: TopometricMap, placements: Mapping[int, Placement], sourc
     return replace(joined, parameters={**joined.parameters, BEND_PARAMETER: bent}) if bent else joined
 
 
-def bends_of(joined: TopometricMap) -> dict[int, Placement]:
-    """Read how the maps that a map was joined of were bent: what `with_bends` put there, also after `save_map` and `load_map`.
+def read_bends(joined: TopometricMap) -> dict[int, Placement]:
+    """Read how the maps that a map was joined of were bent: what `add_bends` put there, also after `save_map` and `load_map`.
 
     Returns:
         One for each bent map, by its number; none of a map that was extracted, or joined of rigid ones.
@@ -124,7 +124,7 @@ def bends_of(joined: TopometricMap) -> dict[int, Placement]:
     try:
         if not isinstance(listed, list | tuple):
             raise ValueError("no list")
-        return dict(_placement(entry) for entry in listed)
+        return dict(_parse_placement(entry) for entry in listed)
     except InputError as error:
         raise InputError(f"{joined.source or 'map'}: {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
@@ -132,7 +132,7 @@ def bends_of(joined: TopometricMap) -> dict[int, Placement]:
         raise InputError(f"{joined.source or 'map'}: damaged bending ({reason}); merge the maps again") from error
 
 
-def _placement(entry: Mapping[str, Any]) -> tuple[int, Placement]:
+def _parse_placement(entry: Mapping[str, Any]) -> tuple[int, Placement]:
     number, source = entry["map"], entry["source"]
     if not isinstance(number, int) or isinstance(number, bool) or number < 0 or not isinstance(source, str):
         raise ValueError(f"map {number!r}")
@@ -140,7 +140,7 @@ def _placement(entry: Mapping[str, Any]) -> tuple[int, Placement]:
     return number, Placement(pose, Deformation.from_json(entry["deformation"]))
 
 
-def placements(transforms: Mapping[int, Sim3], bends: Mapping[int, Deformation]) -> dict[int, Placement]:
+def build_placements(transforms: Mapping[int, Sim3], bends: Mapping[int, Deformation]) -> dict[int, Placement]:
     """Place each map that has a transform, and the first one, ascending.
 
     Args:
@@ -159,7 +159,7 @@ class RoomMatch:
     Args:
         maps: which maps, by their place in the list that was merged.
         rooms: one room of each.
-        probability: that they are one (of the merge, times `odds.match_probability`).
+        probability: that they are one (of the merge, times `odds.compute_match_probability`).
     """
 
     maps: tuple[int, int]
@@ -209,7 +209,7 @@ class MergeResult:
         if self.status not in ("merged", "abstained"):
             raise ValueError(f"status must be merged or abstained, not {self.status!r}")
         if self.map is not None:  # whoever has only the joined map can bend what it was joined of, too
-            object.__setattr__(self, "map", with_bends(self.map, self.placements, [m.source for m in self.maps]))
+            object.__setattr__(self, "map", add_bends(self.map, self.placements, [m.source for m in self.maps]))
 
     @property
     def merged(self) -> bool:
@@ -219,14 +219,14 @@ class MergeResult:
     @property
     def placements(self) -> dict[int, Placement]:
         """k -> where the points of map k lie in the joined frame, of every map that is part of it; none where nothing is."""
-        return placements(self.transforms, self.bends) if self.transforms else {}
+        return build_placements(self.transforms, self.bends) if self.transforms else {}
 
     @property
     def file_transforms(self) -> dict[int, Array]:
         """k -> (4, 4) float64 that takes points of the file of map k into the frame of that of map 0: as `transforms` do, unless
         a cloud was tilted and has been levelled."""
         into = self.maps[0].levelling if self.transforms else np.eye(4)
-        return {k: between_files(pose, self.maps[k].levelling, into) for k, pose in self.transforms.items()}
+        return {k: convert_pose_to_files(pose, self.maps[k].levelling, into) for k, pose in self.transforms.items()}
 
     def save(self, folder: str | Path) -> None:
         """Write merge.json and report.html, and where there is a joined map merged.ply and map.tmap; all of them or none.
@@ -239,47 +239,47 @@ class MergeResult:
         WRITERS["merge"](self, folder)
 
 
-def merge_to_json(result: MergeResult) -> dict[str, Any]:
+def serialise_merge(result: MergeResult) -> dict[str, Any]:
     """`merge.json` as plain values: see docs/outputs.md. Numbers are not rounded: national grids need all digits."""
     registration = result.registration
     rmse = registration.features.get("rmse", float("nan")) if registration else float("nan")
     residuals = result.atlas.residuals if result.atlas else {1: rmse}
     matrices = result.file_transforms
-    transforms = {str(k): transform_to_json(pose, residuals[k], matrices[k]) for k, pose in result.transforms.items()}
+    transforms = {str(k): serialise_transform(pose, residuals[k], matrices[k]) for k, pose in result.transforms.items()}
     listing = {
         "format": MERGE_FORMAT,
         "status": result.status,
         "probability": min(max(float(result.probability), 0.0), 1.0),
         "reason": result.reason,
         "descriptor": result.descriptor,
-        "maps": [map_to_entry(m) for m in result.maps],
+        "maps": [describe_map(m) for m in result.maps],
         "transforms": transforms,
-        "bend": {str(k): bend_to_json(result.maps[k], p) for k, p in result.placements.items() if p.bend is not None},
+        "bend": {str(k): serialise_bend(result.maps[k], p) for k, p in result.placements.items() if p.bend is not None},
         "matches": [{"maps": m.maps, "rooms": m.rooms, "probability": round(m.probability, 4)} for m in result.matches],
         "seconds": {step: round(float(result.seconds.get(step, 0.0)), 4) for step in MERGE_STEPS},
         "points": {str(k): name for k, name in sorted(result.points.items())},
         "alternatives": {name: round(p, 6) for name, p in registration.posterior.items()} if registration else {},
-        "places": places_to_json(registration.places) if registration and registration.places else [],
-        "contradictions": [contradiction_to_json(c) for c in result.atlas.contradictions] if result.atlas else [],
+        "places": serialise_places(registration.places) if registration and registration.places else [],
+        "contradictions": [serialise_contradiction(c) for c in result.atlas.contradictions] if result.atlas else [],
     }
-    plain_listing: dict[str, Any] = plain(listing)
+    plain_listing: dict[str, Any] = convert_to_plain(listing)
     return plain_listing
 
 
-def places_to_json(places: Places) -> list[dict[str, Any]]:
-    """What each place says as plain values: where its middle is in the frame of the first map, m, how much floor both maps saw of
+def serialise_places(places: Places) -> list[dict[str, Any]]:
+    """Serialise the scored places: their middles in the frame of the first map, m, how much floor both maps saw of
     it, m2, and the log odds that it is one place and no look-alike."""
     c = places.crops
     each = zip(c.middle.tolist(), c.area.tolist(), places.log_odds.tolist(), strict=True)
     return [{"at": [round(v, 2) for v in at], "m2": round(m2, 1), "log_odds": round(odds, 2)} for at, m2, odds in each]
 
 
-def transform_to_json(pose: Sim3, rmse: float, matrix: Array, into: int = 0) -> dict[str, Any]:
-    """A pose in the frame of another map as plain values.
+def serialise_transform(pose: Sim3, rmse: float, matrix: Array, into: int = 0) -> dict[str, Any]:
+    """Return a pose in the frame of another map as plain values.
 
     Args:
         rmse: of its surfaces, or of its measurements, m; nan where there are none.
-        matrix: (4, 4), the pose between the files of both maps (`between_files`).
+        matrix: (4, 4), the pose between the files of both maps (`convert_pose_to_files`).
         into: the other map.
     """
     return {

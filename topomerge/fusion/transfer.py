@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from topomerge.extraction.attributes import LEVEL_KINDS, distinct_doors, rooms_at
-from topomerge.extraction.elevations.windows import in_map, same_windows
+from topomerge.extraction.attributes import LEVEL_KINDS, find_rooms_at, select_distinct_doors
+from topomerge.extraction.elevations.windows import iter_same_windows, select_windows
 from topomerge.extraction.plans.part_rooms import PartRooms
 from topomerge.types import EDGE_DTYPE, WINDOW_DTYPE, Array, Placement, TopometricMap
-from topomerge.types.arrays import within_turn
+from topomerge.types.grid import wrap_to_turn
 
 DOOR_SIDE = 1.0  # m around a door in which floor says which rooms it joins
 LEAST_FLOOR = 5  # cells of it, from which a map saw that side of a door
@@ -22,7 +22,7 @@ SEEN_BY_A_PART = ("centre", "lower", "upper", "direction", "width", "height", "k
 LEAST_COVER = 0.3  # of a joined room's floor, from which on a part knows who was in it
 
 
-class LaidPart(NamedTuple):
+class PlacedPart(NamedTuple):
     """What of a part is needed once it is joined: its rooms, and its doors and openings as they lie in the joined map, EDGE_DTYPE
     with the part's rooms."""
 
@@ -30,8 +30,8 @@ class LaidPart(NamedTuple):
     doors: Array
 
 
-def laid_part(part: TopometricMap, placement: Placement) -> LaidPart:
-    """A part as it lies in the joined map."""
+def transform_part(part: TopometricMap, placement: Placement) -> PlacedPart:
+    """Return a part as it lies in the joined map."""
     doors = part.edges[np.isin(part.edges["kind"], LEVEL_KINDS)].copy()
     for name in ("centre", "lower", "upper"):
         doors[name] = placement.transform_points(doors[name])
@@ -39,34 +39,34 @@ def laid_part(part: TopometricMap, placement: Placement) -> LaidPart:
     for name in ("width", "height"):
         doors[name] *= placement.pose.scale
     area = (placement.pose.scale * part.navigable.edge) ** 2
-    return LaidPart(PartRooms(*laid_floor(part, placement), part.rooms["entered"], area), doors)
+    return PlacedPart(PartRooms(*transform_floor(part, placement), part.rooms["entered"], area), doors)
 
 
-def with_doors(joined: TopometricMap, parts: Iterable[LaidPart]) -> TopometricMap:
+def add_part_doors(joined: TopometricMap, parts: Iterable[PlacedPart]) -> TopometricMap:
     """The joined map with those doors and openings of its parts that it lacks, without those that its parts deny, and each as the
     part saw it that is surest of it.
 
     Args:
         parts: as they lie in it.
     """
-    laid = [_LaidFloor.of(part, joined) for part in parts]
+    laid = [_PlacedFloor.from_part(part, joined) for part in parts]
     level = np.isin(joined.edges["kind"], LEVEL_KINDS)
-    edges = joined.edges[[not level[k] or _confirmed(edge, laid) for k, edge in enumerate(joined.edges)]]
-    edges = _as_seen(edges, np.concatenate([np.zeros(0, EDGE_DTYPE), *(part.doors for part in laid)]))
+    edges = joined.edges[[not level[k] or _is_confirmed(edge, laid) for k, edge in enumerate(joined.edges)]]
+    edges = _adopt_doors(edges, np.concatenate([np.zeros(0, EDGE_DTYPE), *(part.doors for part in laid)]))
     for part in laid:
-        new = [door for door in part.doors if not _is_there(edges, door)]
+        new = [door for door in part.doors if not _is_among_edges(edges, door)]
         edges = np.concatenate([edges, np.array(new, EDGE_DTYPE)])
-    return distinct_doors(replace(joined, edges=edges[np.lexsort((*edges["centre"].T[::-1], *edges["rooms"].T[::-1]))]))
+    return select_distinct_doors(replace(joined, edges=edges[np.lexsort((*edges["centre"].T[::-1], *edges["rooms"].T[::-1]))]))
 
 
-def laid_floor(part: TopometricMap, placement: Placement) -> tuple[Array, Array]:
-    """(k, 3) m in the joined map, and (k,) their rooms in the part: the floor of its rooms."""
+def transform_floor(part: TopometricMap, placement: Placement) -> tuple[Array, Array]:
+    """Return (k, 3) m in the joined map, and (k,) their rooms in the part: the floor of its rooms."""
     inside = part.navigable_room >= 0
-    return placement.transform_points(part.navigable.centroids(part.navigable.cells[inside])), part.navigable_room[inside]
+    return placement.transform_points(part.navigable.compute_centroids(part.navigable.cells[inside])), part.navigable_room[inside]
 
 
 @dataclass(frozen=True, eq=False)
-class _LaidFloor:
+class _PlacedFloor:
     """What a part says of doors, in the joined map.
 
     Args:
@@ -82,9 +82,9 @@ class _LaidFloor:
     doors: Array
 
     @classmethod
-    def of(cls, part: LaidPart, joined: TopometricMap) -> _LaidFloor:
+    def from_part(cls, part: PlacedPart, joined: TopometricMap) -> _PlacedFloor:
         part_room, doors = part.rooms.room, part.doors.copy()
-        room, tree = rooms_at(joined, part.rooms.places), cKDTree(part.rooms.places)
+        room, tree = find_rooms_at(joined, part.rooms.places), cKDTree(part.rooms.places)
         pairs = np.full((len(doors), 2), -1, np.int64)
         for k, near in enumerate(tree.query_ball_point(doors["centre"], DOOR_SIDE)):
             there, own = room[near], part_room[near]
@@ -95,21 +95,21 @@ class _LaidFloor:
         doors["rooms"] = np.sort(pairs, axis=1)
         return cls(tree, room, doors["centre"], doors[between])
 
-    def saw_both_sides(self, edge: Array) -> bool:
+    def has_both_sides(self, edge: Array) -> bool:
         """Has it floor on both sides of an edge of the joined map?"""
         near = self.room[self.floor.query_ball_point(edge["centre"], DOOR_SIDE)]
         return all(int((near == room).sum()) >= LEAST_FLOOR for room in edge["rooms"])
 
 
-def _confirmed(edge: Array, parts: Sequence[_LaidFloor]) -> bool:
+def _is_confirmed(edge: Array, parts: Sequence[_PlacedFloor]) -> bool:
     """Has a part a door there, or did none see both sides?"""
     at = np.concatenate([part.centres for part in parts])
     if (np.linalg.norm(at - edge["centre"], axis=1) < ONE_DOOR).any():
         return True
-    return not any(part.saw_both_sides(edge) for part in parts)
+    return not any(part.has_both_sides(edge) for part in parts)
 
 
-def _as_seen(edges: Array, doors: Array) -> Array:
+def _adopt_doors(edges: Array, doors: Array) -> Array:
     """Doors of the joined map as the surest of the parts' doors that are the same has them; its sureness is the higher one."""
     edges = edges.copy()
     for edge in edges:
@@ -125,14 +125,14 @@ def _as_seen(edges: Array, doors: Array) -> Array:
     return edges
 
 
-def _is_there(edges: Array, door: Array) -> bool:
+def _is_among_edges(edges: Array, door: Array) -> bool:
     """Is a door among edges, between the same rooms and near enough?"""
     same = (np.sort(edges["rooms"], axis=1) == door["rooms"]).all(axis=1)
     apart = np.linalg.norm(edges["centre"][same] - door["centre"], axis=1)
     return bool((apart <= max(ONE_DOOR, float(door["width"]) / 2)).any())
 
 
-def with_part_odds(joined: TopometricMap, parts: Sequence[PartRooms]) -> TopometricMap:
+def add_part_odds(joined: TopometricMap, parts: Sequence[PartRooms]) -> TopometricMap:
     """The joined map with the probability that each room was entered, and with what was only glimpsed, as its parts say: that of
     the part in which somebody was most likely there; as the joined map has it where no part has enough of its floor."""
     if not len(joined.rooms):
@@ -142,7 +142,7 @@ def with_part_odds(joined: TopometricMap, parts: Sequence[PartRooms]) -> Topomet
     area = np.bincount(joined.navigable_room[inside], minlength=count) * joined.navigable.edge**2
     entered = np.full(count, -1.0)
     for part in parts:
-        room = rooms_at(joined, part.places)
+        room = find_rooms_at(joined, part.places)
         there = room >= 0
         places = np.bincount(room[there], minlength=count)
         mean = np.bincount(room[there], part.entered[part.room[there]], count) / np.maximum(places, 1)
@@ -153,24 +153,24 @@ def with_part_odds(joined: TopometricMap, parts: Sequence[PartRooms]) -> Topomet
     return replace(joined, rooms=rooms)
 
 
-def laid_windows(part: TopometricMap, placement: Placement) -> Array:
-    """(W,) WINDOW_DTYPE of a part in the joined map, without rooms."""
+def transform_windows(part: TopometricMap, placement: Placement) -> Array:
+    """Return (W,) WINDOW_DTYPE of a part in the joined map, without rooms."""
     windows = part.windows.copy()
     if len(windows):
         windows["centre"] = placement.transform_points(windows["centre"])
-        windows["direction"] = within_turn(windows["direction"] + placement.pose.yaw, np.pi)
+        windows["direction"] = wrap_to_turn(windows["direction"] + placement.pose.yaw, np.pi)
         for name in ("width", "sill", "head"):
             windows[name] *= placement.pose.scale
     windows["rooms"] = -1
     return windows
 
 
-def with_joined_windows(joined: TopometricMap, parts: Sequence[Array]) -> TopometricMap:
-    """The joined map with the windows of its parts, each once: as the part saw it that is the surest of it.
+def add_joined_windows(joined: TopometricMap, parts: Sequence[Array]) -> TopometricMap:
+    """Return the joined map with the windows of its parts, each once: as the part saw it that is the surest of it.
 
     Args:
-        parts: WINDOW_DTYPE of `laid_windows`.
+        parts: WINDOW_DTYPE of `transform_windows`.
     """
     windows = np.concatenate([np.zeros(0, WINDOW_DTYPE), *parts])
-    first = [int(group[0]) for group in same_windows(windows)]
-    return replace(joined, windows=in_map(joined, windows[first]))
+    first = [int(group[0]) for group in iter_same_windows(windows)]
+    return replace(joined, windows=select_windows(joined, windows[first]))

@@ -1,24 +1,99 @@
-"""Arrays in one file: a NumPy archive (.npz) whose bytes depend only on its content, read without trusting it.
-
-The file can be opened with `numpy.load`. Unlike `numpy.savez_compressed` it holds no time of writing. Reading checks what
-the file declares about itself before memory is taken for it, and never unpickles.
-"""
+"""Files that are written whole, archives of arrays read with limits, and weights that ship."""
 
 from __future__ import annotations
 
+import hashlib
 import io
+import json
 import math
+import os
+import platform
+import re
+import shutil
+import tempfile
 import zipfile
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache, lru_cache
+from importlib import resources
 from pathlib import Path
 from typing import IO, Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from topomerge.errors import InputError, is_memory_short
-from topomerge.io.atomic import replacing
 from topomerge.io.piece import refuse_pointer
 from topomerge.types import Array
+
+PART_SUFFIX = ".part"  # of the folders in which files are written
+PART_NAME = re.compile(r"\.([0-9a-f]{8})-(\d+)\.[^.]*\.part$")  # machine and process of the one that writes
+
+
+@contextmanager
+def replace_on_success(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path` with the same name; rename it to `path` on success, delete it on any error.
+
+    A link is followed: what it points to is replaced.
+
+    Raises:
+        InputError: the folder does not exist or can't be written, or `path` is no regular file.
+    """
+    path = Path(path)
+    if path.is_symlink():
+        path = Path(os.path.realpath(path))
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: is no file that could be replaced; give the name of a file")
+    try:
+        _delete_stale_parts(path.parent)
+        # A folder of its own, so that what a kill leaves behind is nowhere found under the file's suffix.
+        prefix = f".{path.stem[:40]}.{_compute_machine_id()}-{os.getpid()}."
+        folder = Path(tempfile.mkdtemp(prefix=prefix, suffix=PART_SUFFIX, dir=path.parent))
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise InputError(f"{path}: can't be written ({reason}); give a folder that exists and is yours") from error
+    beside = folder / path.name
+    try:
+        beside.touch()
+        yield beside
+        umask = os.umask(0)
+        os.umask(umask)
+        beside.chmod(0o666 & ~umask)
+        try:
+            beside.replace(path)
+        except OSError as error:
+            raise InputError(f"{path}: can't be written ({error.strerror or error})") from error
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@cache
+def _compute_machine_id() -> str:
+    """A short name of the machine, or the container, whose numbers of processes those of this process are."""
+    space = Path("/proc/self/ns/pid")
+    numbers = os.readlink(space) if os.path.lexists(space) else ""
+    return hashlib.sha256(f"{platform.node()} {numbers}".encode()).hexdigest()[:8]
+
+
+@cache
+def _delete_stale_parts(folder: Path) -> None:
+    """Delete, once a process, what killed processes of this machine left in a folder."""
+    if os.name != "posix":  # elsewhere a signal can't ask for a process
+        return
+    for left in folder.glob(f".*{PART_SUFFIX}"):
+        owner = PART_NAME.search(left.name)
+        if owner is not None and owner[1] == _compute_machine_id() and not _is_running(int(owner[2])):
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
+
 
 DATE = (1980, 1, 1, 0, 0, 0)  # the first that a zip can tell
 ARCHIVE_LIMIT = 4 << 30  # of all arrays together; a map of 100 million cells needs 2 GB
@@ -38,7 +113,7 @@ def write(arrays: Mapping[str, Array], path: str | Path, effort: int = 6) -> Non
     Raises:
         InputError: the path can't be written.
     """
-    with replacing(path) as beside, zipfile.ZipFile(beside, "w") as archive:
+    with replace_on_success(path) as beside, zipfile.ZipFile(beside, "w") as archive:
         for name, array in arrays.items():
             entry = zipfile.ZipInfo(f"{name}.npy", DATE)
             entry.compress_type = zipfile.ZIP_DEFLATED
@@ -60,19 +135,21 @@ def read(path: str | Path, kind: str = "archive", only: Collection[str] | None =
     Raises:
         InputError: no such file, not such an archive, damaged, or it declares more than it can hold.
     """
-    return _archive_of(path, kind, lambda archive, size: {name: _array(archive, e) for name, e in _entries(archive, size, only)})
+    return _apply_to_archive(
+        path, kind, lambda archive, size: {name: _read_array(archive, e) for name, e in _list_entries(archive, size, only)}
+    )
 
 
-def names(path: str | Path, kind: str = "archive") -> list[str]:
-    """Names of the arrays of such a file, without reading them.
+def list_arrays(path: str | Path, kind: str = "archive") -> list[str]:
+    """List names of the arrays of such a file, without reading them.
 
     Raises:
         InputError: as `read`; damage of the arrays is not looked for.
     """
-    return _archive_of(path, kind, lambda archive, size: [name for name, _ in _entries(archive, size)])
+    return _apply_to_archive(path, kind, lambda archive, size: [name for name, _ in _list_entries(archive, size)])
 
 
-class Head(NamedTuple):
+class ArrayHeader(NamedTuple):
     """What an array of an archive declares of itself."""
 
     shape: tuple[int, ...]
@@ -84,16 +161,18 @@ class Head(NamedTuple):
         return math.prod(self.shape)
 
 
-def heads(path: str | Path, kind: str = "archive") -> dict[str, Head]:
-    """What the arrays of such a file declare, checked as by `read`, without unpacking more than their headers.
+def read_array_headers(path: str | Path, kind: str = "archive") -> dict[str, ArrayHeader]:
+    """Read the headers of the arrays of such a file, checked as by `read`, without unpacking more than them.
 
     Raises:
         InputError: as `read`.
     """
-    return _archive_of(path, kind, lambda archive, size: {name: _declared(archive, e) for name, e in _entries(archive, size)})
+    return _apply_to_archive(
+        path, kind, lambda archive, size: {name: _read_header(archive, e) for name, e in _list_entries(archive, size)}
+    )
 
 
-def _archive_of(path: str | Path, kind: str, use: Callable[[zipfile.ZipFile, int], R]) -> R:
+def _apply_to_archive(path: str | Path, kind: str, use: Callable[[zipfile.ZipFile, int], R]) -> R:
     """What `use` makes of an archive and the size of its file; whatever goes wrong is told of the file."""
     path = Path(path)
     if path.is_dir():
@@ -123,7 +202,7 @@ def _archive_of(path: str | Path, kind: str, use: Callable[[zipfile.ZipFile, int
         raise InputError(f"{path}: damaged or cut off ({reason}); copy or make the {kind} again") from error
 
 
-def _entries(archive: zipfile.ZipFile, size: int, only: Collection[str] | None = None) -> list[tuple[str, zipfile.ZipInfo]]:
+def _list_entries(archive: zipfile.ZipFile, size: int, only: Collection[str] | None = None) -> list[tuple[str, zipfile.ZipInfo]]:
     """Names and places of the arrays in a file of so many bytes; what they declare is checked before any is read."""
     entries = [entry for entry in archive.infolist() if entry.filename.endswith(".npy")]
     if entries and len({entry.filename for entry in entries}) < len(archive.infolist()):
@@ -138,12 +217,12 @@ def _entries(archive: zipfile.ZipFile, size: int, only: Collection[str] | None =
     return [(name, entry) for name, entry in named if only is None or name in only]
 
 
-def _declared(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Head:
+def _read_header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> ArrayHeader:
     with archive.open(entry) as stream:
-        return _head(entry, stream)[0]
+        return _parse_header(entry, stream)[0]
 
 
-def _head(entry: zipfile.ZipInfo, stream: IO[bytes]) -> tuple[Head, bytes]:
+def _parse_header(entry: zipfile.ZipInfo, stream: IO[bytes]) -> tuple[ArrayHeader, bytes]:
     """The declared shape and type of one array, which must fill the entry to the byte; and what was read behind its header."""
     head = io.BytesIO(stream.read(LONGEST_ARRAY_HEADER))
     version = np.lib.format.read_magic(head)
@@ -156,13 +235,13 @@ def _head(entry: zipfile.ZipInfo, stream: IO[bytes]) -> tuple[Head, bytes]:
         raise ValueError(f"{entry.filename} has a layout that maps don't use")
     if head.tell() + math.prod(shape) * dtype.itemsize != entry.file_size:
         raise ValueError(f"{entry.filename} claims shape {shape}, which is not its size")
-    return Head(shape, dtype), head.read()
+    return ArrayHeader(shape, dtype), head.read()
 
 
-def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Array:
+def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Array:
     """One array, unpacked into the memory that it stays in."""
     with archive.open(entry) as stream:
-        head, start = _head(entry, stream)
+        head, start = _parse_header(entry, stream)
         body = bytearray(head.size * head.dtype.itemsize)
         view = memoryview(body)
         view[: len(start)] = start
@@ -175,3 +254,42 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Array:
             at += len(part)
         stream.read(1)  # reading to the end also checks the CRC
     return np.frombuffer(body, head.dtype, count=head.size).reshape(head.shape)
+
+
+VARIABLE = "TOPOMERGE_WEIGHTS"
+
+
+def find_weights_file(package: str, name: str) -> Path:
+    """Find the file `name` of the folder that `VARIABLE` names, if it is there; else that of `package`."""
+    folder = os.environ.get(VARIABLE)
+    if folder:
+        if not Path(folder).is_dir():
+            raise InputError(f"{VARIABLE}: {folder} is no folder; name one with exported weights, or unset it")
+        if (Path(folder) / name).is_file():
+            return Path(folder) / name
+    return _find_packaged_file(package, name)
+
+
+@cache
+def _find_packaged_file(package: str, name: str) -> Path:
+    return Path(str(resources.files(package).joinpath(name)))
+
+
+def read_weights_json(package: str, name: str) -> dict[str, Any]:
+    """Read a JSON file of weights, once.
+
+    Raises:
+        InputError: it is damaged, or no table.
+    """
+    return _read(find_weights_file(package, name))
+
+
+@lru_cache(maxsize=16)
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: damaged ({' '.join(str(error).split())[:120]}); install topomerge again") from error
+    if not isinstance(values, dict):
+        raise InputError(f"{path}: holds no table of weights; install topomerge again")
+    return values

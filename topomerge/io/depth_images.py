@@ -1,7 +1,4 @@
-"""Depth images with the camera that took them and where it stood -> scans: the part that all RGB-D formats share.
-
-Cameras look along their z, with x to the right and y down. Lens distortion is not undone.
-"""
+"""Depth images with their cameras and poses as points."""
 
 from __future__ import annotations
 
@@ -15,10 +12,82 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.grid import PIXELS
-from topomerge.io.piece import damaged
-from topomerge.io.posed import PosedScan
-from topomerge.io.trajectory import no_rotations
+from topomerge.io.piece import BLOCK_POINTS, Piece, build_damage_error
+from topomerge.io.trajectory import find_invalid_rotations
 from topomerge.types import Array
+
+
+@dataclass(frozen=True, eq=False)
+class PosedScan:
+    """What a sensor measured from one place.
+
+    Args:
+        points: (n, 3) in the sensor's frame, or in the fixed frame where they are `registered`.
+        pose: (4, 4) of the sensor in the fixed frame; None: not known, and then the points are registered.
+        colors: (n, 3) uint8.
+        registered: the points stand in the fixed frame already; the pose only says where their rays start.
+        done: share of all scans that are read.
+    """
+
+    points: Array
+    pose: Array | None
+    colors: Array | None = None
+    registered: bool = False
+    done: float = 0.0
+
+
+def iter_pieces(scans: Iterable[PosedScan], warnings: Iterable[str] = ()) -> Iterator[Piece]:
+    """Yield the scans as few large pieces, so that a long walk of small scans costs no more than one large one.
+
+    Rays that met nothing (not finite, or at the sensor itself) are left out.
+
+    Args:
+        scans: in their order; read one at a time.
+        warnings: what the user should know; asked for when all scans are read.
+    """
+    batch: list[PosedScan] = []
+    size, before = 0, 0
+    for scan in map(_transform_scan, scans):
+        batch.append(scan)
+        size += len(scan.points)
+        if size >= BLOCK_POINTS:
+            yield _build_piece(batch, before)
+            before += sum(s.pose is not None for s in batch)
+            batch, size = [], 0
+    if batch:
+        yield _build_piece(batch, before)
+    yield Piece(np.empty((0, 3)), warnings=tuple(warnings), done=1.0)
+
+
+def _transform_scan(scan: PosedScan) -> PosedScan:
+    """The scan with its points in the fixed frame."""
+    points = np.asarray(scan.points, np.float64)
+    far = np.einsum("ij,ij->i", points, points)
+    met = np.isfinite(far) & ((far > 0) | scan.registered)
+    points, colors = (points, scan.colors) if met.all() else (points[met], None if scan.colors is None else scan.colors[met])
+    if scan.pose is not None and not scan.registered:
+        points = points @ scan.pose[:3, :3].T + scan.pose[:3, 3]
+    return PosedScan(points, scan.pose, colors, True, scan.done)
+
+
+def _build_piece(batch: list[PosedScan], before: int) -> Piece:
+    """One piece of placed scans; `before` poses were handed over already."""
+    poses = [s.pose for s in batch if s.pose is not None]
+    numbers, number = [], before
+    for scan in batch:
+        numbers.append(np.full(len(scan.points), -1 if scan.pose is None else number, np.int32))
+        number += scan.pose is not None
+    colors = None
+    if any(s.colors is not None for s in batch):
+        colors = np.concatenate([np.zeros((len(s.points), 3), np.uint8) if s.colors is None else s.colors for s in batch])
+    return Piece(
+        np.concatenate([s.points for s in batch]),
+        colors,
+        poses=np.stack(poses) if poses else None,
+        pose_of=np.concatenate(numbers) if poses or before else None,
+        done=batch[-1].done,
+    )
+
 
 FARTHEST = 5.0  # m: beyond, cameras of depth err by 5 cm and more
 SPACING_AT_4_M = 0.03  # m between points on a wall that far away
@@ -69,8 +138,8 @@ class Frame:
     done: float = 0.0
 
 
-def posed_scans(path: Path, frames: Iterable[Frame | None], said: list[str]) -> Iterator[PosedScan]:
-    """The scan of each frame; those without a pose are left out, and counted in what is said.
+def iter_posed_scans(path: Path, frames: Iterable[Frame | None], said: list[str]) -> Iterator[PosedScan]:
+    """Yield the scan of each frame; those without a pose are left out, and counted in what is said.
 
     Args:
         path: of the recording, for messages.
@@ -85,24 +154,24 @@ def posed_scans(path: Path, frames: Iterable[Frame | None], said: list[str]) -> 
         count += 1
         if frame is None or frame.pose is None or not np.isfinite(frame.pose).all():
             lost += 1
-        elif len(no_rotations(frame.pose[None])):
+        elif len(find_invalid_rotations(frame.pose[None])):
             raise InputError(f"{frame.name}: its pose is not a rotation and a place; mend it, or remove the image")
         else:
-            yield _scan(frame)
+            yield _build_scan(frame)
     if lost == count:
         raise InputError(f"{path}: none of its {count:,} depth images has a pose that can be used; give another recording")
     if lost:
         said.append(f"{lost:,} of {count:,} depth images have no pose that can be used and are left out")
 
 
-def _scan(frame: Frame) -> PosedScan:
+def _build_scan(frame: Frame) -> PosedScan:
     """The points of one frame as its camera sees them."""
     depth = read_depth(frame.depth) if isinstance(frame.depth, Path) else frame.depth
-    points, rows, columns = depth_points(frame.name, depth, frame.camera)
-    return PosedScan(points, frame.pose, _colors(frame, points, rows, columns, depth.shape), done=frame.done)
+    points, rows, columns = unproject_depth(frame.name, depth, frame.camera)
+    return PosedScan(points, frame.pose, _sample_colors(frame, points, rows, columns, depth.shape), done=frame.done)
 
 
-def depth_points(name: Path | str, depth: Array, camera: Camera) -> tuple[Array, Array, Array]:
+def unproject_depth(name: Path | str, depth: Array, camera: Camera) -> tuple[Array, Array, Array]:
     """(n, 3) points in front of a camera, m, and the rows and columns (n,) of their pixels; not every pixel becomes one.
 
     Args:
@@ -144,7 +213,7 @@ def _check_camera(name: Path | str, camera: Camera, shape: tuple[int, ...]) -> N
         raise InputError(f"{name}: has {width} x {height} pixels, and a camera of {stated} can't be its own; {camera.mend}")
 
 
-def _colors(frame: Frame, points: Array, rows: Array, columns: Array, shape: tuple[int, ...]) -> Array | None:
+def _sample_colors(frame: Frame, points: Array, rows: Array, columns: Array, shape: tuple[int, ...]) -> Array | None:
     """(n, 3) uint8 of the points; None where the colours show something else than the depth image."""
     shown = read_color(frame.color) if isinstance(frame.color, Path) else frame.color
     if shown is None:
@@ -161,7 +230,7 @@ def _colors(frame: Frame, points: Array, rows: Array, columns: Array, shape: tup
 
 
 def read_depth(path: Path) -> Array:
-    """(h, w) int32 values of a 16-bit PNG or PGM.
+    """Read (h, w) int32 values of a 16-bit PNG or PGM.
 
     Raises:
         InputError: it is none, or is cut short.
@@ -181,7 +250,7 @@ def read_color(source: Path | bytes, name: Path | str | None = None) -> Array | 
 
 
 def read_pixels(source: Path | bytes, name: Path | str) -> Array:
-    """The values of a PNG, JPEG or PGM, in a file or as bytes.
+    """Read the values of a PNG, JPEG or PGM, in a file or as bytes.
 
     Raises:
         InputError: it is none, is cut short, or absurdly large.
@@ -203,4 +272,4 @@ def read_pixels(source: Path | bytes, name: Path | str) -> Array:
     except FileNotFoundError:
         raise InputError(f"{name}: no such file, but its list names it; copy the folder again") from None
     except Exception as error:
-        raise damaged(Path(name), "a PNG, JPEG or PGM image", error) from error
+        raise build_damage_error(Path(name), "a PNG, JPEG or PGM image", error) from error

@@ -16,11 +16,18 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.options import ReadOptions
-from topomerge.io.pcd import pose, unit_quaternion
-from topomerge.io.piece import BLOCK_POINTS, Piece, bytes8, cut_short, damaged, read_head
-from topomerge.io.subprocess_reader import read_in_subprocess
-from topomerge.kernels.codecs import crc32c
+from topomerge.io.pcd import build_pose_matrix, normalize_quaternion
+from topomerge.io.piece import (
+    BLOCK_POINTS,
+    Piece,
+    ReadOptions,
+    build_damage_error,
+    build_truncation_error,
+    convert_to_uint8,
+    read_head,
+    read_in_subprocess,
+)
+from topomerge.kernels.codecs import compute_crc32c
 from topomerge.types import Array
 
 PAGES_A_TIME = 1 << 15  # checked at a time
@@ -34,7 +41,7 @@ INVALID_FIELDS = ("cartesianInvalidState", "sphericalInvalidState")
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """Blocks of the points of all scans, in the file's common frame."""
+    """Read blocks of the points of all scans, in the file's common frame."""
     if find_spec("pye57") is None:
         raise ImportError("no pye57", name="pye57")
     _check_pages(path)
@@ -51,14 +58,14 @@ def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
         headers = [file.get_header(i) for i in range(file.scan_count)]
         if not headers:
             raise InputError(f"{path}: holds no scans, only images or nothing; export it with its points")
-        poses = np.stack([_pose(h) for h in headers])
+        poses = np.stack([_read_pose(h) for h in headers])
         total = max(sum(h.point_count for h in headers), 1)
         if total > 8 * path.stat().st_size:  # points of one place take no bytes, and could be without end
-            raise damaged(path, "an E57 file", f"it promises {total:,} points, more than it has bits")
+            raise build_damage_error(path, "an E57 file", f"it promises {total:,} points, more than it has bits")
         yield Piece(np.empty((0, 3)), poses=poses)
         done = 0
         for number, header in enumerate(headers):
-            for xyz, colors, bright, count in _scan(path, file, header):
+            for xyz, colors, bright, count in _iter_scan_blocks(path, file, header):
                 done += count
                 world = xyz @ poses[number, :3, :3].T + poses[number, :3, 3]
                 pose_of = np.full(len(world), number, np.int32)
@@ -67,16 +74,16 @@ def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
         file.close()
 
 
-def _pose(header: Any) -> Array:
+def _read_pose(header: Any) -> Array:
     """(4, 4) pose of a scan; without one its points stand in the common frame already."""
     if not header.has_pose():
         return np.eye(4)
     quaternion = np.asarray(header.rotation, np.float64)
-    turn = unit_quaternion(quaternion) if quaternion.any() else np.array([1.0, 0, 0, 0])
-    return pose(turn, np.asarray(header.translation, np.float64))
+    turn = normalize_quaternion(quaternion) if quaternion.any() else np.array([1.0, 0, 0, 0])
+    return build_pose_matrix(turn, np.asarray(header.translation, np.float64))
 
 
-def _scan(path: Path, file: Any, header: Any) -> Iterator[tuple[Array, Array | None, Array | None, int]]:
+def _iter_scan_blocks(path: Path, file: Any, header: Any) -> Iterator[tuple[Array, Array | None, Array | None, int]]:
     """Blocks of one scan: points in the scanner's frame, colours, intensities, and how many rows were read."""
     fields = set(header.point_fields)
     axes = next((a for a in (CARTESIAN, SPHERICAL) if fields >= set(a)), None)
@@ -96,16 +103,16 @@ def _scan(path: Path, file: Any, header: Any) -> Iterator[tuple[Array, Array | N
             for flag in flags:
                 valid &= rows[flag] == 0
             xyz = np.stack([rows[a] for a in axes], axis=1)[valid]
-            colors = bytes8(np.stack([rows[c] for c in shades], axis=1)[valid]) if shades else None
+            colors = convert_to_uint8(np.stack([rows[c] for c in shades], axis=1)[valid]) if shades else None
             bright = rows[INTENSITY_FIELD][valid].astype(np.float32) if lights else None
-            yield (xyz if axes is CARTESIAN else _cartesian(xyz)), colors, bright, count
+            yield (xyz if axes is CARTESIAN else _convert_to_cartesian(xyz)), colors, bright, count
     finally:
         reader.close()
     if left > 0:
-        raise cut_short(path, header.point_count - left, header.point_count)
+        raise build_truncation_error(path, header.point_count - left, header.point_count)
 
 
-def _cartesian(spherical: Array) -> Array:
+def _convert_to_cartesian(spherical: Array) -> Array:
     """(n, 3) x, y, z from range, azimuth and elevation (rad)."""
     distance, azimuth, elevation = spherical.T
     flat = distance * np.cos(elevation)
@@ -120,12 +127,12 @@ def _check_pages(path: Path) -> None:
     if size < length:
         raise InputError(f"{path}: holds {size:,} of {length:,} bytes; the file is cut short, copy it again")
     if page != 1024 or length % page or length == 0 or xml + xml_length > length:
-        raise damaged(path, "an E57 file", "its header contradicts itself")
+        raise build_damage_error(path, "an E57 file", "its header contradicts itself")
     with path.open("rb") as stream:
         for first in range(0, length // page, PAGES_A_TIME):
             data = stream.read(min(PAGES_A_TIME, length // page - first) * page)
             pages = np.frombuffer(data, np.uint8).reshape(-1, page)
             stored = np.ascontiguousarray(pages[:, -4:]).view(">u4")[:, 0]
-            bad = np.flatnonzero(crc32c(pages[:, :-4]) != stored)
+            bad = np.flatnonzero(compute_crc32c(pages[:, :-4]) != stored)
             if len(bad):
-                raise damaged(path, "an E57 file", f"page {first + int(bad[0])} fails its checksum")
+                raise build_damage_error(path, "an E57 file", f"page {first + int(bad[0])} fails its checksum")

@@ -15,18 +15,19 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.las import las_node
-from topomerge.io.octree import (
+from topomerge.io.las import read_las_node
+from topomerge.io.piece import (
     LARGEST_NODE,
     MOST_LEVELS,
+    Piece,
+    ReadOptions,
+    build_damage_error,
     check_node,
-    deepest_level,
+    compute_deepest_level,
+    decode_colors,
+    decode_rows,
     load_json,
-    packed_colors,
-    packed_rows,
 )
-from topomerge.io.options import ReadOptions
-from topomerge.io.piece import Piece, damaged
 from topomerge.types import Array
 
 EPT_KIND = "an EPT point cloud"
@@ -37,7 +38,7 @@ NUMBER_KINDS = {"signed": "i", "unsigned": "u", "float": "f"}
 
 
 @dataclass(frozen=True)
-class Tiles:
+class EptLayout:
     """What `ept.json` says: how nodes are stored, what lies in a row and how its X, Y, Z become coordinates."""
 
     suffix: str
@@ -49,18 +50,18 @@ class Tiles:
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """The points of all nodes, or of those that are coarse enough for `spacing`."""
+    """Read the points of all nodes, or of those that are coarse enough for `spacing`."""
     folder = path if path.is_dir() else path.parent
-    tiles = _tiles(folder / "ept.json")
+    tiles = _read_layout(folder / "ept.json")
     done = 0
-    for key, count in _nodes(folder / "ept-hierarchy", deepest_level(tiles.spacing, options)):
+    for key, count in _iter_nodes(folder / "ept-hierarchy", compute_deepest_level(tiles.spacing, options)):
         node = folder / "ept-data" / f"{key}.{tiles.suffix}"
-        for piece in _points(node, tiles, count, options):
+        for piece in _read_node(node, tiles, count, options):
             done += len(piece.points)
             yield replace(piece, done=done / max(tiles.points, 1))
 
 
-def _tiles(file: Path) -> Tiles:
+def _read_layout(file: Path) -> EptLayout:
     values = load_json(file, EPT_KIND)
     stored = str(values.get("dataType"))
     if stored not in NODE_SUFFIXES or values.get("hierarchyType", "json") != "json":
@@ -74,13 +75,13 @@ def _tiles(file: Path) -> Tiles:
         spacing = (float(bounds[1, 0]) - float(bounds[0, 0])) / max(float(values.get("span", 128)), 1.0)
         points = int(values.get("points", 0))
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise damaged(file, EPT_KIND, f"its bounds or schema: {error}") from error
+        raise build_damage_error(file, EPT_KIND, f"its bounds or schema: {error}") from error
     if not (np.isfinite(bounds).all() and np.isfinite([scale, offset]).all() and scale.all()):
-        raise damaged(file, EPT_KIND, "its bounds, scale or offset are not finite numbers")
-    return Tiles(NODE_SUFFIXES[stored], layout, scale, offset, spacing, points)
+        raise build_damage_error(file, EPT_KIND, "its bounds, scale or offset are not finite numbers")
+    return EptLayout(NODE_SUFFIXES[stored], layout, scale, offset, spacing, points)
 
 
-def _nodes(folder: Path, deepest: int) -> Iterator[tuple[str, int]]:
+def _iter_nodes(folder: Path, deepest: int) -> Iterator[tuple[str, int]]:
     """Key and number of points of each node that has some. Files of the hierarchy are read when their turn comes."""
     pages, seen = [ROOT_KEY], {ROOT_KEY}
     while pages:
@@ -88,39 +89,39 @@ def _nodes(folder: Path, deepest: int) -> Iterator[tuple[str, int]]:
         file = folder / f"{page}.json"
         for key, count in load_json(file, EPT_KIND).items():
             if not KEY.fullmatch(key) or not isinstance(count, int) or count < -1 or int(key.split("-")[0]) > MOST_LEVELS:
-                raise damaged(file, EPT_KIND, f"the node {key[:40]!r} with {str(count)[:20]} points")
+                raise build_damage_error(file, EPT_KIND, f"the node {key[:40]!r} with {str(count)[:20]} points")
             if int(key.split("-")[0]) > deepest:
                 continue
             if count > 0:
                 yield key, count
             elif count == -1:
                 if key in seen:
-                    raise damaged(file, EPT_KIND, f"the hierarchy of {key} is named twice")
+                    raise build_damage_error(file, EPT_KIND, f"the hierarchy of {key} is named twice")
                 seen.add(key)
                 pages.append(key)
 
 
-def _points(node: Path, tiles: Tiles, count: int, options: ReadOptions) -> Iterator[Piece]:
+def _read_node(node: Path, tiles: EptLayout, count: int, options: ReadOptions) -> Iterator[Piece]:
     if tiles.suffix == "laz":
-        yield from las_node(node, count, options)
+        yield from read_las_node(node, count, options)
         return
     check_node(node)
     room = min(count * tiles.layout.itemsize, LARGEST_NODE)
     if tiles.suffix == "bin" and node.stat().st_size > room:
-        raise _too_long(node, count)
-    data = _unpacked(node, room) if tiles.suffix == "zst" else node.read_bytes()
+        raise _build_length_error(node, count)
+    data = _decompress_node(node, room) if tiles.suffix == "zst" else node.read_bytes()
     if len(data) > room:
-        raise _too_long(node, count)
-    rows = packed_rows(node, data, tiles.layout, count)
+        raise _build_length_error(node, count)
+    rows = decode_rows(node, data, tiles.layout, count)
     xyz = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    yield Piece(xyz * tiles.scale + tiles.offset, packed_colors(rows))
+    yield Piece(xyz * tiles.scale + tiles.offset, decode_colors(rows))
 
 
-def _too_long(node: Path, count: int) -> InputError:
-    return damaged(node, EPT_KIND, f"more than the {count:,} points that its hierarchy promises")
+def _build_length_error(node: Path, count: int) -> InputError:
+    return build_damage_error(node, EPT_KIND, f"more than the {count:,} points that its hierarchy promises")
 
 
-def _unpacked(node: Path, room: int) -> bytes:
+def _decompress_node(node: Path, room: int) -> bytes:
     """The bytes of a file under Zstandard, one more than there is room for at most."""
     try:
         from compression import zstd  # type: ignore[import-not-found]
@@ -134,5 +135,5 @@ def _unpacked(node: Path, room: int) -> bytes:
     try:
         data: bytes = zstd.ZstdDecompressor().decompress(node.read_bytes(), max_length=room + 1)
     except zstd.ZstdError as error:
-        raise damaged(node, EPT_KIND, error) from error
+        raise build_damage_error(node, EPT_KIND, error) from error
     return data

@@ -20,13 +20,13 @@ TURNS = {
 }
 
 
-def turn(up: str) -> Array:
-    """(3, 3) float64 rotation that brings axis `up` of the file to +z."""
+def get_axis_rotation(up: str) -> Array:
+    """Return (3, 3) float64 rotation that brings axis `up` of the file to +z."""
     return np.array(TURNS[up], np.float64)
 
 
-def place_points(points: Array, rotation: Array, factor: float) -> Array:
-    """(n, 3) float64 points in metres, z up."""
+def transform_points(points: Array, rotation: Array, factor: float) -> Array:
+    """Return (n, 3) float64 points in metres, z up."""
     with np.errstate(over="ignore", invalid="ignore"):
         scaled = np.asarray(points, np.float64) * factor
         if np.array_equal(rotation, np.eye(3)):
@@ -36,16 +36,16 @@ def place_points(points: Array, rotation: Array, factor: float) -> Array:
         return scaled[:, axes] * rotation.sum(axis=1)
 
 
-def place_poses(poses: Array, rotation: Array, factor: float) -> Array:
-    """(K, 4, 4) float64 sensor poses in the placed frame."""
+def transform_poses(poses: Array, rotation: Array, factor: float) -> Array:
+    """Return (K, 4, 4) float64 sensor poses in the placed frame."""
     placed = np.array(poses, np.float64)
     placed[:, :3, :3] = rotation @ placed[:, :3, :3]
     placed[:, :3, 3] = factor * placed[:, :3, 3] @ rotation.T
     return placed
 
 
-def place_grid(grid: VoxelGrid, rotation: Array, factor: float) -> VoxelGrid:
-    """The same cells in the placed frame; a turn by right angles keeps cells cells."""
+def transform_grid(grid: VoxelGrid, rotation: Array, factor: float) -> VoxelGrid:
+    """Return the same cells in the placed frame; a turn by right angles keeps cells cells."""
     axes, signs = np.abs(rotation).argmax(axis=1), rotation.sum(axis=1)
     cells, shape = grid.cells[:, axes], np.asarray(grid.shape)[axes]
     low, high = grid.bounds
@@ -55,15 +55,15 @@ def place_grid(grid: VoxelGrid, rotation: Array, factor: float) -> VoxelGrid:
     return VoxelGrid.from_cells(cells, origin, grid.edge * factor, (nx, ny, nz), grid.properties)
 
 
-def place_rooms(rooms: tuple[TrueRoom, ...], factor: float) -> tuple[TrueRoom, ...]:
-    """True rooms in metres. Formats that know rooms have z up, so nothing is turned."""
+def scale_rooms(rooms: tuple[TrueRoom, ...], factor: float) -> tuple[TrueRoom, ...]:
+    """Return true rooms in metres. Formats that know rooms have z up, so nothing is turned."""
     if factor == 1.0:
         return rooms
     return tuple(TrueRoom(r.name, r.polygon * factor, r.floor * factor, r.ceiling * factor, r.storey, r.kind) for r in rooms)
 
 
 def choose_shift(points: Array) -> Array:
-    """(3,) float64 shift for finite points (n, 3): zero near the origin, else their middle in whole 100 m.
+    """Choose (3,) float64 shift for finite points (n, 3): zero near the origin, else their middle in whole 100 m.
 
     The median, not the first point: one stray first point must not cost all the others their precision.
     """

@@ -1,11 +1,4 @@
-"""Floor plans from robots: a ROS map_server yaml with its image, or a plain image with a resolution.
-
-Occupied pixels beside others become walls, free pixels a floor at z = 0. Unknown pixels give nothing, nor does the inside of a
-solid area: a sensor sees surfaces, and many plans are black all around the building. The frame is map_server's: x right and y
-up from the lower left corner of the image, turned by the yaw of the origin and moved to it. In a picture of three values the grey
-of unknown is unknown whatever the threshold says (`grey_levels`).
-Source: http://wiki.ros.org/map_server (values, thresholds and modes).
-"""
+"""Read floor plans and robot grids; warn of what is doubtful in them."""
 
 from __future__ import annotations
 
@@ -21,11 +14,175 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.errors import InputError
-from topomerge.io.grey_levels import find_grey_levels, is_clear_cut, surrounds
-from topomerge.io.grid_doubts import doubt_outside, is_inverted
-from topomerge.io.options import ReadOptions
-from topomerge.io.piece import BLOCK_POINTS, MOST_POINTS, Piece, damaged, refuse_pointer, too_many
+from topomerge.io.piece import (
+    BLOCK_POINTS,
+    MOST_POINTS,
+    Piece,
+    ReadOptions,
+    build_count_error,
+    build_damage_error,
+    refuse_pointer,
+)
 from topomerge.types import Array
+
+JUDGED_FLOOR = 4.0  # m2 of floor below which nothing is judged
+OUTSIDE_SHARE = 1 / 3  # of the floor: more outside of every wall is suspicious; of real maps that are read rightly up to .26 is
+FEW_WALLS = 4  # of 8 directions in which a place outside of the walls meets one, at most
+PIXELS_LOOKED_AT = 4_000_000  # of a larger picture every second, third ... pixel
+BODY_RADIUS = 0.25  # m; floor where no body fits is no floor but the lines of walls
+NARROW, WIDE = 0.1, 0.3  # of the pixels of walls, at most, and of floor, at least, that lie deeper than that in what is like them
+
+
+def is_inverted(occupied: Array, free: Array, resolution: float) -> bool:
+    """Return whether the floor is as narrow as the lines of walls, and the walls as wide as a floor.
+
+    Args:
+        occupied, free: (h, w) bool.
+        resolution: m a pixel.
+    """
+    if occupied.sum() <= free.sum() or not free.any():  # there is more floor than walls
+        return False
+    step = max(1, math.ceil(math.sqrt(occupied.size / PIXELS_LOOKED_AT)))
+    occupied, free, resolution = occupied[::step, ::step], free[::step, ::step], resolution * step
+    if not (occupied.any() and free.any()):
+        return False
+    return _measure_deep_share(free, resolution) <= NARROW and _measure_deep_share(occupied, resolution) >= WIDE
+
+
+def _measure_deep_share(mask: Array, resolution: float) -> float:
+    """Share of the pixels of a mask (h, w) that lie deeper in it than `BODY_RADIUS`."""
+    inside = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1][mask]
+    return float((inside * resolution > BODY_RADIUS).mean())
+
+
+def check_outside_floor(occupied: Array, free: Array, resolution: float) -> list[str]:
+    """Check for a floor of which much lies outside of every wall.
+
+    Args:
+        occupied, free: (h, w) bool.
+        resolution: m a pixel.
+    """
+    if free.sum() * resolution**2 < JUDGED_FLOOR or not occupied.any():
+        return []
+    share = measure_outside_share(occupied, free)
+    return [f"{share:.0%} of the floor lies outside of every wall"] if share > OUTSIDE_SHARE else []
+
+
+def measure_outside_share(occupied: Array, free: Array) -> float:
+    """Share of the floor from which at most `FEW_WALLS` of 8 directions meet a wall before the border of the picture.
+
+    Args:
+        occupied, free: (h, w) bool.
+    """
+    step = max(1, math.ceil(math.sqrt(occupied.size / PIXELS_LOOKED_AT)))
+    if step > 1:  # no wall may be lost, or it would not enclose anything
+        padded = np.pad(occupied, [(0, -side % step) for side in occupied.shape])
+        rows, columns = padded.shape
+        occupied = np.logical_or.reduce(padded.reshape(rows // step, step, columns // step, step), axis=(1, 3))
+        free = free[::step, ::step] & ~occupied
+    met = np.zeros(free.shape, np.uint8)
+    for back in (1, -1):
+        met[:, ::back] += np.logical_or.accumulate(occupied[:, ::back], axis=1)
+        met[::back] += np.logical_or.accumulate(occupied[::back], axis=0)
+        for aside in (1, -1):
+            _add_diagonal(met[::back, ::aside], occupied[::back, ::aside])
+    return float((met[free] <= FEW_WALLS).mean()) if free.any() else 0.0
+
+
+def _add_diagonal(met: Array, occupied: Array) -> None:
+    """Add 1 to the pixels (h, w) that meet an occupied one towards the upper left."""
+    reached = np.zeros(occupied.shape[1] + 1, bool)
+    for row, walls in zip(met, occupied, strict=True):
+        reached[1:] = reached[:-1] | walls
+        reached[0] = False
+        row += reached[1:]
+
+
+SPREAD = 12  # levels of 255 to either side of a grey: so far noise carries most of its pixels
+APART = 20  # levels of 255, at least, from the grey of unknown to that of floor
+NEAR_TWO_GREYS = 0.9  # of the pixels of all but the commonest grey: of real maps of three values .9 to 1 lie around the second
+NEAR_TWO_GREYS_JPEG = 0.7  # likewise; its noise carries pixels further
+BETWEEN = 0.2  # pixels between the two greys for each one of noise around that of unknown, at most, where the two are clear cut
+USUAL_UNKNOWN, USUAL_WITHIN = 205, 4  # levels of 255: the grey of unknown of ROS, and how far pictures saved again are from it
+
+
+@dataclass(frozen=True)
+class GreyLevels:
+    """The greys of unknown and of floor in a map, from 0 (wall) to 255 (free)."""
+
+    unknown: int
+    floor: int
+
+    @property
+    def middle(self) -> float:
+        """Lighter pixels are nearer to the grey of floor."""
+        return (self.unknown + self.floor) / 2
+
+    @property
+    def threshold(self) -> float:
+        """The `free_thresh` that parts them: a share of 0..1."""
+        return 1.0 - self.middle / 255.0
+
+
+def find_grey_levels(levels: Array, lossy: bool) -> GreyLevels | None:
+    """Find the greys of unknown and of floor, where nearly all pixels that are no walls lie around two greys; else None.
+
+    Args:
+        levels: (n,) uint8, the pixels that are neither walls nor transparent; 255 is certainly free.
+        lossy: was the picture saved as JPEG?
+    """
+    counts = np.bincount(levels, minlength=256).astype(np.float64)
+    first = _find_mode(counts)
+    others = counts.copy()
+    others[_get_level_window(first)] = 0
+    if not others.any():
+        return None
+    second = _find_mode(others)
+    near = others[_get_level_window(second)].sum() / others.sum()
+    if near < (NEAR_TWO_GREYS_JPEG if lossy else NEAR_TWO_GREYS) or abs(first - second) < APART:
+        return None
+    return GreyLevels(min(first, second), max(first, second))
+
+
+def is_clear_cut(grey: GreyLevels, levels: Array) -> bool:
+    """Return whether hardly any pixels are between the noise around the greys of unknown and of floor.
+
+    Args:
+        grey: of the picture.
+        levels: (n,) uint8, of the pixels that count as floor.
+    """
+    noise = (levels <= grey.unknown + SPREAD).sum()
+    between = (levels > grey.unknown + SPREAD) & (levels < grey.floor - SPREAD)
+    return bool(between.sum() <= BETWEEN * noise)
+
+
+def is_unknown_grey(grey: GreyLevels, levels: Array, counted: Array) -> bool:
+    """Return whether the grey of unknown is that of ROS, or the commoner one along the border of the picture.
+
+    Args:
+        grey: of the picture.
+        levels: (h, w) uint8.
+        counted: (h, w) bool, the pixels that are neither walls nor transparent.
+    """
+    if abs(grey.unknown - USUAL_UNKNOWN) <= USUAL_WITHIN:
+        return True
+    inner = np.zeros(levels.shape, bool)
+    inner[1:-1, 1:-1] = True
+    border = levels[counted & ~inner]
+    return bool((border < grey.middle).sum() > (border >= grey.middle).sum())
+
+
+def _get_level_window(level: int) -> slice:
+    return slice(max(level - SPREAD, 0), level + SPREAD + 1)
+
+
+def _find_mode(counts: Array) -> int:
+    """The grey with the most pixels around it."""
+    sums = np.convolve(counts, np.ones(2 * SPREAD + 1), "same")
+    near = _get_level_window(int(sums.argmax()))
+    smooth = np.convolve(counts, (1, 2, 3, 2, 1), "same")
+    return near.start + int(smooth[near].argmax())
+
 
 PIXELS = 100_000_000  # more is refused
 LARGEST_YAML = 1 << 20  # bytes
@@ -53,7 +210,7 @@ class Plan:
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """Floor points, then walls layer by layer, in metres."""
+    """Read floor points, then walls layer by layer, in metres."""
     if path.suffix.lower() in (".yaml", ".yml"):
         plan = read_yaml(path)
         if options.resolution is not None:
@@ -71,7 +228,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
 
 
 def read_yaml(path: Path) -> Plan:
-    """A map_server file.
+    """Read a map_server file.
 
     Raises:
         InputError: it is not one, a value can't be used, or its image is missing.
@@ -85,29 +242,32 @@ def read_yaml(path: Path) -> Plan:
     except (UnicodeDecodeError, yaml.reader.ReaderError) as error:
         raise InputError(f"{path}: is no text; give the yaml that names the image") from error
     except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise damaged(path, "a map_server file", getattr(error, "problem", None) or error) from error
+        raise build_damage_error(path, "a map_server file", getattr(error, "problem", None) or error) from error
     if not isinstance(values, dict) or "image" not in values or "resolution" not in values:
         raise InputError(f"{path}: is not a map_server file (no image and resolution); give the yaml that names the image")
     if not isinstance(values["image"], str) or not isinstance(values.get("mode", ""), str):
-        shown = f"{_shown(values['image'])}, {_shown(values.get('mode'))}"
+        shown = f"{_shorten_value(values['image'])}, {_shorten_value(values.get('mode'))}"
         raise InputError(f"{path}: image and mode are names, not {shown}; mend it")
     image, said = _find_image(path, values["image"].strip())
-    resolution = _number(path, values, "resolution", None)
+    resolution = _read_number(path, values, "resolution", None)
     origin = values.get("origin", [0.0, 0.0, 0.0])
     if not isinstance(origin, list) or len(origin) < 2:
-        raise InputError(f"{path}: origin is {_shown(origin)}; it is a list of x, y and yaw")
-    x, y = (_number(path, {"origin": v}, "origin", None) for v in origin[:2])
+        raise InputError(f"{path}: origin is {_shorten_value(origin)}; it is a list of x, y and yaw")
+    x, y = (_read_number(path, {"origin": v}, "origin", None) for v in origin[:2])
     yaw = 0.0
     if len(origin) > 2 and _is_nan(origin[2]):  # map_saver writes that for a quaternion of zeros
-        said = (*said, f"{path.name}: the yaw of its origin is {_shown(origin[2])} and was read as 0; write 0 in its place")
+        said = (
+            *said,
+            f"{path.name}: the yaw of its origin is {_shorten_value(origin[2])} and was read as 0; write 0 in its place",
+        )
     elif len(origin) > 2:
-        yaw = _number(path, {"origin": origin[2]}, "origin", None)
+        yaw = _read_number(path, {"origin": origin[2]}, "origin", None)
     mode = values.get("mode", "trinary").lower()
     negate = values.get("negate", 0)
     if mode not in MODES or negate not in (0, 1) or not resolution > 0:
-        wrong = f"mode {_shown(mode)}, negate {_shown(negate)} or resolution {resolution:g}"
+        wrong = f"mode {_shorten_value(mode)}, negate {_shorten_value(negate)} or resolution {resolution:g}"
         raise InputError(f"{path}: {wrong} can't be used; mode is one of {', '.join(MODES)}, negate 0 or 1, resolution above 0")
-    thresholds = (_number(path, values, *known) for known in (("occupied_thresh", 0.65), ("free_thresh", 0.196)))
+    thresholds = (_read_number(path, values, *known) for known in (("occupied_thresh", 0.65), ("free_thresh", 0.196)))
     occupied, free = (min(max(value, -1.0), 2.0) for value in thresholds)  # beyond 0 to 1 all are alike
     return Plan(image, resolution, (x, y, yaw), bool(negate), occupied, free, mode, said)
 
@@ -120,17 +280,17 @@ def _is_nan(value: object) -> bool:
         return False
 
 
-def _number(path: Path, values: dict[str, Any], key: str, default: float | None) -> float:
+def _read_number(path: Path, values: dict[str, Any], key: str, default: float | None) -> float:
     try:
         value = float(values.get(key, math.nan if default is None else default))
     except (TypeError, ValueError):
         value = math.nan
     if not math.isfinite(value):
-        raise InputError(f"{path}: {key} is {_shown(values.get(key))} instead of a number; mend it")
+        raise InputError(f"{path}: {key} is {_shorten_value(values.get(key))} instead of a number; mend it")
     return value
 
 
-def _shown(value: object) -> str:
+def _shorten_value(value: object) -> str:
     """What stands in a file, not longer than fits into a message: aliases can make a list of a few bytes endless."""
     short = reprlib.Repr()
     short.maxlevel = short.maxlist = short.maxdict = 2
@@ -152,7 +312,7 @@ def _find_image(path: Path, name: str) -> tuple[Path, tuple[str, ...]]:
 
 
 def read_image(path: Path) -> tuple[Array, Array]:
-    """Brightness (h, w) in 0..1 and whether each pixel is transparent.
+    """Read brightness (h, w) in 0..1 and whether each pixel is transparent.
 
     Raises:
         InputError: not an image, or a huge one.
@@ -180,7 +340,7 @@ def read_image(path: Path) -> tuple[Array, Array]:
     except UnidentifiedImageError as error:
         raise InputError(f"{path}: is not an image of {', '.join(IMAGE_FORMATS)}; save it as PNG") from error
     except (OSError, SyntaxError, ValueError, EOFError) as error:
-        raise damaged(path, "an image", error if str(error) else "cut short") from error
+        raise build_damage_error(path, "an image", error if str(error) else "cut short") from error
     clear = rgba[..., 3] == 0 if kind == "RGBA" else np.zeros(rgba.shape[:2], bool)
     bright = rgba.astype(np.float32) if kind == "L" else rgba[..., :3].mean(axis=2, dtype=np.float32)
     bright /= 255.0
@@ -188,7 +348,7 @@ def read_image(path: Path) -> tuple[Array, Array]:
 
 
 def read_pixels(path: Path, plan: Plan) -> tuple[Array, Array, tuple[str, ...]]:
-    """(h, w) bool occupied and free pixels of the image of a plan, and what is doubtful about them.
+    """Read (h, w) bool occupied and free pixels of the image of a plan, and what is doubtful about them.
 
     Args:
         path: what the user named: the yaml, or the image itself.
@@ -204,7 +364,7 @@ def read_pixels(path: Path, plan: Plan) -> tuple[Array, Array, tuple[str, ...]]:
         raise InputError(f"{path}: {wrong}; is free space white and are walls black? mend thresholds, negate or mode")
     doubts: list[str] = []
     if plan.mode == "trinary":
-        free, said = _without_unknown(path, image, plan, occupied, free)
+        free, said = _remove_unknown(path, image, plan, occupied, free)
         doubts += [said] if said else []
     if is_inverted(occupied, free, plan.resolution):
         advice = (
@@ -212,13 +372,13 @@ def read_pixels(path: Path, plan: Plan) -> tuple[Array, Array, tuple[str, ...]]:
         )
         wall = f"{occupied.mean():.0%} of the picture counts as wall"
         doubts.append(f"{plan.image.name}: {wall}; are its colours inverted? {advice}")
-    for doubt in doubt_outside(occupied, free, plan.resolution):
+    for doubt in check_outside_floor(occupied, free, plan.resolution):
         advice = "if nobody saw it, lower free_thresh below its grey, or paint it in the grey of unknown (205)"
         doubts.append(f"{plan.image.name}: {doubt}; {advice}")
     return occupied, free, tuple(doubts)
 
 
-def _without_unknown(path: Path, image: tuple[Array, Array], plan: Plan, occupied: Array, free: Array) -> tuple[Array, str]:
+def _remove_unknown(path: Path, image: tuple[Array, Array], plan: Plan, occupied: Array, free: Array) -> tuple[Array, str]:
     """The free pixels without those that are unknown by their grey, and the warning about them, "" for none."""
     bright, clear = image
     counted = ~(occupied | clear | np.isnan(bright))
@@ -230,7 +390,7 @@ def _without_unknown(path: Path, image: tuple[Array, Array], plan: Plan, occupie
     if grey is None or grey.threshold >= plan.free:
         return free, ""
     is_floor = bool((free & (levels == grey.unknown)).any())
-    if is_floor and not surrounds(grey, levels, counted):
+    if is_floor and not is_unknown_grey(grey, levels, counted):
         return free, ""
     known = free & (levels > grey.middle)
     noise = 1.0 - known.sum() / max(int(free.sum()), 1)
@@ -257,7 +417,7 @@ def classify(image: tuple[Array, Array], plan: Plan) -> tuple[Array, Array]:
 
 
 def extrude(path: Path, occupied: Array, free: Array, plan: Plan, options: ReadOptions) -> Iterator[Piece]:
-    """Floor, walls and, if asked for, ceiling."""
+    """Yield floor, walls and, if asked for, ceiling."""
     spacing = (options.spacing or plan.resolution * options.factor) / options.factor
     height = options.extrude / options.factor
     parts = max(1, math.ceil(plan.resolution / spacing - 1e-6))  # points a pixel along each axis
@@ -266,23 +426,23 @@ def extrude(path: Path, occupied: Array, free: Array, plan: Plan, options: ReadO
     walls, floor = int(occupied.sum()), int(free.sum())
     total = parts**2 * (walls * float(len(levels)) + floor * (1 + options.ceiling))
     if total > MOST_POINTS:
-        raise too_many(path, total, spacing * options.factor)
-    ground, high = _pixels(free), _pixels(occupied)
+        raise build_count_error(path, total, spacing * options.factor)
+    ground, high = _flatten_mask(free), _flatten_mask(occupied)
     layers = [(ground, 0.0)] + [(high, z) for z in levels] + ([(ground, height)] if options.ceiling else [])
     for number, (pixels, z) in enumerate(layers):
-        for points in _layer(pixels, free.shape, plan, parts):
+        for points in _iter_point_blocks(pixels, free.shape, plan, parts):
             flat = np.column_stack([points, np.full(len(points), z)])
             yield Piece(flat, done=0.1 + 0.9 * (number + 1) / len(layers))
 
 
-def _pixels(mask: Array) -> Array:
+def _flatten_mask(mask: Array) -> Array:
     """(n,) int32 numbers of the masked pixels, row after row."""
     step = max(1, BLOCK_POINTS // mask.shape[1])  # rows at a time: NumPy's numbers take 8 bytes each
     starts = range(0, len(mask), step)
     return np.concatenate([(np.flatnonzero(mask[i : i + step]) + i * mask.shape[1]).astype(np.int32) for i in starts])
 
 
-def _layer(pixels: Array, shape: tuple[int, ...], plan: Plan, parts: int) -> Iterator[Array]:
+def _iter_point_blocks(pixels: Array, shape: tuple[int, ...], plan: Plan, parts: int) -> Iterator[Array]:
     """Blocks (n, 2) of metric points of pixels, parts² a pixel, at the centres of its parts."""
     inner = (np.arange(parts) + 0.5) / parts
     dx, dy = (d.ravel() for d in np.meshgrid(inner, inner))

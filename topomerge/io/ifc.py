@@ -1,26 +1,86 @@
-"""IFC building models: elements sampled by area, spaces kept as the true rooms.
-
-Door leaves are left out unless asked for: a leaf is modelled shut, and doors are walked through. ifcopenshell brings every
-model into metres with z up.
-"""
+"""Read building models (IFC)."""
 
 from __future__ import annotations
 
 import os
+import re
+from array import array
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from topomerge.errors import InputError
 from topomerge.io.mesh import sample
-from topomerge.io.options import ReadOptions
-from topomerge.io.piece import Piece, damaged
-from topomerge.io.step import check_references
-from topomerge.io.subprocess_reader import read_in_subprocess
+from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_in_subprocess
 from topomerge.types import Array, TrueRoom
+
+NOT_SAID = re.compile(rb"'[^']*'|/\*.*?\*/", re.DOTALL)  # strings and comments
+STATEMENT = re.compile(rb"#(\d+)\s*=\s*([^;]*)")
+ENTITY_REFERENCE = re.compile(rb"#(\d+)")
+DEEPEST = 5000  # references one behind the other; models of buildings have 15
+# The two sides of a wall name each other (CorrespondingBoundary): the schema's one circle, which no geometry follows.
+PAIRED = re.compile(rb"IFCRELSPACEBOUNDARY2NDLEVEL\s*\(", re.IGNORECASE)
+
+
+def check_references(path: Path) -> None:
+    """Refuse a file whose entities refer to themselves, directly or around, or too deep.
+
+    Raises:
+        InputError: it does.
+    """
+    owners, targets, count = parse_references(path.read_bytes())
+    graph = csr_array((np.ones(len(owners), np.int8), (owners, targets)), shape=(count, count))
+    _, circle = connected_components(graph, directed=True, connection="strong")
+    in_circle = np.bincount(circle)[circle] > 1 if count else np.zeros(0, bool)
+    in_circle[owners[owners == targets]] = True
+    if in_circle.any():
+        raise build_damage_error(
+            path, "an IFC model", f"{in_circle.sum():,} entities refer to themselves, directly or in a circle"
+        )
+    deeper = _count_deep_entities(owners, targets, count)
+    if deeper:
+        raise build_damage_error(path, "an IFC model", f"{deeper:,} entities are nested deeper than {DEEPEST:,}")
+
+
+def _count_deep_entities(owners: Array, targets: Array, count: int) -> int:
+    """Number of entities with more than DEEPEST references one behind the other below them."""
+    waiting = np.bincount(owners, minlength=count)
+    order = np.argsort(targets, kind="stable")
+    ends = np.searchsorted(targets[order], np.arange(count + 1))
+    free, left = np.flatnonzero(waiting == 0), count
+    for _ in range(DEEPEST):  # in each round goes what refers to nothing that is left
+        left -= len(free)
+        if not len(free):
+            break
+        edges = np.concatenate([order[ends[i] : ends[i + 1]] for i in free])
+        freed, times = np.unique(owners[edges], return_counts=True)
+        waiting[freed] -= times
+        free = freed[waiting[freed] == 0]
+    return left
+
+
+def parse_references(text: bytes) -> tuple[Array, Array, int]:
+    """Parse (m,) rows that refer, (m,) rows that they refer to, and the number of entities.
+
+    What does not exist is left out, and what boundaries of spaces say of each other.
+    """
+    text = NOT_SAID.sub(b"", text)
+    statements = [(match[1], match[2]) for match in STATEMENT.finditer(text)]
+    row = {name: i for i, (name, _) in enumerate(statements)}
+    paired = {name for name, said in statements if PAIRED.match(said)}
+    owners, targets = array("q"), array("q")
+    for name, said in statements:
+        left_out = paired if name in paired else ()
+        existing = [row[other] for other in ENTITY_REFERENCE.findall(said) if other in row and other not in left_out]
+        owners.extend([row[name]] * len(existing))
+        targets.extend(existing)
+    return np.array(owners, np.int64), np.array(targets, np.int64), len(statements)
+
 
 # What has a shape but is not built, or is cut out of something else.
 NOT_BUILT = ("IfcSpace", "IfcFeatureElement", "IfcSite", "IfcAnnotation", "IfcGrid", "IfcVirtualElement", "IfcSpatialZone")
@@ -32,7 +92,7 @@ WELD = 1e-3  # m, corners closer than this are one
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """The true rooms, then points on every built element, in the order of their ids.
+    """Read the true rooms, then points on every built element, in the order of their ids.
 
     The library is in a process of its own: a reference to an entity of another kind can make it break down.
     """
@@ -50,16 +110,16 @@ def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
     try:
         model = ifcopenshell.open(str(path))
     except ifcopenshell.Error as error:
-        raise damaged(path, "an IFC model", error) from error
+        raise build_damage_error(path, "an IFC model", error) from error
     if not all(line.Points for line in model.by_type("IfcPolyline")):  # the library divides by their number
-        raise damaged(path, "an IFC model", "a line without points")
+        raise build_damage_error(path, "an IFC model", "a line without points")
     built = [p for p in model.by_type("IfcProduct") if p.Representation and _is_built(p, options.doors)]
     if not built:
         raise InputError(f"{path}: has no building elements with a shape; export it with its geometry")
-    spaces = _spaces(model)
-    yield Piece(np.empty((0, 3)), rooms=_rooms(spaces), done=0.05)
+    spaces = _read_spaces(model)
+    yield Piece(np.empty((0, 3)), rooms=_build_rooms(spaces), done=0.05)
     shapes: dict[int, tuple[Array, Array]] = {}
-    for number, (element, vertices, faces) in enumerate(_shapes(model, built)):
+    for number, (element, vertices, faces) in enumerate(_iter_shapes(model, built)):
         shapes[element] = vertices, faces
         if number % 50 == 0:
             yield Piece(np.empty((0, 3)), done=0.05 + 0.75 * number / len(built))
@@ -71,7 +131,7 @@ def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
         for piece in sample(path, vertices, faces, options, first=first):
             yield Piece(piece.points, done=0.9)
         first += len(faces)
-    yield from _missing_floors(path, spaces, list(shapes.values()), options, first)
+    yield from _sample_missing_floors(path, spaces, list(shapes.values()), options, first)
     lost = len(built) - len(shapes)
     if lost:
         yield Piece(np.empty((0, 3)), warnings=(f"{lost} of {len(built)} elements have no usable shape",), done=1.0)
@@ -94,19 +154,19 @@ def _is_built(product: Any, doors: bool) -> bool:
     return not any(product.is_a(kind) for kind in left_out)
 
 
-def _shapes(model: Any, products: list[Any]) -> Iterator[tuple[int, Array, Array]]:
+def _iter_shapes(model: Any, products: list[Any]) -> Iterator[tuple[int, Array, Array]]:
     """(id, vertices (n, 3), faces (m, 3)) of products, in metres in the model's frame.
 
     Flat bodies are made by the fast one of the library's two kernels, all others, and those in which it fails, by the slow one.
     """
     left = {p.id() for p in products}
     for kernel in GEOMETRY_KERNELS:
-        for element, vertices, faces in _shapes_by(model, [p for p in products if p.id() in left], kernel):
+        for element, vertices, faces in _iter_shapes_by_kernel(model, [p for p in products if p.id() in left], kernel):
             left.discard(element)
             yield element, vertices, faces
 
 
-def _shapes_by(model: Any, products: list[Any], kernel: Any) -> Iterator[tuple[int, Array, Array]]:
+def _iter_shapes_by_kernel(model: Any, products: list[Any], kernel: Any) -> Iterator[tuple[int, Array, Array]]:
     """The same by one kernel; what it cannot make is left out."""
     import ifcopenshell.geom
 
@@ -129,20 +189,20 @@ def _shapes_by(model: Any, products: list[Any], kernel: Any) -> Iterator[tuple[i
             return
 
 
-def _spaces(model: Any) -> list[tuple[Any, Array, Array]]:
+def _read_spaces(model: Any) -> list[tuple[Any, Array, Array]]:
     """(space, vertices, faces) of every space with a shape, in the order of their ids."""
     spaces = {s.id(): s for s in model.by_type("IfcSpace") if s.Representation}
-    shapes = sorted(_shapes(model, list(spaces.values())), key=lambda s: s[0])
+    shapes = sorted(_iter_shapes(model, list(spaces.values())), key=lambda s: s[0])
     return [(spaces[element], vertices, faces) for element, vertices, faces in shapes]
 
 
-def _missing_floors(
+def _sample_missing_floors(
     path: Path, spaces: list[tuple[Any, Array, Array]], shapes: list[tuple[Array, Array]], options: ReadOptions, first: int
 ) -> Iterator[Piece]:
     """Floors of spaces on a level that has no slab: some models hold walls and ceilings only, and nobody could stand in them."""
-    slabs = np.concatenate([_level_areas(v, f, _flat(v, f)) for v, f in shapes])
-    lows = [_low(v, f) for _, v, f in spaces]
-    floors = [_level_areas(v, f, low) for (_, v, f), low in zip(spaces, lows, strict=True)]
+    slabs = np.concatenate([_measure_level_areas(v, f, _find_level_faces(v, f)) for v, f in shapes])
+    lows = [_find_floor_faces(v, f) for _, v, f in spaces]
+    floors = [_measure_level_areas(v, f, low) for (_, v, f), low in zip(spaces, lows, strict=True)]
     levels = np.round([v[:, 2].min() for _, v, _ in spaces], 1)
     added = 0
     for level in np.unique(levels):
@@ -162,33 +222,33 @@ def _missing_floors(
         yield Piece(np.empty((0, 3)), warnings=(said,), done=0.95)
 
 
-def _level_areas(vertices: Array, faces: Array, which: Array) -> Array:
+def _measure_level_areas(vertices: Array, faces: Array, which: Array) -> Array:
     """(k, 2) height (m) and area (m2) of the faces chosen."""
     a, b, c = (vertices[faces[which, i]] for i in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return np.column_stack([(a + b + c)[:, 2] / 3, area])
 
 
-def _flat(vertices: Array, faces: Array) -> Array:
+def _find_level_faces(vertices: Array, faces: Array) -> Array:
     """(m,) bool: is the face rather level than steep?"""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
     return np.abs(normals[:, 2]) > 0.7 * np.linalg.norm(normals, axis=1)
 
 
-def _low(vertices: Array, faces: Array) -> Array:
+def _find_floor_faces(vertices: Array, faces: Array) -> Array:
     """(m,) bool: level faces in the lowest quarter of a body, its floor."""
     low, high = vertices[:, 2].min(), vertices[:, 2].max()
-    return _flat(vertices, faces) & (vertices[faces][:, :, 2].mean(axis=1) < low + (high - low) / 4)
+    return _find_level_faces(vertices, faces) & (vertices[faces][:, :, 2].mean(axis=1) < low + (high - low) / 4)
 
 
-def _rooms(spaces: list[tuple[Any, Array, Array]]) -> tuple[TrueRoom, ...]:
+def _build_rooms(spaces: list[tuple[Any, Array, Array]]) -> tuple[TrueRoom, ...]:
     """Every space with a shape, in the order of its storey and name."""
     outlined = []
     for space, vertices, faces in spaces:
         floor, ceiling = float(vertices[:, 2].min()), float(vertices[:, 2].max())
-        outlined.append((space, outline(vertices, faces), floor, ceiling))
-    storeys = _storeys([(_storey_of(space), floor) for space, _, floor, _ in outlined])
+        outlined.append((space, trace_outline(vertices, faces), floor, ceiling))
+    storeys = _number_storeys([(_find_storey_id(space), floor) for space, _, floor, _ in outlined])
     rooms = [
         TrueRoom(str(space.Name or ""), polygon, floor, ceiling, storey, str(space.LongName or ""))
         for (space, polygon, floor, ceiling), storey in zip(outlined, storeys, strict=True)
@@ -197,7 +257,7 @@ def _rooms(spaces: list[tuple[Any, Array, Array]]) -> tuple[TrueRoom, ...]:
     return tuple(sorted(rooms, key=lambda r: (r.storey, r.name, r.floor, *r.polygon[0])))
 
 
-def _storey_of(space: Any) -> int:
+def _find_storey_id(space: Any) -> int:
     """Id of the IfcBuildingStorey that a space belongs to, 0 where it belongs to none."""
     parent = space
     while parent is not None and not parent.is_a("IfcBuildingStorey"):
@@ -205,7 +265,7 @@ def _storey_of(space: Any) -> int:
     return 0 if parent is None else int(parent.id())
 
 
-def _storeys(spaces: list[tuple[int, float]]) -> list[int]:
+def _number_storeys(spaces: list[tuple[int, float]]) -> list[int]:
     """Number of the storey of each (storey id, floor height), the lowest storey with spaces being 0."""
     heights: dict[int, list[float]] = {}
     for storey, floor in spaces:
@@ -215,8 +275,8 @@ def _storeys(spaces: list[tuple[int, float]]) -> list[int]:
     return [number[storey] for storey, _ in spaces]
 
 
-def outline(vertices: Array, faces: Array) -> Array:
-    """(k, 2) float64 outline of a body's floor, counter-clockwise, without its holes.
+def trace_outline(vertices: Array, faces: Array) -> Array:
+    """Trace (k, 2) float64 outline of a body's floor, counter-clockwise, without its holes.
 
     The floor is made of the flat faces in the lowest quarter; where they enclose nothing, the convex hull stands in.
     """
@@ -225,14 +285,14 @@ def outline(vertices: Array, faces: Array) -> Array:
     triangles = index.reshape(-1)[faces]
     a, b, c = (points[triangles[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
-    floor = _low(points, triangles)
+    floor = _find_floor_faces(points, triangles)
     turned = np.where(normals[floor, 2:] < 0, triangles[floor][:, ::-1], triangles[floor])  # all seen from above
-    loops = [points[loop, :2] for loop in _loops(turned)]
-    best = max(loops, key=area, default=np.empty((0, 2)))
-    return best if area(best) > 0.01 else _hull(points[:, :2])
+    loops = [points[loop, :2] for loop in _find_boundary_loops(turned)]
+    best = max(loops, key=compute_signed_area, default=np.empty((0, 2)))
+    return best if compute_signed_area(best) > 0.01 else _compute_hull(points[:, :2])
 
 
-def _loops(triangles: Array) -> list[list[int]]:
+def _find_boundary_loops(triangles: Array) -> list[list[int]]:
     """Closed chains of the edges that only one of the triangles has."""
     edges = {(int(t[i]), int(t[(i + 1) % 3])) for t in triangles for i in range(3)}
     after: dict[int, list[int]] = {}
@@ -254,13 +314,13 @@ def _loops(triangles: Array) -> list[list[int]]:
     return loops
 
 
-def area(polygon: Array) -> float:
-    """Signed area of a polygon (k, 2), m²; positive where it runs counter-clockwise."""
+def compute_signed_area(polygon: Array) -> float:
+    """Compute the signed area of a polygon (k, 2), m²; positive where it runs counter-clockwise."""
     x, y = np.asarray(polygon, np.float64).T
     return 0.5 * float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum())
 
 
-def _hull(points: Array) -> Array:
+def _compute_hull(points: Array) -> Array:
     from scipy.spatial import ConvexHull, QhullError
 
     try:

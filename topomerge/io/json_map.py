@@ -3,36 +3,94 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from topomerge.errors import InputError
-from topomerge.io import scene_graph, valetudo
-from topomerge.io.options import ReadOptions
-from topomerge.io.piece import Piece, damaged
+from topomerge.io import valetudo
+from topomerge.io.mesh import sample
+from topomerge.io.piece import Piece, ReadOptions, build_damage_error
+from topomerge.types import Array
+
+BEYOND_NUMBERS = 2**53  # of a vertex: from here on not every whole number is a float64
+GRAPH_KIND = "a scene graph"
+
+
+def is_scene_graph(about: object) -> bool:
+    """Return whether a value is a scene graph saved by Spark-DSG. Old versions have no header."""
+    return isinstance(about, dict) and isinstance(about.get("nodes"), list) and isinstance(about.get("edges"), list)
+
+
+def iter_pieces(path: Path, graph: Mapping[str, Any], options: ReadOptions) -> Iterator[Piece]:
+    """Yield the vertices of the mesh, then points sampled on its faces, in metres.
+
+    Raises:
+        InputError: the graph has no mesh, or a damaged one.
+    """
+    mesh = graph.get("mesh")
+    if not isinstance(mesh, dict) or not mesh.get("points"):
+        raise InputError(
+            f"{path}: is a scene graph without a mesh, so that nothing tells where its walls are; give dsg_with_mesh.json, which "
+            "Hydra saves beside it"
+        )
+    vertices = _parse_table(path, mesh["points"], "points")
+    faces = _parse_table(path, mesh.get("faces") or np.zeros((0, 3)), "faces")
+    if not (np.abs(faces) < BEYOND_NUMBERS).all() or (faces != np.round(faces)).any():  # so of nan, too
+        raise build_damage_error(path, GRAPH_KIND, "a face of its mesh names a vertex that does not exist")
+    colors = _parse_colors(path, mesh, len(vertices))
+    yield Piece(vertices, colors, done=0.5)
+    yield from sample(path, vertices, faces.astype(np.int64), options, colors)
+
+
+def _parse_table(path: Path, rows: Any, name: str) -> Array:
+    """(n, 3) float64."""
+    try:
+        table = np.array(rows, np.float64)
+    except (TypeError, ValueError) as error:
+        raise build_damage_error(path, GRAPH_KIND, f"{name} of its mesh are no rows of three numbers") from error
+    if table.ndim != 2 or table.shape[1] != 3:
+        raise build_damage_error(path, GRAPH_KIND, f"{name} of its mesh are no rows of three numbers")
+    return table
+
+
+def _parse_colors(path: Path, mesh: Mapping[str, Any], many: int) -> Array | None:
+    """(many, 3) uint8; None where the mesh has none."""
+    listed = mesh.get("colors")
+    if not listed or not mesh.get("has_colors", True):
+        return None
+    try:
+        table = np.array([[c["r"], c["g"], c["b"]] for c in listed], np.float64)
+    except (KeyError, TypeError, ValueError) as error:
+        raise build_damage_error(path, GRAPH_KIND, "colors of its mesh are none") from error
+    if table.shape != (many, 3):
+        raise build_damage_error(path, GRAPH_KIND, f"its mesh has {many:,} points and {len(table):,} colors")
+    return np.nan_to_num(table).clip(0, 255).astype(np.uint8)
+
 
 LARGEST_MAP_JSON = 1 << 28  # bytes: the mesh of a floor of 3,000 m2 in faces of 10 cm
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """What the reader of the map hands over, in metres.
+    """Read a map in JSON by the reader of its kind, in metres.
 
     Raises:
         InputError: it is no JSON, or of neither kind.
     """
-    about = what_is_in(path)
+    about = load_json_map(path)
     if valetudo.is_robot_map(about):
-        yield from valetudo.pieces(path, about, options)
-    elif scene_graph.is_scene_graph(about):
-        yield from scene_graph.pieces(path, about, options)
+        yield from valetudo.iter_pieces(path, about, options)
+    elif is_scene_graph(about):
+        yield from iter_pieces(path, about, options)
     else:
         kinds = "a map of Valetudo nor a scene graph of Spark-DSG"
         raise InputError(f"{path}: is neither {kinds}, the JSON that can be read; give the scan or the map that it tells of")
 
 
-def what_is_in(path: Path) -> Any:
-    """The value of a file of JSON.
+def load_json_map(path: Path) -> Any:
+    """Load the value of a file of JSON.
 
     Raises:
         InputError: it is none, or too large.
@@ -43,4 +101,4 @@ def what_is_in(path: Path) -> Any:
     try:
         return json.loads(path.read_bytes())
     except (UnicodeDecodeError, ValueError, RecursionError) as error:
-        raise damaged(path, "a map in JSON", error) from error
+        raise build_damage_error(path, "a map in JSON", error) from error

@@ -1,23 +1,163 @@
-"""LAS and LAZ, read in blocks by laspy."""
+"""Read LAS and LAZ files, COPC included."""
 
 from __future__ import annotations
 
 import logging
 import struct
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.copc import coarse_records, octree_of
-from topomerge.io.laz_chunks import check_chunk, head_size, layers_of
-from topomerge.io.octree import check_node
-from topomerge.io.options import ReadOptions
-from topomerge.io.piece import BLOCK_POINTS, Piece, bytes8, cut_short, damaged, read_head
+from topomerge.io.piece import (
+    BLOCK_POINTS,
+    MOST_LEVELS,
+    Piece,
+    ReadOptions,
+    build_damage_error,
+    build_truncation_error,
+    check_node,
+    compute_deepest_level,
+    convert_to_uint8,
+    read_head,
+)
 from topomerge.types import Array
+
+LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of fields: a point, colours, colours and near infrared, waves; extra bytes have one each
+EXTRA_BYTES = 14
+ITEM = struct.Struct("<3H")  # kind, size and version of fields
+ITEMS_AT = 32  # of the record of the compression
+
+
+def count_layers(record: bytes) -> int:
+    """Count the layers of a chunk; 0 for point formats that have none.
+
+    Args:
+        record: the data of the file's record of its compression.
+    """
+    (count,) = struct.unpack_from("<H", record, ITEMS_AT)
+    items = [ITEM.unpack_from(record, ITEMS_AT + 2 + k * ITEM.size) for k in range(count)]
+    if not items or items[0][0] not in LAYERS:
+        return 0
+    return sum(size if kind == EXTRA_BYTES else LAYERS.get(kind, 0) for kind, size, _ in items)
+
+
+def check_chunk(path: Path, head: bytes, length: int, layers: int, point: int) -> None:
+    """Refuse a chunk whose layers promise more bytes than it has.
+
+    Args:
+        head: its first bytes, `compute_head_size` of them at least.
+        length: its bytes.
+        layers: of it.
+        point: bytes of a point that is not compressed.
+    """
+    size = compute_head_size(layers, point)
+    promised = sum(struct.unpack_from(f"<{layers}I", head, point + 4)) + size if len(head) >= size else size
+    if promised > length:
+        raise build_damage_error(path, "a LAZ file", f"a chunk of {length:,} bytes promises {promised:,}")
+
+
+def compute_head_size(layers: int, point: int) -> int:
+    """Compute the number of bytes before the first layer."""
+    return point + 4 + 4 * layers
+
+
+COPC_KIND = "a COPC file"
+RECORD_AT, RECORD_HEAD = 375, struct.Struct("<2x16sHH32x")  # the first record behind a header of LAS 1.4
+COPC_INFO = struct.Struct("<5d2Q")  # centre, half of the cube's edge, spacing of the root, place and size of the first page
+ENTRY = struct.Struct("<4iQ2i")  # of a page: level, x, y, z, place, bytes, points (-1: a page)
+LARGEST_PAGE = 1 << 26  # bytes
+MOST_NODE_POINTS = 1 << 22
+
+
+@dataclass(frozen=True)
+class Octree:
+    """Where the hierarchy starts, its bytes, and the distance of the root's points, in the file's unit."""
+
+    place: int
+    size: int
+    spacing: float
+
+
+def read_octree(path: Path) -> Octree | None:
+    """Read the octree of a COPC file; None: it is another LAS or LAZ file."""
+    with path.open("rb") as stream:
+        stream.seek(RECORD_AT)
+        data = stream.read(RECORD_HEAD.size + COPC_INFO.size)
+    if len(data) < RECORD_HEAD.size + COPC_INFO.size:
+        return None
+    name, number, _ = RECORD_HEAD.unpack_from(data)
+    if name.rstrip(b"\0") != b"copc" or number != 1:
+        return None
+    *_, spacing, place, size = COPC_INFO.unpack_from(data, RECORD_HEAD.size)
+    return Octree(place, size, spacing)
+
+
+def iter_coarse_records(path: Path, octree: Octree, options: ReadOptions) -> Iterator[tuple[Any, Any, float]]:
+    """The header, the records of a node, and the share of the file that is read with it, for each node that is coarse enough.
+
+    Raises:
+        InputError: the octree does not fit the file.
+    """
+    import laspy
+    import lazrs
+
+    with path.open("rb") as stream:
+        header = laspy.LasHeader.read_from(stream)
+        packing = header.vlrs.get("LasZipVlr")
+        if not packing:
+            raise build_damage_error(path, COPC_KIND, "its points are not compressed")
+        record = packing[0].record_data_bytes()
+        layers, size, seen = count_layers(record), header.point_format.size, 0
+        for place, length, count in _iter_nodes(path, stream, octree, compute_deepest_level(octree.spacing, options)):
+            seen += count
+            if seen > header.point_count:
+                raise build_damage_error(
+                    path, COPC_KIND, f"its octree has more points than the {header.point_count:,} of the file"
+                )
+            stream.seek(place)
+            data = stream.read(length)
+            check_chunk(path, data, length, layers, size)
+            out = np.zeros(count * size, np.uint8)
+            lazrs.decompress_points_with_chunk_table(data, record, out, [(count, length)])
+            packed = laspy.PackedPointRecord.from_buffer(out, header.point_format)
+            rows = laspy.ScaleAwarePointRecord(packed.array, header.point_format, header.scales, header.offsets)
+            yield header, rows, seen / header.point_count
+
+
+def _iter_nodes(path: Path, stream: IO[bytes], octree: Octree, deepest: int) -> Iterator[tuple[int, int, int]]:
+    """Place, bytes and points of each node down to a level."""
+    whole = left = path.stat().st_size
+    pages, seen = [(octree.place, octree.size)], {octree.place}
+    while pages:
+        place, size = pages.pop()
+        if size > LARGEST_PAGE or size % ENTRY.size or place + size > whole:
+            raise build_damage_error(path, COPC_KIND, f"a page of {size:,} bytes at {place:,} of {whole:,}")
+        left -= size
+        stream.seek(place)
+        for level, _, _, _, start, length, count in list(ENTRY.iter_unpack(stream.read(size))):
+            if not 0 <= level <= MOST_LEVELS or count < -1 or length < 0 or (count and start + length > whole):
+                raise build_damage_error(
+                    path, COPC_KIND, f"a node of level {level} with {count:,} points and {length:,} bytes at {start:,}"
+                )
+            if count > MOST_NODE_POINTS:
+                raise InputError(f"{path}: has a node of {count:,} points, too many for one; read it without --spacing")
+            if level > deepest or count == 0:
+                continue
+            left -= length if count > 0 else 0
+            if left < 0:  # pages and nodes that are named again and again are endless work
+                raise build_damage_error(path, COPC_KIND, f"its pages and nodes have more than the {whole:,} bytes of the file")
+            if count > 0:
+                yield start, length, count
+            elif start in seen:
+                raise build_damage_error(path, COPC_KIND, f"the page at {start:,} is named twice")
+            else:
+                seen.add(start)
+                pages.append((start, length))
+
 
 LASZIP = b"laszip encoded"
 LARGEST_HEAD = 64 << 20  # bytes searched for the record of the compression
@@ -26,18 +166,18 @@ SMALLEST_CHUNK = 20  # bytes: a compressed chunk starts with one point as it is
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """Blocks of points with their colours; of a COPC file, those of the levels that are coarse enough for `spacing`."""
-    octree = None if options.spacing is None else octree_of(path)
+    """Read blocks of points with their colours; of a COPC file, those of the levels that are coarse enough for `spacing`."""
+    octree = None if options.spacing is None else read_octree(path)
     if octree is not None:
         _check_head(path)
-    for header, rows, done in records(path) if octree is None else coarse_records(path, octree, options):
+    for header, rows, done in records(path) if octree is None else iter_coarse_records(path, octree, options):
         colored = {"red", "green", "blue"} <= set(header.point_format.dimension_names)
         bright = np.asarray(rows.intensity, np.float32)
-        yield Piece(coordinates(rows), _colors(rows) if colored else None, done=done, intensities=bright)
+        yield Piece(get_coordinates(rows), _convert_colors(rows) if colored else None, done=done, intensities=bright)
 
 
-def las_node(path: Path, promised: int, options: ReadOptions) -> Iterator[Piece]:
-    """The points of a node that is a LAS or LAZ file.
+def read_las_node(path: Path, promised: int, options: ReadOptions) -> Iterator[Piece]:
+    """Read the points of a node that is a LAS or LAZ file.
 
     Raises:
         InputError: it can't be read, or has fewer points than the hierarchy promises.
@@ -51,13 +191,13 @@ def las_node(path: Path, promised: int, options: ReadOptions) -> Iterator[Piece]
     except (InputError, MemoryError, ImportError, GeneratorExit, KeyboardInterrupt, SystemExit):
         raise
     except BaseException as error:  # panics of the decoder are no Exception
-        raise damaged(path, "a node of an octree", error) from error
+        raise build_damage_error(path, "a node of an octree", error) from error
     if count < promised:
-        raise cut_short(path, count, promised)
+        raise build_truncation_error(path, count, promised)
 
 
 def records(path: Path) -> Iterator[tuple[Any, Any, float]]:
-    """The header, a block of records with all their dimensions, and the share of the file that is read with it."""
+    """Yield the header, a block of records with all their dimensions, and the share of the file that is read with it."""
     import laspy
 
     logging.getLogger("laspy").setLevel(logging.CRITICAL)  # it logs what it also raises
@@ -70,26 +210,26 @@ def records(path: Path) -> Iterator[tuple[Any, Any, float]]:
         promised, size = header.point_count, header.point_format.size
         room = path.stat().st_size - header.offset_to_point_data
         if not header.are_points_compressed and promised * size > room:
-            raise cut_short(path, max(room, 0) // size, promised)
+            raise build_truncation_error(path, max(room, 0) // size, promised)
         if promised > MOST_POINTS_A_BYTE * max(room, 0):
-            raise damaged(path, "a LAZ file", f"it promises {promised:,} points in {max(room, 0):,} bytes")
+            raise build_damage_error(path, "a LAZ file", f"it promises {promised:,} points in {max(room, 0):,} bytes")
         for rows in reader.chunk_iterator(BLOCK_POINTS):
             if not len(rows):
                 break
             done += len(rows)
             yield header, rows, done / promised
     if done < promised:
-        raise cut_short(path, done, promised)
+        raise build_truncation_error(path, done, promised)
 
 
-def coordinates(rows: Any) -> Array:
-    """(n, 3) float64 of records, in the file's frame and unit."""
+def get_coordinates(rows: Any) -> Array:
+    """Return (n, 3) float64 of records, in the file's frame and unit."""
     return np.stack([np.asarray(rows.x), np.asarray(rows.y), np.asarray(rows.z)], axis=1)
 
 
-def _colors(rows: object) -> Array | None:
+def _convert_colors(rows: object) -> Array | None:
     values = np.stack([np.asarray(getattr(rows, n)) for n in ("red", "green", "blue")], axis=1)
-    return bytes8(values)
+    return convert_to_uint8(values)
 
 
 def _check_head(path: Path) -> None:
@@ -98,7 +238,7 @@ def _check_head(path: Path) -> None:
     start, records = int.from_bytes(head[96:100], "little"), int.from_bytes(head[100:104], "little")
     size = path.stat().st_size
     if start > size or records * 54 > size:
-        raise damaged(path, "a LAS file", f"{records:,} records before point data at byte {start:,} of {size:,}")
+        raise build_damage_error(path, "a LAS file", f"{records:,} records before point data at byte {start:,} of {size:,}")
     if head[104] & 0x80:  # compressed
         _check_table(path, start, size)
         record = _check_items(path, start, int.from_bytes(head[105:107], "little"))
@@ -117,7 +257,7 @@ def _check_items(path: Path, start: int, record: int) -> bytes:
     count = int.from_bytes(before[at + 32 : at + 34], "little")
     items = before[at + 34 : at + 34 + 6 * count]  # kind, size and version of two bytes each
     if at < 52 or len(items) < 6 * count or sum(struct.unpack("<" + "2xH2x" * count, items)) != record:
-        raise damaged(path, "a LAZ file", f"its fields do not add up to {record} bytes")
+        raise build_damage_error(path, "a LAZ file", f"its fields do not add up to {record} bytes")
     return before[at : at + 34 + 6 * count]
 
 
@@ -125,7 +265,7 @@ def _check_chunks(path: Path, start: int, record: bytes, point: int) -> None:
     """Refuse a LAZ file in which the layers of a chunk promise more bytes than the chunk has."""
     import lazrs
 
-    layers, size = layers_of(record), path.stat().st_size
+    layers, size = count_layers(record), path.stat().st_size
     if not layers:
         return
     at = start + 8
@@ -135,9 +275,9 @@ def _check_chunks(path: Path, start: int, record: bytes, point: int) -> None:
             if not count and not length:  # some writers end with an empty one
                 continue
             if at + length > size:
-                raise damaged(path, "a LAZ file", f"a chunk of {length:,} bytes at byte {at:,} of {size:,}")
+                raise build_damage_error(path, "a LAZ file", f"a chunk of {length:,} bytes at byte {at:,} of {size:,}")
             stream.seek(at)
-            check_chunk(path, stream.read(head_size(layers, point)), length, layers, point)
+            check_chunk(path, stream.read(compute_head_size(layers, point)), length, layers, point)
             at += length
 
 
@@ -155,4 +295,4 @@ def _check_table(path: Path, start: int, size: int) -> None:
         stream.seek(max(at, 0))
         chunks = int.from_bytes(stream.read(8)[4:], "little")
     if not start < at < size or chunks * SMALLEST_CHUNK > size:
-        raise damaged(path, "a LAZ file", f"table of {chunks:,} chunks at byte {at:,} of {size:,}")
+        raise build_damage_error(path, "a LAZ file", f"table of {chunks:,} chunks at byte {at:,} of {size:,}")

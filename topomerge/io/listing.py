@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.io.atomic import replacing
+from topomerge.io.archive import replace_on_success
 from topomerge.types import ROOM_ODDS, TopometricMap
 
 LISTING_FORMAT = 1
@@ -40,33 +40,33 @@ EDGE_FACTS = ("kind", "open", "half", "confidence", "lower", "upper")
 DIGITS = 6  # micrometres: the digits behind are noise
 
 
-def room_words(room: Any) -> list[str]:
-    """What is said of a row of ROOM_DTYPE: `outside`, `glimpsed` (only looked into), `doubtful` (probably no room)."""
+def describe_room(room: Any) -> list[str]:
+    """Describe a row of ROOM_DTYPE: `outside`, `glimpsed` (only looked into), `doubtful` (probably no room)."""
     words = (("outside", room["outside"] > 0.5), ("glimpsed", room["glimpsed"]), ("doubtful", room["confidence"] < 0.5))
     return [word for word, so in words if so]
 
 
-def plain(value: Any) -> Any:
-    """The value in Python's own types, as far as JSON has them: arrays and tuples as lists, anything odd as its text."""
+def convert_to_plain(value: Any) -> Any:
+    """Return the value in Python's own types, as far as JSON has them: arrays and tuples as lists, anything odd as its text."""
     if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
+        return convert_to_plain(value.tolist())
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): convert_to_plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
-        return [plain(item) for item in (sorted(value) if isinstance(value, set | frozenset) else value)]
+        return [convert_to_plain(item) for item in (sorted(value) if isinstance(value, set | frozenset) else value)]
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 
-def _strict(value: Any) -> Any:
+def _convert_to_strict_json(value: Any) -> Any:
     """Rounded, and null for the numbers that JSON does not have."""
     if isinstance(value, float):
         return round(value, DIGITS) if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {key: _strict(item) for key, item in value.items()}
-    return [_strict(item) for item in value] if isinstance(value, list) else value
+        return {key: _convert_to_strict_json(item) for key, item in value.items()}
+    return [_convert_to_strict_json(item) for item in value] if isinstance(value, list) else value
 
 
-def map_to_json(map: TopometricMap) -> dict[str, Any]:
+def convert_map_to_json(map: TopometricMap) -> dict[str, Any]:
     """The map as a dictionary of plain Python values that is valid JSON; see the top of this file for its fields."""
     rooms = [
         {
@@ -87,30 +87,30 @@ def map_to_json(map: TopometricMap) -> dict[str, Any]:
         "source": map.source,
         "voxel_size": float(map.grid.edge),
         "rooms": rooms,
-        "edges": [_edge(e, "rooms") for e in map.edges],
-        "windows": [_window(w) for w in map.windows],
+        "edges": [_build_edge_entry(e, "rooms") for e in map.edges],
+        "windows": [_build_window_entry(w) for w in map.windows],
         "areas": areas,
-        "narrows": [_edge(e, "areas") for e in map.narrows],
+        "narrows": [_build_edge_entry(e, "areas") for e in map.narrows],
         "storeys": storeys,
         "seconds": map.seconds,
         "parameters": map.parameters,
         "warnings": list(map.warnings),
     }
-    strict: dict[str, Any] = _strict(plain(listing))
+    strict: dict[str, Any] = _convert_to_strict_json(convert_to_plain(listing))
     return strict
 
 
-def _edge(edge: Any, ends: str) -> dict[str, Any]:
+def _build_edge_entry(edge: Any, ends: str) -> dict[str, Any]:
     door = {name: edge[name] for name in ("centre", "width", "height", "direction")}
     return {ends: edge["rooms"], "door": door, **{name: edge[name] for name in EDGE_FACTS}}
 
 
-def _window(window: Any) -> dict[str, Any]:
+def _build_window_entry(window: Any) -> dict[str, Any]:
     rooms = [room if room >= 0 else None for room in window["rooms"].tolist()]
     return {"rooms": rooms, **{name: window[name] for name in window.dtype.names if name != "rooms"}}
 
 
-def json_text(listing: Mapping[str, Any]) -> str:
+def format_json(listing: Mapping[str, Any]) -> str:
     """Strict JSON with a line for each room, edge and storey, so that it can be read and compared."""
     lines = []
     for key, value in listing.items():
@@ -123,16 +123,16 @@ def json_text(listing: Mapping[str, Any]) -> str:
 
 
 def save_json(map: TopometricMap, path: str | Path) -> None:
-    """Write `map_to_json` as UTF-8.
+    """Write `convert_map_to_json` as UTF-8.
 
     Raises:
         InputError: the path can't be written.
     """
-    with replacing(path) as beside:
-        beside.write_text(json_text(map_to_json(map)), encoding="utf-8", errors="replace")
+    with replace_on_success(path) as beside:
+        beside.write_text(format_json(convert_map_to_json(map)), encoding="utf-8", errors="replace")
 
 
-def _columns(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+def _format_columns(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     """Lines of a table: right-aligned, but for the last column."""
     table = [list(header), *map(list, rows)]
     widths = [max(len(row[i]) for row in table) for i in range(len(header))]
@@ -141,15 +141,15 @@ def _columns(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     return ["  ".join(row).rstrip() for row in cells]
 
 
-def _number(value: float, digits: int, unknown: bool = False) -> str:
+def _format_number(value: float, digits: int, unknown: bool = False) -> str:
     return "–" if unknown or not math.isfinite(value) else f"{value:.{digits}f}"
 
 
-def _plural(count: int, word: str) -> str:
+def _format_count(count: int, word: str) -> str:
     return f"{count} {word}{'' if count == 1 or word == 'stairs' else 's'}"
 
 
-def _neighbours(map: TopometricMap) -> list[list[str]]:
+def _list_neighbours(map: TopometricMap) -> list[list[str]]:
     """For each room the rooms that it leads to; a second door to the same one is not told again."""
     beside: list[dict[int, str]] = [{} for _ in map.rooms]
     for edge in map.edges:
@@ -160,45 +160,45 @@ def _neighbours(map: TopometricMap) -> list[list[str]]:
     return [[f"{room}{rooms[room]}" for room in sorted(rooms)] for rooms in beside]
 
 
-def _room_rows(map: TopometricMap) -> Iterable[Sequence[str]]:
+def _iter_room_rows(map: TopometricMap) -> Iterable[Sequence[str]]:
     doors = np.bincount(map.edges["rooms"].ravel(), minlength=len(map.rooms))
-    for i, (room, beside) in enumerate(zip(map.rooms, _neighbours(map), strict=True)):
+    for i, (room, beside) in enumerate(zip(map.rooms, _list_neighbours(map), strict=True)):
         yield (
             str(i),
             str(room["storey"]),
-            _number(room["area"], 1),
-            _number(room["height"], 2, room["height"] == 0),
+            _format_number(room["area"], 1),
+            _format_number(room["height"], 2, room["height"] == 0),
             str(room["cells"]),
             str(doors[i]),
-            "  ".join([", ".join(beside), *room_words(room)]),
+            "  ".join([", ".join(beside), *describe_room(room)]),
         )
 
 
-def _storey_rows(map: TopometricMap) -> Iterable[Sequence[str]]:
+def _iter_storey_rows(map: TopometricMap) -> Iterable[Sequence[str]]:
     rooms = np.bincount(map.rooms["storey"], minlength=len(map.storeys))
     for i, storey in enumerate(map.storeys):
         floor, ceiling, area = storey["floor"], storey["ceiling"], storey["area"]
-        yield str(i), _number(floor, 2), _number(ceiling, 2), _number(area, 1), str(rooms[i])
+        yield str(i), _format_number(floor, 2), _format_number(ceiling, 2), _format_number(area, 1), str(rooms[i])
 
 
-def map_to_text(map: TopometricMap) -> str:
-    """Tables of rooms, storeys and seconds for a terminal, without a line break at the end."""
+def format_map(map: TopometricMap) -> str:
+    """Return tables of rooms, storeys and seconds for a terminal, without a line break at the end."""
     kinds = Counter(map.edges["kind"].tolist())
-    counts = [_plural(len(map.rooms), "room"), _plural(len(map.storeys), "storey")]
-    counts += [_plural(kinds[kind], kind) for kind in ("door", "opening", "stairs")]
-    counts += [_plural(kinds["ramp"], "ramp")] if kinds["ramp"] else []
-    counts += [_plural(len(map.windows), "window")] if len(map.windows) else []
+    counts = [_format_count(len(map.rooms), "room"), _format_count(len(map.storeys), "storey")]
+    counts += [_format_count(kinds[kind], kind) for kind in ("door", "opening", "stairs")]
+    counts += [_format_count(kinds["ramp"], "ramp")] if kinds["ramp"] else []
+    counts += [_format_count(len(map.windows), "window")] if len(map.windows) else []
     steps = [(f"{s:.2f}", step) for step, s in map.seconds.items()]
     steps.append((f"{sum(map.seconds.values()):.2f}", "all"))
     source = " ".join((map.source or "map").splitlines())  # names of files may hold line breaks
     return "\n".join(
         (
-            f"{source}: {', '.join(counts)}; {_plural(len(map.grid), 'cell')} of {map.grid.edge:g} m",
+            f"{source}: {', '.join(counts)}; {_format_count(len(map.grid), 'cell')} of {map.grid.edge:g} m",
             "",
-            *_columns(("room", "storey", "area m²", "height m", "cells", "doors", "leads to"), _room_rows(map)),
+            *_format_columns(("room", "storey", "area m²", "height m", "cells", "doors", "leads to"), _iter_room_rows(map)),
             "",
-            *_columns(("storey", "floor m", "ceiling m", "area m²", "rooms"), _storey_rows(map)),
+            *_format_columns(("storey", "floor m", "ceiling m", "area m²", "rooms"), _iter_storey_rows(map)),
             "",
-            *_columns(("seconds", "step"), steps),
+            *_format_columns(("seconds", "step"), steps),
         )
     )

@@ -1,27 +1,9 @@
-"""Topometric maps in files: `.tmap` in and out (and, from here too, JSON and PLY out).
-
-A `.tmap` is one compressed NumPy archive without pickled objects. Format 2 holds:
-
-| array | content |
-|---|---|
-| format | the number of the format |
-| about | JSON as bytes: source, parameters, seconds, warnings, names of the arrays that follow |
-| grid_cells, navigable_cells, free_cells | Morton codes ascending, each as the difference to the one before |
-| grid_frame, … | origin x, y, z and edge length, m |
-| grid_shape, … | cells along x, y, z |
-| grid_property.NAME, … | one row a cell |
-| room, navigable_room | int32 room of each cell, -1 none |
-| navigable_area | int32 area of each navigable cell, -1 none |
-| rooms, edges, storeys, areas, narrows, windows | tables, see `topomerge.types` |
-| provenance | uint32 bit set of the maps that saw each cell |
-
-`free_…`, `windows` and `provenance` are absent where the map has none. `fixtures` of earlier versions is not read.
-"""
+"""Read and write maps (`.tmap`), within limits."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -30,10 +12,10 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io import archive
-from topomerge.io.listing import map_to_json, plain, save_json
-from topomerge.io.map_limits import require_compact_rooms, require_sane_counts
+from topomerge.io.archive import ArrayHeader
+from topomerge.io.listing import convert_map_to_json, convert_to_plain, save_json
 from topomerge.io.rooms_ply import save_rooms_ply
-from topomerge.kernels import morton
+from topomerge.kernels import voxels
 from topomerge.types import (
     AREA_DTYPE,
     EDGE_DTYPE,
@@ -45,12 +27,82 @@ from topomerge.types import (
     Array,
     TopometricMap,
     VoxelGrid,
-    levelling_of,
-    with_outline_odds,
+    add_outline_odds,
+    read_levelling,
 )
 
-__all__ = ["TMAP_FORMAT", "load_map", "map_to_json", "save_json", "save_map", "save_rooms_ply"]
+# The largest buildings have about 1,000 rooms, the tallest 163 storeys.
+ROOM_LIMIT, STOREY_LIMIT = 5_000, 200
+ROOM_COLUMNS, TOTAL_COLUMNS = 50_000_000, 100_000_000  # of the grid, in the rectangle around a room's floor, and around each
+CONNECTION_LIMIT = 30_000  # of edges, areas, narrows and windows each, however many rooms there are
+EDGES_PER_ROOM, AREAS_PER_ROOM, WINDOWS_PER_ROOM = 20, 20, 100  # on average
+ABOUT_LIMIT = 1 << 24  # bytes of what a map says about itself
+PROPERTY_WIDTH = 64  # numbers of one property in a cell
+CELL_ARRAYS = {"grid": ("room", "provenance"), "navigable": ("navigable_room", "navigable_area"), "free": ()}  # a row for each
 
+
+def require_sane_counts(heads: Mapping[str, ArrayHeader]) -> None:
+    """Refuses what the arrays of a map declare, before any of them is unpacked: tables longer than the cells can fill, and rows
+    of cells that there are not.
+
+    Raises:
+        KeyError: an array is missing.
+        ValueError: more rooms, edges, storeys, areas, narrows or windows than a building has; more or fewer rows of a property
+            than cells; words that no map says.
+    """
+    rooms, areas = heads["rooms"].size, heads["areas"].size
+    cells = heads["room"].size + heads["navigable_room"].size
+    limits = {
+        "rooms": (ROOM_LIMIT, ""),
+        "storeys": (STOREY_LIMIT, ""),
+        "edges": (min(EDGES_PER_ROOM * rooms, CONNECTION_LIMIT), f" ({EDGES_PER_ROOM} a room)"),
+        "areas": (min(AREAS_PER_ROOM * rooms, CONNECTION_LIMIT), f" ({AREAS_PER_ROOM} a room)"),
+        "narrows": (min(EDGES_PER_ROOM * areas, CONNECTION_LIMIT), f" ({EDGES_PER_ROOM} an area)"),
+        "windows": (min(WINDOWS_PER_ROOM * rooms, CONNECTION_LIMIT), f" ({WINDOWS_PER_ROOM} a room)"),
+    }
+    for name, (limit, share) in limits.items():
+        words = share if limit < CONNECTION_LIMIT else ""
+        if name in heads and heads[name].size > limit:
+            raise ValueError(f"declares {heads[name].size:,} {name}, more than {limit:,}{words}")
+    if rooms > cells:
+        raise ValueError(f"declares {rooms:,} rooms and has only {cells:,} cells")
+    if heads["about"].size * heads["about"].dtype.itemsize > ABOUT_LIMIT:
+        raise ValueError(f"says more than {ABOUT_LIMIT >> 20} MB about itself")
+    _require_rows(heads)
+
+
+def _require_rows(heads: Mapping[str, ArrayHeader]) -> None:
+    """Refuses arrays that have not one row for each cell, or more numbers in one than any property has."""
+    for grid, of_cells in CELL_ARRAYS.items():
+        if f"{grid}_cells" not in heads:
+            continue
+        count = heads[f"{grid}_cells"].size
+        named = [name for name in heads if name in of_cells or name.startswith(f"{grid}_property.")]
+        for name in named:
+            shape = heads[name].shape
+            if shape[:1] != (count,):
+                raise ValueError(f"{name} has the shape {shape} for {count:,} cells")
+            if heads[name].size > PROPERTY_WIDTH * count:
+                raise ValueError(f"{name} has {heads[name].size // max(count, 1):,} numbers a cell, more than {PROPERTY_WIDTH}")
+
+
+def require_compact_rooms(navigable: VoxelGrid, room: Array, rooms: int) -> None:
+    """Refuses rooms whose floor is strewn over the map: what draws a room goes through the rectangle around it.
+
+    Raises:
+        ValueError: the rectangles have more columns than those of a building.
+    """
+    inside = (room >= 0) & (room < rooms)
+    low, high = np.full((rooms, 2), np.iinfo(np.int64).max), np.full((rooms, 2), -1)
+    columns = navigable.cells[inside, :2].astype(np.int64)
+    np.minimum.at(low, room[inside], columns)
+    np.maximum.at(high, room[inside], columns)
+    sizes = np.where(high[:, 0] >= 0, np.prod(np.where(high >= 0, high - low + 1, 0), axis=1, dtype=np.float64), 0.0)
+    if sizes.max(initial=0) > ROOM_COLUMNS or sizes.sum() > TOTAL_COLUMNS:
+        raise ValueError(f"has rooms that span {sizes.sum():.2g} columns of cells, the largest {sizes.max():.2g}")
+
+
+__all__ = ["TMAP_FORMAT", "convert_map_to_json", "load_map", "save_json", "save_map", "save_rooms_ply"]
 TMAP_FORMAT = 2
 KIND = "map of topomerge (.tmap)"
 COORDINATE_LIMIT = 1e9  # m, either way: beyond, float64 is coarser than 0.1 micrometres
@@ -89,8 +141,8 @@ def save_map(map: TopometricMap, path: str | Path) -> None:
         arrays["provenance"] = map.provenance.astype("<u4")
     about = {
         "source": map.source,
-        "parameters": plain(dict(map.parameters)),
-        "seconds": plain(dict(map.seconds)),
+        "parameters": convert_to_plain(dict(map.parameters)),
+        "seconds": convert_to_plain(dict(map.seconds)),
         "warnings": list(map.warnings),
         "arrays": list(arrays),
     }
@@ -108,7 +160,7 @@ def load_map(path: str | Path) -> TopometricMap:
         InputError: no such file, not a map, of a newer format, damaged or cut off; more rooms or edges than a building has, a
             number in a table that is none, a frame that no building has.
     """
-    heads = archive.heads(path, KIND)
+    heads = archive.read_array_headers(path, KIND)
     if "format" not in heads or "about" not in heads:
         raise InputError(f"{path}: is not a {KIND}: make one with `topomerge extract SCAN -o A.tmap`")
     number: Any = archive.read(path, KIND, ["format"])["format"] if heads["format"].shape == () else heads["format"]
@@ -116,15 +168,15 @@ def load_map(path: str | Path) -> TopometricMap:
         older = number.shape == () and number.dtype.kind in "iu" and int(number) < TMAP_FORMAT
         advice = "make it again with `topomerge extract`" if older else "update topomerge"
         raise InputError(f"{path}: is of format {number}, and this topomerge reads format {TMAP_FORMAT}; {advice}")
-    with _told_of(path):
+    with _convert_map_errors(path):
         require_sane_counts(heads)  # before anything is unpacked
     arrays = archive.read(path, KIND, [name for name in heads if name not in UNREAD])
-    with _told_of(path):
-        return _map(arrays)
+    with _convert_map_errors(path):
+        return _build_map(arrays)
 
 
 @contextmanager
-def _told_of(path: str | Path) -> Iterator[None]:
+def _convert_map_errors(path: str | Path) -> Iterator[None]:
     """Within, whatever is wrong with the arrays of a map becomes one line about its file."""
     try:
         yield
@@ -153,8 +205,8 @@ def _pack(name: str, grid: VoxelGrid) -> dict[str, Array]:
 
 
 def _unpack(arrays: dict[str, Array], name: str) -> VoxelGrid:
-    deltas, frame = _typed(arrays, f"{name}_cells", "u", 1), _typed(arrays, f"{name}_frame", "f", 1)
-    shape = _typed(arrays, f"{name}_shape", "i", 1)
+    deltas, frame = _check_array(arrays, f"{name}_cells", "u", 1), _check_array(arrays, f"{name}_frame", "f", 1)
+    shape = _check_array(arrays, f"{name}_shape", "i", 1)
     if frame.shape != (4,) or shape.shape != (3,) or not np.isfinite(frame).all():
         raise ValueError(f"{name} has no proper frame")
     _require_usable_frame(name, frame[:3], float(frame[3]))
@@ -167,7 +219,7 @@ def _unpack(arrays: dict[str, Array], name: str) -> VoxelGrid:
     if offset is not None and (offset.dtype != np.uint8 or offset.shape != (len(codes), 3)):
         raise ValueError(f"the points of the cells of {name} have no proper offsets")
     x, y, z = shape.tolist()
-    return VoxelGrid(morton.decode(codes), frame[:3].copy(), float(frame[3]), (x, y, z), properties)
+    return VoxelGrid(voxels.decode(codes), frame[:3].copy(), float(frame[3]), (x, y, z), properties)
 
 
 def _require_usable_frame(name: str, origin: Array, edge: float) -> None:
@@ -177,15 +229,15 @@ def _require_usable_frame(name: str, origin: Array, edge: float) -> None:
         raise ValueError(f"{name} has cells of {edge:.4g} m, not of {SHORTEST_CELL_EDGE} to {LONGEST_CELL_EDGE:g} m")
 
 
-def _typed(arrays: dict[str, Array], name: str, kind: str, dimensions: int) -> Array:
+def _check_array(arrays: dict[str, Array], name: str, kind: str, dimensions: int) -> Array:
     array = arrays[name]
     if array.dtype.kind != kind or array.ndim != dimensions:
         raise ValueError(f"{name} has type {array.dtype} and shape {array.shape}")
     return array
 
 
-def _table(arrays: dict[str, Array], name: str, dtype: np.dtype[Any]) -> Array:
-    table = _typed(arrays, name, "V", 1)
+def _check_table(arrays: dict[str, Array], name: str, dtype: np.dtype[Any]) -> Array:
+    table = _check_array(arrays, name, "V", 1)
     if table.dtype != dtype:
         raise ValueError(f"{name} has other columns")
     for column in (c for c in dtype.names or () if dtype[c].base.kind == "f"):
@@ -202,7 +254,7 @@ def _table(arrays: dict[str, Array], name: str, dtype: np.dtype[Any]) -> Array:
     return table.astype(dtype, copy=False)
 
 
-def _widened(table: Array, dtype: np.dtype[Any]) -> Array:
+def _widen_table(table: Array, dtype: np.dtype[Any]) -> Array:
     """A table with more columns, 0 in the new ones."""
     out = np.zeros(len(table), dtype)
     for name in table.dtype.names or ():
@@ -210,32 +262,32 @@ def _widened(table: Array, dtype: np.dtype[Any]) -> Array:
     return out
 
 
-def _rooms(arrays: dict[str, Array]) -> Array:
+def _read_rooms(arrays: dict[str, Array]) -> Array:
     """The table of rooms. Files of earlier versions say no probabilities: there a glimpsed room was not entered."""
     if arrays["rooms"].dtype == OLDER_ROOMS:
-        return with_outline_odds(_widened(_table(arrays, "rooms", OLDER_ROOMS), ROOM_DTYPE))
-    rooms = _table(arrays, "rooms", ROOM_DTYPE)
+        return add_outline_odds(_widen_table(_check_table(arrays, "rooms", OLDER_ROOMS), ROOM_DTYPE))
+    rooms = _check_table(arrays, "rooms", ROOM_DTYPE)
     for name in ROOM_ODDS:
         if not ((rooms[name] >= 0) & (rooms[name] <= 1)).all():
             raise ValueError(f"rooms has a {name} that is not from 0 to 1")
     return rooms
 
 
-def _edges(arrays: dict[str, Array], name: str) -> Array:
+def _read_edges(arrays: dict[str, Array], name: str) -> Array:
     """A table of edges. Files of earlier versions do not tell half-open doors from open ones."""
     older = arrays[name].dtype == OLDER_EDGE_DTYPE
-    return _widened(_table(arrays, name, OLDER_EDGE_DTYPE if older else EDGE_DTYPE), EDGE_DTYPE)
+    return _widen_table(_check_table(arrays, name, OLDER_EDGE_DTYPE if older else EDGE_DTYPE), EDGE_DTYPE)
 
 
-def _windows(arrays: dict[str, Array]) -> Array:
+def _read_windows(arrays: dict[str, Array]) -> Array:
     """The table of windows. Files of earlier versions have none."""
-    windows = _table(arrays, "windows", WINDOW_DTYPE) if "windows" in arrays else np.zeros(0, WINDOW_DTYPE)
+    windows = _check_table(arrays, "windows", WINDOW_DTYPE) if "windows" in arrays else np.zeros(0, WINDOW_DTYPE)
     if (windows["width"] <= 0).any() or (windows["head"] <= windows["sill"]).any():
         raise ValueError("windows has one that is not wide or not high")
     return windows
 
 
-def _limited_warnings(messages: list[Any]) -> tuple[str, ...]:
+def _limit_warnings(messages: list[Any]) -> tuple[str, ...]:
     """The first warnings, each one line of bounded length, and how many more there are."""
     surplus = len(messages) - WARNING_LIMIT
     if surplus <= 1:  # one more takes no more room than the line that counts it, which may be that one
@@ -248,34 +300,34 @@ def _limited_warnings(messages: list[Any]) -> tuple[str, ...]:
     return (*lines, f"and {surplus:,} more warnings") if surplus else tuple(lines)
 
 
-def _map(arrays: dict[str, Array]) -> TopometricMap:
+def _build_map(arrays: dict[str, Array]) -> TopometricMap:
     about = json.loads(arrays["about"].item())
     if missing := set(about["arrays"]) - set(arrays) - UNREAD:
         raise KeyError(min(missing))
-    provenance = _typed(arrays, "provenance", "u", 1).astype(np.uint32) if "provenance" in arrays else None
-    edges, narrows = _edges(arrays, "edges"), _edges(arrays, "narrows")
+    provenance = _check_array(arrays, "provenance", "u", 1).astype(np.uint32) if "provenance" in arrays else None
+    edges, narrows = _read_edges(arrays, "edges"), _read_edges(arrays, "narrows")
     for table in (edges, narrows):
         table["kind"].tolist()  # fails here, not later, where the text is none
-    navigable, navigable_room = _unpack(arrays, "navigable"), _typed(arrays, "navigable_room", "i", 1).astype(np.int32)
+    navigable, navigable_room = _unpack(arrays, "navigable"), _check_array(arrays, "navigable_room", "i", 1).astype(np.int32)
     if len(navigable) == len(navigable_room):  # else the map itself refuses them
         require_compact_rooms(navigable, navigable_room, arrays["rooms"].size)
-    levelling_of(about["parameters"])  # fails here, not where points are moved by it
+    read_levelling(about["parameters"])  # fails here, not where points are moved by it
     return TopometricMap(
         grid=_unpack(arrays, "grid"),
-        room=_typed(arrays, "room", "i", 1).astype(np.int32),
+        room=_check_array(arrays, "room", "i", 1).astype(np.int32),
         navigable=navigable,
         navigable_room=navigable_room,
-        rooms=_rooms(arrays),
+        rooms=_read_rooms(arrays),
         edges=edges,
-        storeys=_table(arrays, "storeys", STOREY_DTYPE),
-        areas=_table(arrays, "areas", AREA_DTYPE),
-        navigable_area=_typed(arrays, "navigable_area", "i", 1).astype(np.int32),
+        storeys=_check_table(arrays, "storeys", STOREY_DTYPE),
+        areas=_check_table(arrays, "areas", AREA_DTYPE),
+        navigable_area=_check_array(arrays, "navigable_area", "i", 1).astype(np.int32),
         narrows=narrows,
-        windows=_windows(arrays),
+        windows=_read_windows(arrays),
         free=_unpack(arrays, "free") if "free_cells" in arrays else None,
         provenance=provenance,
         source=str(about["source"]),
         parameters=dict(about["parameters"]),
         seconds={str(step): float(s) for step, s in about["seconds"].items()},
-        warnings=_limited_warnings(list(about["warnings"])),
+        warnings=_limit_warnings(list(about["warnings"])),
     )

@@ -14,9 +14,8 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io import text
-from topomerge.io.options import ReadOptions
-from topomerge.io.piece import BLOCK_POINTS, Piece, cut_short, damaged, single
-from topomerge.kernels.codecs import lzf_unpack
+from topomerge.io.piece import BLOCK_POINTS, Piece, ReadOptions, build_damage_error, build_truncation_error, convert_to_float32
+from topomerge.kernels.codecs import unpack_lzf
 from topomerge.types import Array
 
 LONGEST_HEADER = 1 << 16  # bytes
@@ -38,27 +37,27 @@ class Header:
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """Blocks of points; the viewpoint, where it is not the default, is the pose of all."""
+    """Read blocks of points; the viewpoint, where it is not the default, is the pose of all."""
     del options
-    header = _header(path)
+    header = _read_header(path)
     names = header.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
         raise InputError(f"{path}: has the fields {' '.join(names)} but not x y z; export it with coordinates")
-    blocks = {"ascii": _ascii, "binary": _binary, "binary_compressed": _packed}[header.kind](path, header)
-    pose = _pose(header.viewpoint)
+    blocks = {"ascii": _iter_ascii, "binary": _iter_binary, "binary_compressed": _iter_compressed}[header.kind](path, header)
+    pose = _build_pose(header.viewpoint)
     done = 0
     for rows in blocks:
         done += len(rows)
         xyz = np.stack([rows[n] for n in "xyz"], axis=1)
         pose_of = None if pose is None else np.zeros(len(rows), np.int32)
         first = pose if done == len(rows) else None
-        bright = single(rows[INTENSITY]) if INTENSITY in names and not header.dtype[INTENSITY].shape else None
-        yield Piece(xyz, _colors(rows), poses=first, pose_of=pose_of, done=done / header.points, intensities=bright)
+        bright = convert_to_float32(rows[INTENSITY]) if INTENSITY in names and not header.dtype[INTENSITY].shape else None
+        yield Piece(xyz, _decode_colors(rows), poses=first, pose_of=pose_of, done=done / header.points, intensities=bright)
     if done < header.points:
-        raise cut_short(path, done, header.points)
+        raise build_truncation_error(path, done, header.points)
 
 
-def _header(path: Path) -> Header:
+def _read_header(path: Path) -> Header:
     with path.open("rb") as stream:
         head = stream.read(LONGEST_HEADER)
     end = re.search(rb"(?m)^DATA[ \t]+(\w+)[ \t]*\r?\n", head)
@@ -72,19 +71,19 @@ def _header(path: Path) -> Header:
         counts = [int(v) for v in words.get("COUNT", ["1"] * len(names))]
         total = int(words["POINTS"][0]) if "POINTS" in words else int(words["WIDTH"][0]) * int(words["HEIGHT"][0])
         viewpoint = tuple(float(v) for v in words.get("VIEWPOINT", ["0", "0", "0", "1", "0", "0", "0"]))
-        dtype = _dtype(names, sizes, kinds, counts)
+        dtype = _build_dtype(names, sizes, kinds, counts)
     except (KeyError, ValueError, IndexError, TypeError) as error:
-        raise damaged(path, "a PCD file", f"header: {error}") from error
+        raise build_damage_error(path, "a PCD file", f"header: {error}") from error
     kind = end[1].decode("latin-1").lower()
     if kind not in ("ascii", "binary", "binary_compressed") or total < 0 or len(viewpoint) != 7:
-        raise damaged(path, "a PCD file", f"DATA {kind}, {total} points")
+        raise build_damage_error(path, "a PCD file", f"DATA {kind}, {total} points")
     size = path.stat().st_size - end.end()
     if total > size and kind != "binary_compressed":  # a point is at least a byte long
-        raise cut_short(path, 0, total)
+        raise build_truncation_error(path, 0, total)
     return Header(dtype, total, viewpoint, kind, end.end(), len(lines))
 
 
-def _dtype(names: list[str], sizes: list[int], kinds: list[str], counts: list[int]) -> np.dtype:
+def _build_dtype(names: list[str], sizes: list[int], kinds: list[str], counts: list[int]) -> np.dtype:
     """Type of a row. Padding fields are all named "_", so names that repeat get a number."""
     columns = []
     for i, (name, size, kind, count) in enumerate(zip(names, sizes, kinds, counts, strict=True)):
@@ -96,28 +95,28 @@ def _dtype(names: list[str], sizes: list[int], kinds: list[str], counts: list[in
     return np.dtype(columns)
 
 
-def _binary(path: Path, header: Header) -> Iterator[Array]:
+def _iter_binary(path: Path, header: Header) -> Iterator[Array]:
     have = max(path.stat().st_size - header.start, 0) // header.dtype.itemsize
     if have < header.points:
-        raise cut_short(path, have, header.points)
+        raise build_truncation_error(path, have, header.points)
     if header.points:
         rows = np.memmap(path, header.dtype, "r", header.start, (header.points,))
         for first in range(0, header.points, BLOCK_POINTS):
             yield np.asarray(rows[first : first + BLOCK_POINTS])
 
 
-def _packed(path: Path, header: Header) -> Iterator[Array]:
+def _iter_compressed(path: Path, header: Header) -> Iterator[Array]:
     with path.open("rb") as stream:
         stream.seek(header.start)
         sizes, data = stream.read(8), np.frombuffer(stream.read(), np.uint8)
     packed, full = int.from_bytes(sizes[:4], "little"), int.from_bytes(sizes[4:], "little")
     if len(sizes) < 8 or packed > len(data):
-        raise cut_short(path, len(data), packed, "bytes")
+        raise build_truncation_error(path, len(data), packed, "bytes")
     if full != header.points * header.dtype.itemsize or full > BEST_PACKING * max(packed, 1):
-        raise damaged(path, "a PCD file", f"{full:,} bytes for {header.points:,} points")
-    unpacked = lzf_unpack(data[:packed], full)
+        raise build_damage_error(path, "a PCD file", f"{full:,} bytes for {header.points:,} points")
+    unpacked = unpack_lzf(data[:packed], full)
     if unpacked is None:
-        raise damaged(path, "a PCD file", "its compressed data can't be unpacked")
+        raise build_damage_error(path, "a PCD file", "its compressed data can't be unpacked")
     rows, at = np.empty(header.points, header.dtype), 0
     for name in header.dtype.names or ():  # the columns stand one after the other
         column = header.dtype[name]
@@ -128,16 +127,16 @@ def _packed(path: Path, header: Header) -> Iterator[Array]:
         yield rows[first : first + BLOCK_POINTS]
 
 
-def _ascii(path: Path, header: Header) -> Iterator[Array]:
+def _iter_ascii(path: Path, header: Header) -> Iterator[Array]:
     names = header.dtype.names or ()
-    wanted = [n for n in names if n in ("x", "y", "z", "rgb", "rgba", "r", "g", "b", INTENSITY) and not header.dtype[n].shape]
+    requested = [n for n in names if n in ("x", "y", "z", "rgb", "rgba", "r", "g", "b", INTENSITY) and not header.dtype[n].shape]
     widths = [int(np.prod(header.dtype[n].shape, dtype=int)) for n in names]
-    columns = tuple(sum(widths[: names.index(n)]) for n in wanted)
-    kind = np.dtype([(n, header.dtype[n]) for n in wanted])
+    columns = tuple(sum(widths[: names.index(n)]) for n in requested)
+    kind = np.dtype([(n, header.dtype[n]) for n in requested])
     with path.open(encoding="latin-1") as stream:
-        for values in text.rows(path, stream, columns, skip=header.lines):
+        for values in text.iter_rows(path, stream, columns, skip=header.lines):
             rows = np.empty(len(values), kind)
-            for i, name in enumerate(wanted):
+            for i, name in enumerate(requested):
                 integers = kind[name].kind in "iu"
                 column = values[:, i]
                 with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 a number is as good as infinite
@@ -145,7 +144,7 @@ def _ascii(path: Path, header: Header) -> Iterator[Array]:
             yield rows
 
 
-def _colors(rows: Array) -> Array | None:
+def _decode_colors(rows: Array) -> Array | None:
     """(n, 3) uint8 from three fields, or from one of four bytes b, g, r, a."""
     names = rows.dtype.names or ()
     if {"r", "g", "b"} <= set(names):
@@ -157,21 +156,21 @@ def _colors(rows: Array) -> Array | None:
     return np.stack([(packed >> s) & 255 for s in (16, 8, 0)], axis=1).astype(np.uint8)
 
 
-def _pose(viewpoint: tuple[float, ...]) -> Array | None:
+def _build_pose(viewpoint: tuple[float, ...]) -> Array | None:
     """(1, 4, 4) pose of the sensor; None for the default, which says nothing."""
     if viewpoint == (0, 0, 0, 1, 0, 0, 0) or not np.isfinite(viewpoint).all() or not any(viewpoint[3:]):
         return None
-    return pose(unit_quaternion(np.array(viewpoint[3:])), np.array(viewpoint[:3]))[None]
+    return build_pose_matrix(normalize_quaternion(np.array(viewpoint[3:])), np.array(viewpoint[:3]))[None]
 
 
-def unit_quaternion(quaternion: Array) -> Array:
-    """The quaternion (4,), of any length but 0, as one of length 1."""
+def normalize_quaternion(quaternion: Array) -> Array:
+    """Return the quaternion (4,), of any length but 0, as one of length 1."""
     scaled = quaternion / np.abs(quaternion).max()  # its length may be beyond any number
     return scaled / np.linalg.norm(scaled)
 
 
-def pose(quaternion: Array, translation: Array) -> Array:
-    """(4, 4) pose from a unit quaternion w, x, y, z and a translation."""
+def build_pose_matrix(quaternion: Array, translation: Array) -> Array:
+    """Build (4, 4) pose from a unit quaternion w, x, y, z and a translation."""
     w, x, y, z = quaternion
     matrix = np.eye(4)
     matrix[:3, :3] = (

@@ -15,8 +15,15 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io import text
-from topomerge.io.options import ReadOptions
-from topomerge.io.piece import BLOCK_POINTS, Piece, bytes8, cut_short, damaged, single
+from topomerge.io.piece import (
+    BLOCK_POINTS,
+    Piece,
+    ReadOptions,
+    build_damage_error,
+    build_truncation_error,
+    convert_to_float32,
+    convert_to_uint8,
+)
 from topomerge.types import Array
 
 LONGEST_HEADER = 1 << 20  # bytes
@@ -42,12 +49,12 @@ class Element:
         """Do all rows have the same length?"""
         return all(kind is not None for _, kind in self.properties)
 
-    def dtype(self, order: str) -> np.dtype:
-        """Type of a binary row."""
+    def build_dtype(self, order: str) -> np.dtype:
+        """Build type of a binary row."""
         return np.dtype([(name, order + str(kind)) for name, kind in self.properties])
 
-    def shortest(self) -> int:
-        """Bytes that a row needs at least, binary or ascii."""
+    def compute_min_row_size(self) -> int:
+        """Compute the bytes that a row needs at least, binary or ascii."""
         return max(len(self.properties), 1)
 
 
@@ -61,26 +68,26 @@ class Header:
     lines: int
 
     def find(self, name: str) -> Element | None:
-        """The element of that name."""
+        """Find the element of that name."""
         return next((e for e in self.elements if e.name == name), None)
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """Blocks of vertices, and where there are faces points sampled on them."""
+    """Read blocks of vertices, and where there are faces points sampled on them."""
     header = read_header(path)
     vertex, face = header.find("vertex"), header.find("face")
     if vertex is None or not {"x", "y", "z"} <= {n for n, k in vertex.properties if k}:
         raise InputError(f"{path}: has no vertices with x, y and z; export it as a point cloud")
     size = path.stat().st_size
     for element in header.elements:
-        if element.count * element.shortest() > size - header.start:
+        if element.count * element.compute_min_row_size() > size - header.start:
             have = 0  # of others than the first one nobody knows where they begin or end
             if element is header.elements[0] and not header.order:
                 with path.open("rb") as stream:
                     have = sum(1 for _ in stream) - header.lines
             elif element is header.elements[0] and element.fixed:
-                have = (size - header.start) // max(element.dtype(header.order).itemsize, 1)
-            raise cut_short(path, have, element.count, f"rows of {element.name}")
+                have = (size - header.start) // max(element.build_dtype(header.order).itemsize, 1)
+            raise build_truncation_error(path, have, element.count, f"rows of {element.name}")
     before = header.elements[: header.elements.index(vertex)]
     if (face is not None and face.count) or not all(e.fixed for e in (*before, vertex)):
         yield from _read_whole(path, options)
@@ -91,7 +98,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
 
 
 def read_header(path: Path) -> Header:
-    """The header of a PLY file.
+    """Read the header of a PLY file.
 
     Raises:
         InputError: it is not one.
@@ -116,41 +123,41 @@ def read_header(path: Path) -> Header:
                 is_list = words[1] == "list"
                 elements[-1].properties.append((words[-1], None if is_list else PLY_TYPES[words[1]]))
         except (KeyError, IndexError, ValueError) as error:
-            raise damaged(path, "a PLY file", f"header line {' '.join(words)!r}") from error
+            raise build_damage_error(path, "a PLY file", f"header line {' '.join(words)!r}") from error
     if order is None or any(e.count < 0 or len({n for n, _ in e.properties}) < len(e.properties) for e in elements):
-        raise damaged(path, "a PLY file", "no format line, a negative count or a property named twice")
+        raise build_damage_error(path, "a PLY file", "no format line, a negative count or a property named twice")
     return Header(order, elements, end.end(), len(lines))
 
 
-def color_names(names: list[str]) -> tuple[str, ...]:
-    """The names of the colour channels, or none."""
+def find_color_names(names: list[str]) -> tuple[str, ...]:
+    """Find the names of the colour channels, or none."""
     return next((c for c in text.COLOR_COLUMNS if all(n in names for n in c)), ())
 
 
-def intensity_name(names: list[str]) -> str:
-    """The name of the intensity, or none."""
+def find_intensity_name(names: list[str]) -> str:
+    """Find the name of the intensity, or none."""
     return next((n for n in names if n.lower() in INTENSITY_NAMES), "")
 
 
 def _read_binary(path: Path, header: Header, before: list[Element], vertex: Element) -> Iterator[Piece]:
-    dtype = vertex.dtype(header.order)
-    start = header.start + sum(e.count * e.dtype(header.order).itemsize for e in before)
+    dtype = vertex.build_dtype(header.order)
+    start = header.start + sum(e.count * e.build_dtype(header.order).itemsize for e in before)
     have = max(path.stat().st_size - start, 0) // dtype.itemsize
     if have < vertex.count:
-        raise cut_short(path, have, vertex.count)
+        raise build_truncation_error(path, have, vertex.count)
     if not vertex.count:
         return
     rows = np.memmap(path, dtype, "r", start, (vertex.count,))
     names = [n for n, _ in vertex.properties]
-    colors, shade = color_names(names), intensity_name(names)
+    colors, shade = find_color_names(names), find_intensity_name(names)
     for first in range(0, vertex.count, BLOCK_POINTS):
         block = rows[first : first + BLOCK_POINTS]
         done = (first + len(block)) / vertex.count
-        bright = single(block[shade]) if shade else None
-        yield Piece(_stack(block, ("x", "y", "z")), _colors(block, colors), done=done, intensities=bright)
+        bright = convert_to_float32(block[shade]) if shade else None
+        yield Piece(_stack_columns(block, ("x", "y", "z")), _stack_colors(block, colors), done=done, intensities=bright)
 
 
-def _stack(rows: Array, names: tuple[str, ...]) -> Array:
+def _stack_columns(rows: Array, names: tuple[str, ...]) -> Array:
     """(n, 3) from three columns of a structured array, in the machine's byte order."""
     kind = np.result_type(*(rows.dtype[n] for n in names)).newbyteorder("=")
     out = np.empty((len(rows), len(names)), kind)
@@ -159,29 +166,29 @@ def _stack(rows: Array, names: tuple[str, ...]) -> Array:
     return out
 
 
-def _colors(rows: Array, names: tuple[str, ...]) -> Array | None:
-    return bytes8(_stack(rows, names)) if names else None
+def _stack_colors(rows: Array, names: tuple[str, ...]) -> Array | None:
+    return convert_to_uint8(_stack_columns(rows, names)) if names else None
 
 
 def _read_ascii(path: Path, header: Header, before: list[Element], vertex: Element) -> Iterator[Piece]:
     names = [n for n, _ in vertex.properties]
-    shades, shade = color_names(names), intensity_name(names)
-    wanted = ("x", "y", "z", *shades, *([shade] if shade else []))
-    columns = tuple(names.index(n) for n in wanted)
+    shades, shade = find_color_names(names), find_intensity_name(names)
+    requested = ("x", "y", "z", *shades, *([shade] if shade else []))
+    columns = tuple(names.index(n) for n in requested)
     count = 0
     with path.open(encoding="latin-1") as stream:
         skip = header.lines + sum(e.count for e in before)
         lines = itertools.islice(stream, skip + vertex.count)
-        for values in text.rows(path, lines, columns, skip=skip):
+        for values in text.iter_rows(path, lines, columns, skip=skip):
             count += len(values)
             colors = values[:, 3:6] if shades else None
-            bright = single(values[:, -1]) if shade else None
+            bright = convert_to_float32(values[:, -1]) if shade else None
             if colors is not None and vertex.properties[columns[3]][1] not in ("f4", "f8"):
                 colors = colors.clip(0, 65535).astype(np.int64)
-            shown = None if colors is None else bytes8(colors)
+            shown = None if colors is None else convert_to_uint8(colors)
             yield Piece(values[:, :3], shown, done=count / vertex.count, intensities=bright)
     if count < vertex.count:
-        raise cut_short(path, count, vertex.count)
+        raise build_truncation_error(path, count, vertex.count)
 
 
 def _read_whole(path: Path, options: ReadOptions) -> Iterator[Piece]:
@@ -196,18 +203,18 @@ def _read_whole(path: Path, options: ReadOptions) -> Iterator[Piece]:
         except (PlyElementParseError, KeyError, ValueError):
             data = PlyData.read(str(path))  # slower: not all faces are triangles
     except (PlyElementParseError, PlyHeaderParseError) as error:
-        raise damaged(path, "a PLY file", error) from error
+        raise build_damage_error(path, "a PLY file", error) from error
     rows = data["vertex"].data
-    vertices = _stack(rows, ("x", "y", "z"))
-    colors = _colors(rows, color_names(list(rows.dtype.names or ())))
+    vertices = _stack_columns(rows, ("x", "y", "z"))
+    colors = _stack_colors(rows, find_color_names(list(rows.dtype.names or ())))
     yield Piece(vertices, colors, done=0.5)
     faces = data["face"].data if "face" in data else np.empty(0, [("none", "u1")])
     name = next((n for n in ("vertex_indices", "vertex_index") if n in (faces.dtype.names or ())), None)
     if name is not None and len(faces):
-        yield from sample(path, vertices, _triangles(faces[name]), options, colors)
+        yield from sample(path, vertices, _triangulate(faces[name]), options, colors)
 
 
-def _triangles(polygons: Array) -> Array:
+def _triangulate(polygons: Array) -> Array:
     """(m, 3) int64 fans of triangles of polygons given as an (n, k) array or an object array of index lists."""
     if polygons.dtype != object:
         return polygons.astype(np.int64)

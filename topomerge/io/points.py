@@ -1,4 +1,6 @@
-"""Points in: one door for every format.
+"""From the pieces of a reader to clouds of a wanted size: placed, cleaned, judged.
+
+Points in: one door for every format.
 
 `read_points` and `read_chunks` find the reader by the file's suffix, bring what it hands over into metres with z up, and turn
 every failure into an `InputError` of one line. Only the reader that is needed is imported.
@@ -15,11 +17,239 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from topomerge.errors import InputError, is_memory_short
-from topomerge.io.gather import Gatherer
-from topomerge.io.options import ReadOptions, read_options
-from topomerge.io.piece import Piece, damaged, refuse_pointer
-from topomerge.types import PointCloud
+from topomerge.io import frame
+from topomerge.io.frame import get_axis_rotation
+from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_options, refuse_pointer
+from topomerge.types import Array, PointCloud, TrueRoom, VoxelGrid
+
+LARGE, HIGH = 2000.0, 100.0  # m, extents beyond what is scanned as one building
+SLAB_THICKNESS = 0.1  # m
+STOREY_HEIGHT = 4.5  # m
+LOWEST_ROOM, HIGHEST_ROOM = 2.0, 3.6  # m, usual heights of a room
+DEGREES_ACROSS = 0.1  # degrees, 11 km: no scan of a building is as wide
+DEGREES_TALLER = 20.0  # times as tall (m) as across (degrees): no building in metres is
+DEGREES_AWAY = 1.0  # degrees from 0, 0, which lies in the sea
+JUDGED_POINTS = 200  # points below which nothing is judged
+
+
+class PointSample:
+    """A thinned copy of all points seen so far, of bounded size."""
+
+    def __init__(self, limit: int = 400_000) -> None:
+        self.limit = limit
+        self.step = 1
+        self.parts: list[Array] = []
+
+    def add(self, points: Array) -> None:
+        """Take every `step`-th of the (n, 3) points."""
+        self.parts.append(np.array(points[:: self.step], np.float64))
+        while sum(len(p) for p in self.parts) > self.limit:
+            self.step *= 2
+            self.parts = [p[::2] for p in self.parts]
+
+    @property
+    def points(self) -> Array:
+        """(n, 3) float64."""
+        return np.concatenate(self.parts) if self.parts else np.empty((0, 3))
+
+
+def warn_about(points: Array, up: str | None) -> list[str]:
+    """Warn about a sample of placed points (n, 3) that look wrong.
+
+    Args:
+        points: (n, 3), metres, z up.
+        up: the axis of the file that was taken as up; None where the format states its own unit and up axis.
+    """
+    if len(points) < JUDGED_POINTS:
+        return []
+    low, high = np.percentile(points, (1, 99), axis=0)
+    if up is None:
+        return _check_unit(high - low, ())
+    units = (("mm", 0.001), ("cm", 0.01))
+    return _check_degrees(low, high) or _check_unit(high - low, units) or _check_up_axis(points, low, high, up)
+
+
+def _check_degrees(low: Array, high: Array) -> list[str]:
+    """Are x and y longitude and latitude, and only z a length?"""
+    across, tall = float((high - low)[:2].max()), float(high[2] - low[2])
+    on_earth = bool((np.abs((low, high))[:, :2] <= 180.0).all() and (np.abs((low, high))[:, :2].min(axis=1) <= 90.0).all())
+    if not (0 < across <= DEGREES_ACROSS and tall >= DEGREES_TALLER * across and on_earth):
+        return []
+    if np.hypot(*low[:2]) < DEGREES_AWAY:
+        return []
+    x, y = (f"{axis} {low[k]:.5f} to {high[k]:.5f}" for k, axis in enumerate("xy"))
+    return [f"coordinates look like degrees of longitude and latitude ({x}, {y}): project them to metres first, as to UTM"]
+
+
+def _check_unit(extent: Array, units: tuple[tuple[str, float], ...]) -> list[str]:
+    size = " x ".join(f"{e:.4g}" for e in extent)
+    check = "check --unit and --scale" if units else "check --scale and --resolution"
+    across, tall = float(extent[:2].max()), float(extent[2])
+    if across > LARGE or tall > HIGH:
+        for unit, factor in units:
+            if 1.5 <= tall * factor <= 400 and 1.5 <= across * factor <= LARGE:
+                name = {"mm": "millimetres", "cm": "centimetres"}[unit]
+                return [f"coordinates look like {name} (extent {size}): give --unit {unit}"]
+        return [f"extent of {size} m is beyond any building: {check}"]
+    if max(across, tall) < 0.5:
+        return [f"extent of {size} m is smaller than any room: {check}"]
+    return []
+
+
+def _check_up_axis(points: Array, low: Array, high: Array, up: str) -> list[str]:
+    scores = compute_flatness(points, low, high)
+    best = int(np.argmax(scores))
+    tall, narrow = high[2] - low[2], float((high - low)[:2].min())
+    # A corridor seen without floor and ceiling is flat across its walls too, but it is not taller than a storey; a shaft or
+    # a tower is, but flat across both pairs of its walls.
+    second = sorted(scores)[1]
+    clear = scores[best] >= max(0.12, 1.8 * second) or scores[best] >= max(0.08, 2.5 * second)
+    if STOREY_HEIGHT <= tall <= 2 * STOREY_HEIGHT and not clear and LOWEST_ROOM <= narrow <= HIGHEST_ROOM:
+        return [f"{tall:.1f} m tall, but only {narrow:.1f} m wide: if another axis than {up} is up in this file, give --up"]
+    if best == 2 or not clear or tall < STOREY_HEIGHT:
+        return []
+    axis = "xyz"[int(np.abs(get_axis_rotation(up)[best]).argmax())]
+    return [
+        f"floors and ceilings seem to lie across {axis}, not {up} ({scores[best]:.0%} of the surface lies flat in "
+        f"{axis}, {scores[2]:.0%} in {up}): if {axis} is up in this file, give --up {axis}"
+    ]
+
+
+def compute_flatness(points: Array, low: Array, high: Array) -> list[float]:
+    """Share of the surface that lies in the strongest slab across x, y and z; the surface is counted in occupied cells."""
+    inside = points[((points >= low - SLAB_THICKNESS) & (points <= high + SLAB_THICKNESS)).all(axis=1)]
+    cells = np.floor((inside - inside.min(axis=0)) / SLAB_THICKNESS).astype(np.int64)
+    ny, nz = (int(n) for n in cells.max(axis=0)[1:] + 1)
+    codes = np.unique((cells[:, 0] * ny + cells[:, 1]) * nz + cells[:, 2])
+    slabs = (codes // (ny * nz), codes // nz % ny, codes % nz)
+    return [float(np.convolve(np.bincount(s), (1, 1)).max() / len(codes)) for s in slabs]
+
+
+BEYOND = 1e30  # m; larger values are as good as infinite, and float32 ends at 3e38
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Placed points with what belongs to each."""
+
+    points: Array
+    colors: Array | None = None
+    labels: Array | None = None
+    pose_of: Array | None = None
+    intensities: Array | None = None
+
+    def select(self, rows: Array | slice) -> _Part:
+        values = (self.points, self.colors, self.labels, self.pose_of, self.intensities)
+        return _Part(*(None if v is None else v[rows] for v in values))  # type: ignore[arg-type]
+
+
+def _join(parts: list[_Part]) -> _Part:
+    """All parts as one and nothing left in the list. What a part lacks is black, without room, pose or intensity."""
+    if len(parts) == 1:
+        return parts.pop()
+    rows = [len(p.points) for p in parts]
+    columns: list[Array | None] = []
+    for name, blank in (("points", 0), ("colors", 0), ("labels", -1), ("pose_of", -1), ("intensities", np.nan)):
+        values = [getattr(p, name) for p in parts]
+        present = next((v for v in values if v is not None), None)
+        if present is None:
+            columns.append(None)
+            continue
+        shape, kind = present.shape[1:], present.dtype
+        full = (np.full((n, *shape), blank, kind) if v is None else v for v, n in zip(values, rows, strict=True))
+        columns.append(np.concatenate(list(full)))
+    parts.clear()
+    return _Part(*columns)  # type: ignore[arg-type]
+
+
+class Gatherer:
+    """Collects pieces of one file and hands out clouds.
+
+    Args:
+        source: path of the file, for the clouds and for errors.
+        up: axis of the file that points up; None: the format states its own unit and z is up.
+        factor: metres per unit of the file.
+        chunk: points a cloud.
+        warnings: what is already known to be said about the file.
+    """
+
+    def __init__(self, source: str, up: str | None, factor: float, chunk: int, warnings: list[str]) -> None:
+        self.source, self.up, self.factor, self.chunk = source, up, factor, chunk
+        self.rotation = frame.get_axis_rotation(up or "z")
+        self.shift: Array | None = None
+        self.warnings = list(warnings)
+        self.sample = PointSample()
+        self.dropped = 0
+        self.parts: list[_Part] = []
+        self.size = 0
+        self.poses: Array | None = None
+        self.free: VoxelGrid | None = None
+        self.rooms: tuple[TrueRoom, ...] = ()
+        self.pending: PointCloud | None = None  # the last full cloud, held back because the last one carries the warnings
+
+    def add(self, piece: Piece) -> Iterator[PointCloud]:
+        """Take a piece in; yields the clouds that are now complete."""
+        self._update_metadata(piece)
+        if len(piece.points):
+            part = self._transform_piece(piece)
+            self.parts.append(part)
+            self.size += len(part.points)
+        while self.size >= self.chunk:
+            joined = _join(self.parts)
+            if self.size > self.chunk:
+                self.parts.append(joined.select(slice(self.chunk, None)))
+            self.size -= self.chunk
+            yield from self._emit_cloud(joined.select(slice(None, self.chunk)))
+
+    def finish(self) -> Iterator[PointCloud]:
+        """Yield the clouds that are left; the last one carries all warnings."""
+        if self.size:
+            yield from self._emit_cloud(_join(self.parts))
+        if self.pending is None:
+            lost = f"; all {self.dropped:,} are not finite" if self.dropped else ""
+            raise InputError(f"{self.source}: holds no points{lost}; export it again")
+        if self.dropped:
+            self.warnings.append(f"{self.dropped:,} points were not finite and are left out")
+        self.warnings += warn_about(self.sample.points, self.up)
+        yield replace(self.pending, warnings=tuple(dict.fromkeys(self.warnings)))
+
+    def _update_metadata(self, piece: Piece) -> None:
+        """Keep what a piece says about the whole file."""
+        self.warnings += piece.warnings
+        self.rooms += frame.scale_rooms(piece.rooms, self.factor)
+        if piece.poses is not None:
+            placed = frame.transform_poses(piece.poses, self.rotation, self.factor)
+            self.poses = placed if self.poses is None else np.concatenate([self.poses, placed])
+        if piece.free is not None and len(piece.free):
+            self.free = frame.transform_grid(piece.free, self.rotation, self.factor)
+
+    def _transform_piece(self, piece: Piece) -> _Part:
+        points = frame.transform_points(piece.points, self.rotation, self.factor)
+        part = _Part(points, piece.colors, piece.labels, piece.pose_of, piece.intensities)
+        if not (points.min() > -BEYOND and points.max() < BEYOND):  # so of nan, too
+            finite = np.asarray((np.abs(points) < BEYOND).all(axis=1))
+            self.dropped += int(len(points) - finite.sum())
+            part = part.select(finite)
+        if self.shift is None and len(part.points):
+            self.shift = frame.choose_shift(part.points)
+        self.sample.add(part.points)
+        shift = np.zeros(3) if self.shift is None else self.shift
+        return replace(part, points=(part.points - shift).astype(np.float32))
+
+    def _emit_cloud(self, part: _Part) -> Iterator[PointCloud]:
+        assert self.shift is not None
+        cloud = PointCloud(
+            part.points, self.shift, part.colors, part.labels, self.poses, part.pose_of, self.free, self.rooms, self.source
+        )
+        cloud = replace(cloud, intensities=part.intensities, upright=self.up is None)
+        self.free, self.rooms = None, ()
+        if self.pending is not None:
+            yield self.pending
+        self.pending = cloud
+
 
 Progress = Callable[[float, str], None]
 Block = TypeVar("Block")
@@ -73,18 +303,18 @@ OCTREES = {  # by the file that names all others
 POSED_RGBD_FOLDER = Format("a folder of RGB-D images with their poses", "rgbd_folders", ())
 
 
-def suffixes() -> tuple[str, ...]:
-    """Every suffix that can be read."""
+def list_suffixes() -> tuple[str, ...]:
+    """List every suffix that can be read."""
     return tuple(s for f in FORMATS for s in f.suffixes)
 
 
 def read_points(path: str | Path, *, progress: Progress | None = None, **options: Any) -> PointCloud:
-    """The points of a file as one cloud, in metres, z up: ``read_points("a.ply", up="y", unit="mm")``.
+    """Read the points of a file as one cloud, in metres, z up: ``read_points("a.ply", up="y", unit="mm")``.
 
     Args:
         path: the file, whose suffix names the format, or a folder of scans.
         progress: called now and then with the share done and a text.
-        options: those of `topomerge.io.options.ReadOptions`: ``up``, ``unit``, ``scale`` of the coordinates; ``resolution``,
+        options: those of `topomerge.io.piece.ReadOptions`: ``up``, ``unit``, ``scale`` of the coordinates; ``resolution``,
             ``extrude``, ``ceiling`` of floor plans; ``spacing`` of points on surfaces; ``doors`` of building models; ``poses``
             and ``topic`` of scans; ``one_frame`` of a folder whose files are parts of one cloud.
 
@@ -97,7 +327,7 @@ def read_points(path: str | Path, *, progress: Progress | None = None, **options
 def read_chunks(
     path: str | Path, *, chunk: int = 2_000_000, progress: Progress | None = None, **options: Any
 ) -> Iterator[PointCloud]:
-    """The points of a file as clouds of at most `chunk` points, for files larger than memory.
+    """Read the points of a file as clouds of at most `chunk` points, for files larger than memory.
 
     All clouds share one shift. Poses, free space and true rooms come with the first, warnings about the whole file with the
     last. Meshes, building models, OctoMaps and NumPy archives are read whole and then cut.
@@ -109,7 +339,7 @@ def read_chunks(
         options: as of `read_points`, whose errors these are, too.
     """
     path = Path(path)
-    file_format = format_of(path)
+    file_format = detect_format(path)
     reading = read_options(path, options)
     if reading.one_frame and file_format is SCAN_FOLDER:
         file_format = TILES_FOLDER
@@ -127,24 +357,24 @@ def read_chunks(
         reading = replace(reading, unit=None, up=None)
     up = None if file_format.fixed else reading.up or file_format.up
     gatherer = Gatherer(str(path), up, reading.factor, chunk, warnings)
-    return _chunks(path, _pieces(path, file_format, reading), gatherer, progress)
+    return _iter_chunks(path, _iter_pieces(path, file_format, reading), gatherer, progress)
 
 
-def format_of(path: Path) -> Format:
-    """The format of a file that exists and can be opened, or of a folder.
+def detect_format(path: Path) -> Format:
+    """Return the format of a file that exists and can be opened, or of a folder.
 
     Raises:
         InputError: it can't, or its suffix is that of no format.
     """
     if path.is_dir():
-        return _folder_format(path)
+        return _detect_folder_format(path)
     for file_format in (OCTREES[path.name],) if path.name in OCTREES else FORMATS:
         if path.name in OCTREES or path.suffix.lower() in file_format.suffixes:
             break
     else:
         if path.suffix.lower() == ".tmap":
             raise InputError(f"{path}: is a map already; give the scan that it was made of, or see it with `topomerge info`")
-        readable = " ".join(s[1:] for s in suffixes())
+        readable = " ".join(s[1:] for s in list_suffixes())
         raise InputError(f"{path}: unknown suffix {path.suffix or '(none)'}; rename or export it as one of {readable}")
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: is no regular file (a pipe or a device); give the name of a file")
@@ -161,7 +391,7 @@ def format_of(path: Path) -> Format:
     return file_format
 
 
-def _folder_format(path: Path) -> Format:
+def _detect_folder_format(path: Path) -> Format:
     """What a folder holds: a ROS 2 bag or parts of a bag, an octree of files, RGB-D images, or scans."""
     bag = next(f for f in FORMATS if f.module == "bag")
     names = [p.name for p in path.iterdir() if not p.name.startswith(".")]
@@ -174,17 +404,17 @@ def _folder_format(path: Path) -> Format:
         raise InputError(f"{path}: is a Potree 2 point cloud, which is not read; give the LAS or LAZ file that it was made of")
     if "depth.txt" in names:
         return RGBD_FOLDER
-    from topomerge.io.rgbd_folders import layout_of
+    from topomerge.io.rgbd_folders import find_layout
 
-    return POSED_RGBD_FOLDER if layout_of(path) else SCAN_FOLDER
-
-
-def _pieces(path: Path, file_format: Format, options: ReadOptions) -> Iterator[Piece]:
-    return guarded(path, file_format, lambda reader: reader.read(path, options))
+    return POSED_RGBD_FOLDER if find_layout(path) else SCAN_FOLDER
 
 
-def guarded(path: Path, file_format: Format, blocks: Callable[[Any], Iterator[Block]]) -> Iterator[Block]:
-    """What the reader of a format hands over, a block at a time.
+def _iter_pieces(path: Path, file_format: Format, options: ReadOptions) -> Iterator[Piece]:
+    return iter_guarded(path, file_format, lambda reader: reader.read(path, options))
+
+
+def iter_guarded(path: Path, file_format: Format, blocks: Callable[[Any], Iterator[Block]]) -> Iterator[Block]:
+    """Yield the blocks of a format's reader, with its errors converted to `InputError`.
 
     Args:
         path: of the file.
@@ -218,7 +448,7 @@ def guarded(path: Path, file_format: Format, blocks: Callable[[Any], Iterator[Bl
         _refuse_pointers_in(path)
         if is_memory_short(error):
             raise InputError(f"{path}: does not fit into memory; use a machine with more, or thin the file") from error
-        raise damaged(path, file_format.name, error) from error
+        raise build_damage_error(path, file_format.name, error) from error
 
 
 def _refuse_pointers_in(folder: Path) -> None:
@@ -229,7 +459,7 @@ def _refuse_pointers_in(folder: Path) -> None:
                 refuse_pointer(file)
 
 
-def _chunks(path: Path, pieces: Iterable[Piece], gatherer: Gatherer, progress: Progress | None) -> Iterator[PointCloud]:
+def _iter_chunks(path: Path, pieces: Iterable[Piece], gatherer: Gatherer, progress: Progress | None) -> Iterator[PointCloud]:
     for piece in pieces:
         yield from gatherer.add(piece)
         if progress is not None:

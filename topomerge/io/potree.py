@@ -17,10 +17,18 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.las import las_node
-from topomerge.io.octree import MOST_LEVELS, check_node, deepest_level, load_json, packed_colors, packed_rows
-from topomerge.io.options import ReadOptions
-from topomerge.io.piece import Piece, damaged
+from topomerge.io.las import read_las_node
+from topomerge.io.piece import (
+    MOST_LEVELS,
+    Piece,
+    ReadOptions,
+    build_damage_error,
+    check_node,
+    compute_deepest_level,
+    decode_colors,
+    decode_rows,
+    load_json,
+)
 from topomerge.types import Array
 
 POTREE_KIND = "a Potree 1.x point cloud"
@@ -53,17 +61,17 @@ class Octree:
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """The points of all nodes, or of those that are coarse enough for `spacing`."""
+    """Read the points of all nodes, or of those that are coarse enough for `spacing`."""
     folder = path if path.is_dir() else path.parent
-    octree = _octree(folder / "cloud.js")
+    octree = _read_octree(folder / "cloud.js")
     done = 0
-    for name, count in _nodes(octree, deepest_level(octree.spacing, options)):
-        for piece in _points(octree, name, count, options):
+    for name, count in _iter_nodes(octree, compute_deepest_level(octree.spacing, options)):
+        for piece in _read_node(octree, name, count, options):
             done += len(piece.points)
             yield replace(piece, done=done / max(octree.points, done, 1))
 
 
-def _octree(file: Path) -> Octree:
+def _read_octree(file: Path) -> Octree:
     values = load_json(file, POTREE_KIND)
     version = str(values.get("version", "none"))
     if not re.fullmatch(r"1\.\d{1,3}(\.\d+)?", version) or not VERSIONS[0] <= int(version.split(".")[1]) <= VERSIONS[1]:
@@ -76,21 +84,21 @@ def _octree(file: Path) -> Octree:
         step = 0 if listed else int(values["hierarchyStepSize"])
         spacing, scale, points = float(values["spacing"]), float(values.get("scale", 1.0)), int(values.get("points", 0))
         inside = PurePosixPath(str(values.get("octreeDir", "data")))
-        suffix, layout = _layout(file, values["pointAttributes"])
+        suffix, layout = _parse_attributes(file, values["pointAttributes"])
     except InputError:
         raise
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise damaged(file, POTREE_KIND, f"{type(error).__name__}: {error}") from error
+        raise build_damage_error(file, POTREE_KIND, f"{type(error).__name__}: {error}") from error
     with np.errstate(over="ignore", invalid="ignore"):  # what is too wide is refused below
         edge = float((high - low).max())
     if not (np.isfinite([*low, *high, edge, scale]).all() and edge > 0 and scale > 0 and (listed or step > 0)):
-        raise damaged(file, POTREE_KIND, "its bounding box, scale or hierarchyStepSize can't be used")
+        raise build_damage_error(file, POTREE_KIND, "its bounding box, scale or hierarchyStepSize can't be used")
     if inside.is_absolute() or ".." in inside.parts:
         raise InputError(f"{file}: has its points outside of its folder ({str(inside)[:100]}); put them beside it")
     return Octree(file.parent / inside, step, listed, low, edge, scale, spacing, points, suffix, layout)
 
 
-def _layout(file: Path, attributes: Any) -> tuple[str, np.dtype[Any] | None]:
+def _parse_attributes(file: Path, attributes: Any) -> tuple[str, np.dtype[Any] | None]:
     """The suffix of nodes, and the layout of their rows where they are packed."""
     if isinstance(attributes, str) and attributes in FILES:
         return FILES[attributes], None
@@ -113,21 +121,21 @@ def _layout(file: Path, attributes: Any) -> tuple[str, np.dtype[Any] | None]:
     return "bin", layout
 
 
-def _nodes(octree: Octree, deepest: int) -> Iterator[tuple[str, int]]:
+def _iter_nodes(octree: Octree, deepest: int) -> Iterator[tuple[str, int]]:
     """Name and number of points of each node; a file of the hierarchy is read when its turn comes."""
     if octree.listed:
         if len(dict(octree.listed)) < len(octree.listed):
-            raise damaged(octree.folder, POTREE_KIND, "a node is listed twice")
+            raise build_damage_error(octree.folder, POTREE_KIND, "a node is listed twice")
         for name, count in octree.listed:
             if not NODE_NAME.fullmatch(name) or len(name) - 1 > MOST_LEVELS or count < 0:
-                raise damaged(octree.folder, POTREE_KIND, f"a node {name[:40]!r} with {count} points")
+                raise build_damage_error(octree.folder, POTREE_KIND, f"a node {name[:40]!r} with {count} points")
             if len(name) - 1 <= deepest and count:
                 yield name, count
         return
     roots = ["r"]
     while roots:
         root = roots.pop()
-        for name, count, more in _hierarchy(octree, root):
+        for name, count, more in _iter_hierarchy(octree, root):
             if len(name) - 1 > deepest:
                 break  # breadth first: the rest is as deep
             if more:
@@ -136,9 +144,9 @@ def _nodes(octree: Octree, deepest: int) -> Iterator[tuple[str, int]]:
                 yield name, count
 
 
-def _hierarchy(octree: Octree, root: str) -> Iterator[tuple[str, int, bool]]:
+def _iter_hierarchy(octree: Octree, root: str) -> Iterator[tuple[str, int, bool]]:
     """Name, number of points, and whether it has a file of its own, of each node in a file of the hierarchy, by level."""
-    file = _place(octree, root).with_suffix(".hrc")
+    file = _build_node_path(octree, root).with_suffix(".hrc")
     check_node(file)
     data = file.read_bytes()
     entries = HRC_ENTRY.iter_unpack(data[: len(data) // HRC_ENTRY.size * HRC_ENTRY.size])
@@ -154,11 +162,11 @@ def _hierarchy(octree: Octree, root: str) -> Iterator[tuple[str, int, bool]]:
             yield name, count, last and children != 0
             deeper += [] if last else [f"{name}{k}" for k in range(8) if children >> k & 1]
         if deeper and len(deeper[0]) - 1 > MOST_LEVELS:
-            raise damaged(file, POTREE_KIND, f"more than {MOST_LEVELS} levels")
+            raise build_damage_error(file, POTREE_KIND, f"more than {MOST_LEVELS} levels")
         names = deeper
 
 
-def _place(octree: Octree, name: str) -> Path:
+def _build_node_path(octree: Octree, name: str) -> Path:
     """Where the files of a node lie, without a suffix."""
     if octree.listed:
         return octree.folder / name
@@ -166,17 +174,17 @@ def _place(octree: Octree, name: str) -> Path:
     return octree.folder.joinpath("r", *parts, name)
 
 
-def _points(octree: Octree, name: str, count: int, options: ReadOptions) -> Iterator[Piece]:
-    file = _place(octree, name).with_suffix(f".{octree.suffix}")
+def _read_node(octree: Octree, name: str, count: int, options: ReadOptions) -> Iterator[Piece]:
+    file = _build_node_path(octree, name).with_suffix(f".{octree.suffix}")
     if octree.layout is None:
-        yield from las_node(file, count, options)
+        yield from read_las_node(file, count, options)
         return
     check_node(file)
-    rows = packed_rows(file, file.read_bytes(), octree.layout, count)
-    yield Piece(rows["place"].astype(np.float64) * octree.scale + _corner(octree, name), packed_colors(rows))
+    rows = decode_rows(file, file.read_bytes(), octree.layout, count)
+    yield Piece(rows["place"].astype(np.float64) * octree.scale + _compute_corner(octree, name), decode_colors(rows))
 
 
-def _corner(octree: Octree, name: str) -> Array:
+def _compute_corner(octree: Octree, name: str) -> Array:
     """(3,) lower corner of a node's cube: each figure of its name halves the cube, x by 4, y by 2, z by 1."""
     corner, edge = octree.low.copy(), octree.edge
     for figure in name[1:]:

@@ -13,10 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.depth_images import Camera, Frame, posed_scans
-from topomerge.io.options import ReadOptions
-from topomerge.io.piece import Piece
-from topomerge.io.posed import pieces
+from topomerge.io.depth_images import Camera, Frame, iter_pieces, iter_posed_scans
+from topomerge.io.piece import Piece, ReadOptions
 from topomerge.io.trajectory import LONGEST_GAP, Trajectory, read_trajectory
 
 COLOR_GAP = 0.05  # s between a depth image and its colours
@@ -31,20 +29,20 @@ USUAL_CAMERA = (525.0, 525.0, 319.5, 239.5)
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """Points of every depth image in the frame of the trajectory, image by image."""
+    """Read points of every depth image in the frame of the trajectory, image by image."""
     source = Path(options.poses) if options.poses else path / "groundtruth.txt"
     if not source.exists() and not options.poses:
         raise InputError(f"{path}: has depth images, but no groundtruth.txt; give --poses with a trajectory (TUM)")
     trajectory = read_trajectory(source)
     if trajectory.times is None:
         raise InputError(f"{source}: has no times; give a trajectory in the format of TUM, with those of the images")
-    camera, said = _camera(path)
-    depths = _images(path, "depth.txt")
-    colors = _images(path, "rgb.txt") if (path / "rgb.txt").is_file() else []
-    yield from pieces(posed_scans(path, _frames(path, depths, colors, trajectory, camera), said), said)
+    camera, said = _read_camera(path)
+    depths = _read_image_list(path, "depth.txt")
+    colors = _read_image_list(path, "rgb.txt") if (path / "rgb.txt").is_file() else []
+    yield from iter_pieces(iter_posed_scans(path, _iter_frames(path, depths, colors, trajectory, camera), said), said)
 
 
-def _camera(path: Path) -> tuple[Camera, list[str]]:
+def _read_camera(path: Path) -> tuple[Camera, list[str]]:
     """The camera of a folder, and what the user should know of it."""
     stated = path / "camera.txt"
     if stated.is_file():
@@ -64,7 +62,7 @@ def _camera(path: Path) -> tuple[Camera, list[str]]:
     return Camera((fx, fy), (cx, cy), DEPTH_OF_METRE, TUM_SIZE, mend), [] if name else [usual]
 
 
-def _images(path: Path, name: str) -> list[tuple[float, Path]]:
+def _read_image_list(path: Path, name: str) -> list[tuple[float, Path]]:
     """(time, file) of each image of a list, in ascending time.
 
     Raises:
@@ -89,16 +87,16 @@ def _images(path: Path, name: str) -> list[tuple[float, Path]]:
     return images
 
 
-def _frames(
+def _iter_frames(
     path: Path, depths: list[tuple[float, Path]], colors: list[tuple[float, Path]], trajectory: Trajectory, camera: Camera
 ) -> Iterator[Frame]:
     """One image after the other, without a pose where there is none near its time."""
     times = np.array([time for time, _ in depths])
-    near = trajectory.gap(times) <= LONGEST_GAP
+    near = trajectory.measure_gap(times) <= LONGEST_GAP
     if not near.any():
         raise InputError(f"{path}: no depth image has a pose within {LONGEST_GAP:g} s; give --poses with those of these images")
     color_times = np.array([time for time, _ in colors])
-    for number, pose in enumerate(trajectory.at(times)):
+    for number, pose in enumerate(trajectory.interpolate(times)):
         time, file = depths[number]
         shown = None
         if len(colors) and abs(color_times[nearest := int(np.abs(color_times - time).argmin())] - time) <= COLOR_GAP:

@@ -1,28 +1,201 @@
-"""RTAB-Map databases: the laser scans or depth images of all nodes, each where the graph, when it was last optimised, puts it.
-
-Read are laser scans with x y z, else depth images, else laser slices. Without optimised poses those of the odometry are taken,
-if they are of one session. The file is opened for reading only, as one that nobody changes, and nothing in it is run.
-"""
+"""Read databases of RTAB-Map."""
 
 from __future__ import annotations
 
 import re
 import sqlite3
+import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io import rtabmap_blobs as blobs
-from topomerge.io.depth_images import Frame, posed_scans, read_color
-from topomerge.io.options import ReadOptions
-from topomerge.io.piece import Piece, damaged, read_head
-from topomerge.io.posed import PosedScan, pieces
-from topomerge.io.trajectory import no_rotations
+from topomerge.io.depth_images import Camera, Frame, PosedScan, iter_pieces, iter_posed_scans, read_color, read_pixels
+from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_head
+from topomerge.io.trajectory import find_invalid_rotations
 from topomerge.types import Array
+
+LARGEST_BLOB = 1 << 27  # bytes of a cell, packed or unpacked: an image of 32 megapixels of float depth
+POSE_NUMBERS = 12  # of the upper three rows of a pose
+MAT_TYPES = {0: "u1", 1: "i1", 2: "u2", 3: "i2", 4: "i4", 5: "f4", 6: "f8"}  # of an OpenCV matrix: the lowest three bits
+MAT_TAIL = struct.Struct("<3i")  # rows, columns and type, behind the packed values
+CAMERA_HEAD = struct.Struct("<11i")  # version (3), kind, width, height, numbers of K, D, R and P, and of the local transform
+MONO, STEREO = 0, 1  # kinds of camera
+SERIALIZED_SINCE = (0, 18)  # the version that writes cameras as its classes do, and scans with their angles
+FORMAT_SINCE = (0, 16, 1)  # the version that says what the numbers of a scan are
+RVL = b"DEPTHRVL"
+FLAT_SCANS, SPATIAL_SCANS = range(1, 5), range(5, 12)  # formats with x y, and with x y z
+FLAT_CHANNELS = (2, 5)  # of scans without a format: x y, or with a normal; others have x y z
+COLORED_SCANS = (7, 10)  # formats whose fourth number holds colours
+MILLIMETRES, METRES = 1000.0, 1.0  # values of depth in a metre: of 16 bits, and of floats
+
+
+@dataclass(frozen=True, eq=False)
+class MountedCamera:
+    """A camera and its pose (4, 4) on the robot; `size` are the rows and columns that it is stated for, 0 where it is not."""
+
+    focal: tuple[float, float]
+    centre: tuple[float, float]
+    size: tuple[int, int]
+    mount: Array
+
+    def scale_to_depth(self, shape: tuple[int, ...], metre: float) -> Camera:
+        """Return the same for a depth image of a shape, which may be smaller than the colours that the camera is stated for."""
+        share = [have / stated if stated else 1.0 for have, stated in zip(shape, self.size, strict=True)]
+        (fx, fy), (cx, cy) = self.focal, self.centre
+        return Camera((fx * share[1], fy * share[0]), (cx * share[1], cy * share[0]), metre)
+
+
+def check_bytes(what: str, *cells: object) -> None:
+    """Raise an InputError where a cell is neither empty nor bytes: text in an image's place would be taken for a file's name."""
+    odd = next((cell for cell in cells if not isinstance(cell, bytes | None)), None)
+    if odd is not None:
+        raise InputError(f"{what} has text or a number where bytes belong ({type(odd).__name__}); it is damaged")
+
+
+def decode_pose(blob: bytes | None) -> Array | None:
+    """Decode (4, 4) float64 of twelve floats; None where it is empty or RTAB-Map's null: all zero, or not finite."""
+    if blob is None or len(blob) != 4 * POSE_NUMBERS:
+        return None
+    return build_pose_matrix(np.frombuffer(blob, "<f4"))
+
+
+def build_pose_matrix(numbers: Array) -> Array | None:
+    """Build (4, 4) of twelve numbers; None where they are null."""
+    if not np.isfinite(numbers).all() or not numbers.any():
+        return None
+    return np.vstack([numbers.reshape(3, 4).astype(np.float64), (0, 0, 0, 1)])
+
+
+def decode_matrix(blob: bytes, what: str) -> Array:
+    """Decode (rows, columns, channels) of a packed OpenCV matrix.
+
+    Raises:
+        InputError: it is cut short, damaged or too large.
+    """
+    if len(blob) < MAT_TAIL.size:
+        raise InputError(f"{what} has {len(blob)} bytes, too few; it is damaged")
+    rows, columns, kind = MAT_TAIL.unpack(blob[-MAT_TAIL.size :])
+    name, channels = MAT_TYPES.get(kind & 7), (kind >> 3) + 1
+    if name is None or min(rows, columns) < 0 or not 0 < channels <= 512:
+        raise InputError(f"{what} is no matrix that can be read ({rows} x {columns}, type {kind}); it is damaged")
+    size = rows * columns * channels * np.dtype(name).itemsize
+    if size > LARGEST_BLOB:
+        raise InputError(f"{what} would have {size:,} bytes, more than {LARGEST_BLOB:,}; it is damaged")
+    try:
+        data = zlib.decompressobj().decompress(blob[: -MAT_TAIL.size], max(size, 1))
+    except zlib.error as error:
+        raise InputError(f"{what} can't be unpacked ({error}); it is damaged") from error
+    if len(data) != size:
+        raise InputError(f"{what} has {len(data):,} of {size:,} bytes; it is cut short")
+    return np.frombuffer(data, "<" + name).reshape(rows, columns, channels)
+
+
+def decode_cameras(blob: bytes, version: tuple[int, ...], what: str) -> list[MountedCamera]:
+    """Decode the cameras of a node, side by side in its images.
+
+    Raises:
+        InputError: they are a stereo pair, or can't be read.
+    """
+    if version < SERIALIZED_SINCE:
+        numbers = np.frombuffer(blob, "<f4", len(blob) // 4).astype(np.float64)
+        if len(numbers) == 7 + POSE_NUMBERS:
+            raise _build_stereo_error(what)
+        rows = numbers.reshape(-1, 6 + POSE_NUMBERS) if len(numbers) and len(numbers) % (6 + POSE_NUMBERS) == 0 else None
+        if rows is None:
+            raise InputError(f"{what} has a calibration of {len(blob)} bytes, which is no camera; it is damaged")
+        return [_build_mounted_camera(r[:4], (int(r[5]), int(r[4])), r[6:], what) for r in rows]
+    read = []
+    while blob:
+        if len(blob) < CAMERA_HEAD.size:
+            raise InputError(f"{what} has a calibration that is cut short; it is damaged")
+        _, _, _, kind, width, height, *counts = CAMERA_HEAD.unpack(blob[: CAMERA_HEAD.size])
+        if kind == STEREO:
+            raise _build_stereo_error(what)
+        end = CAMERA_HEAD.size + 8 * sum(counts[:4]) + 4 * counts[4]
+        fitting = all(count in able for count, able in zip(counts, ((9,), range(15), (0, 9), (0, 12), (0, 12)), strict=True))
+        if kind != MONO or not fitting or len(blob) < end:
+            raise InputError(f"{what} has a calibration that can't be read (kind {kind}, numbers {counts}); it is damaged")
+        numbers = np.frombuffer(blob, "<f8", sum(counts[:4]), CAMERA_HEAD.size)
+        plain = (
+            numbers[-12:].reshape(3, 4) if counts[3] else numbers[:9].reshape(3, 3)
+        )  # P, which is for images without distortion
+        mount = np.frombuffer(blob, "<f4", counts[4], end - 4 * counts[4]) if counts[4] else np.eye(4)[:3].ravel()
+        read.append(_build_mounted_camera((plain[0, 0], plain[1, 1], plain[0, 2], plain[1, 2]), (height, width), mount, what))
+        blob = blob[end:]
+    return read
+
+
+def _build_mounted_camera(numbers: Array | tuple[float, ...], size: tuple[int, int], mount: Array, what: str) -> MountedCamera:
+    fx, fy, cx, cy = (float(n) for n in numbers)
+    pose = build_pose_matrix(np.asarray(mount))
+    if not (np.isfinite((fx, fy, cx, cy)).all() and min(fx, fy) > 0 and min(size) >= 0) or pose is None:
+        raise InputError(
+            f"{what} has a camera that can't be used (focal lengths {fx:g} {fy:g}); calibrate it, or mend the database"
+        )
+    return MountedCamera((fx, fy), (cx, cy), size, pose)
+
+
+def _build_stereo_error(what: str) -> InputError:
+    return InputError(
+        f"{what} has stereo images, whose depth is not computed; export its cloud from RTAB-Map, or use a camera of depth"
+    )
+
+
+def decode_scan_format(info: bytes | None, version: tuple[int, ...]) -> tuple[int, Array]:
+    """Decode the format of a scan's numbers (0: not stated), and the pose (4, 4) of the laser on the robot."""
+    numbers = np.frombuffer(info or b"", "<f4", len(info or b"") // 4)
+    ahead = 7 if version >= SERIALIZED_SINCE else 3 if version >= FORMAT_SINCE and len(numbers) == 3 + POSE_NUMBERS else 2
+    if len(numbers) != ahead + POSE_NUMBERS:
+        return 0, np.eye(4)
+    form = {7: numbers[0], 3: numbers[2]}.get(ahead, np.float32(0))
+    mount = build_pose_matrix(numbers[ahead:])
+    return int(form) if np.isfinite(form) else 0, np.eye(4) if mount is None else mount
+
+
+def decode_scan_points(blob: bytes, form: int, what: str) -> tuple[Array, Array | None]:
+    """Decode (n, 3) points of a laser scan in its own frame, and (n, 3) uint8 colours, or None.
+
+    Raises:
+        InputError: it can't be unpacked, or is in a format that is not known.
+    """
+    values = decode_matrix(blob, what)
+    rows = values.reshape(-1, values.shape[2])
+    channels = rows.shape[1]
+    flat = form in FLAT_SCANS or (form == 0 and channels in FLAT_CHANNELS)
+    if values.dtype != np.float32 or channels < (2 if flat else 3) or (form and form not in (*FLAT_SCANS, *SPATIAL_SCANS)):
+        raise InputError(f"{what} is in a format that is not known ({form}, {channels} numbers a point); export it from RTAB-Map")
+    points = np.zeros((len(rows), 3))
+    with np.errstate(invalid="ignore"):  # a damaged number may be a nan that warns
+        points[:, : 2 if flat else 3] = rows[:, : 2 if flat else 3]
+    if form not in COLORED_SCANS or channels < 4:
+        return points, None
+    packed = np.ascontiguousarray(rows[:, 3]).view(np.uint32)
+    return points, np.stack([(packed >> s) & 255 for s in (16, 8, 0)], axis=1).astype(np.uint8)
+
+
+def decode_depth(blob: bytes, what: str) -> tuple[Array, float]:
+    """Decode (h, w) of a depth image, and how many of its values are a metre.
+
+    Raises:
+        InputError: it is packed by RVL, or is no depth image.
+    """
+    if blob.startswith(RVL):
+        raise InputError(
+            f"{what} is packed by RVL, which is not read; store it as .png (Mem/DepthCompressionFormat) by rtabmap-reprocess"
+        )
+    image = read_pixels(blob, what)
+    if image.ndim == 3 and image.shape[2] == 4 and image.dtype == np.uint8:  # floats in the bytes of blue, green, red, alpha
+        return np.ascontiguousarray(image[..., [2, 1, 0, 3]]).view("<f4")[..., 0], METRES
+    if image.ndim != 2 or image.dtype == np.uint8:
+        raise InputError(f"{what} is no depth image of 16 or 32 bits; give a database of a camera of depth")
+    return image, MILLIMETRES
+
 
 RTABMAP_KIND = "an RTAB-Map database"
 OLDEST, NEWEST = (0, 11, 10), (0, 23)  # versions of the database that are read; of the newest, all corrections
@@ -43,25 +216,25 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
             )
     try:
         with closing(sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True)) as base:
-            base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, blobs.LARGEST_BLOB)
+            base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_BLOB)
             base.execute("PRAGMA trusted_schema = OFF")
-            yield from _pieces(path, base)
+            yield from _iter_pieces(path, base)
     except sqlite3.Error as error:
-        raise damaged(path, RTABMAP_KIND, error) from error
+        raise build_damage_error(path, RTABMAP_KIND, error) from error
 
 
-def _pieces(path: Path, base: sqlite3.Connection) -> Iterator[Piece]:
-    version = _version(path, base)
+def _iter_pieces(path: Path, base: sqlite3.Connection) -> Iterator[Piece]:
+    version = _read_version(path, base)
     said: list[str] = []
-    poses = _poses(path, base, version, said)
-    kind = _kind(path, base, version)
+    poses = _read_poses(path, base, version, said)
+    kind = _detect_kind(path, base, version)
     if kind == "depth":
-        yield from pieces(posed_scans(path, _frames(path, base, version, poses), said), said)
+        yield from iter_pieces(iter_posed_scans(path, _iter_frames(path, base, version, poses), said), said)
     else:
-        yield from pieces(_scans(path, base, version, poses, kind == "flat", said), said)
+        yield from iter_pieces(_iter_scans(path, base, version, poses, kind == "flat", said), said)
 
 
-def _version(path: Path, base: sqlite3.Connection) -> tuple[int, ...]:
+def _read_version(path: Path, base: sqlite3.Connection) -> tuple[int, ...]:
     """The version of RTAB-Map that laid the database out.
 
     Raises:
@@ -82,7 +255,7 @@ def _version(path: Path, base: sqlite3.Connection) -> tuple[int, ...]:
     return version
 
 
-def _poses(path: Path, base: sqlite3.Connection, version: tuple[int, ...], said: list[str]) -> Poses:
+def _read_poses(path: Path, base: sqlite3.Connection, version: tuple[int, ...], said: list[str]) -> Poses:
     """The pose of the robot at each node: optimised ones, else those of the odometry.
 
     Raises:
@@ -90,13 +263,13 @@ def _poses(path: Path, base: sqlite3.Connection, version: tuple[int, ...], said:
     """
     row = base.execute("SELECT opt_ids, opt_poses FROM Admin").fetchone() if version >= OPTIMISED_SINCE else None
     if row is not None and row[0] and row[1]:
-        blobs.check_bytes(f"{path}: the optimised poses", *row)
-        ids = blobs.matrix(row[0], f"{path}: opt_ids").ravel()
-        numbers = blobs.matrix(row[1], f"{path}: opt_poses").ravel()
-        if len(numbers) != blobs.POSE_NUMBERS * len(ids) or ids.dtype != np.int32 or numbers.dtype != np.float32:
-            raise damaged(path, RTABMAP_KIND, f"{len(numbers):,} numbers of optimised poses for {len(ids):,} nodes")
-        rows = numbers.reshape(-1, blobs.POSE_NUMBERS)
-        poses: Poses = {int(i): blobs.pose_matrix(r) for i, r in zip(ids, rows, strict=True) if i > 0}  # below 0 are landmarks
+        check_bytes(f"{path}: the optimised poses", *row)
+        ids = decode_matrix(row[0], f"{path}: opt_ids").ravel()
+        numbers = decode_matrix(row[1], f"{path}: opt_poses").ravel()
+        if len(numbers) != POSE_NUMBERS * len(ids) or ids.dtype != np.int32 or numbers.dtype != np.float32:
+            raise build_damage_error(path, RTABMAP_KIND, f"{len(numbers):,} numbers of optimised poses for {len(ids):,} nodes")
+        rows = numbers.reshape(-1, POSE_NUMBERS)
+        poses: Poses = {int(i): build_pose_matrix(r) for i, r in zip(ids, rows, strict=True) if i > 0}  # below 0 are landmarks
     else:
         sessions = base.execute("SELECT COUNT(DISTINCT map_id) FROM Node").fetchone()[0]
         if sessions > 1:
@@ -104,18 +277,18 @@ def _poses(path: Path, base: sqlite3.Connection, version: tuple[int, ...], said:
                 f"{path}: holds {sessions:,} sessions and no optimised poses that join them; open it in RTAB-Map and save it"
             )
         nodes = base.execute("SELECT id, pose FROM Node").fetchall()
-        blobs.check_bytes(f"{path}: the poses", *(blob for _, blob in nodes))
-        poses = {int(i): blobs.pose_of(blob) for i, blob in nodes}
+        check_bytes(f"{path}: the poses", *(blob for _, blob in nodes))
+        poses = {int(i): decode_pose(blob) for i, blob in nodes}
         said.append("it has no optimised poses: those of the odometry are taken, which drift")
     for node, pose in poses.items():
-        if pose is not None and len(no_rotations(pose[None])):
+        if pose is not None and len(find_invalid_rotations(pose[None])):
             raise InputError(
                 f"{path}: node {node} has a pose that is not a rotation and a place; optimise the graph in RTAB-Map again"
             )
     return poses
 
 
-def _kind(path: Path, base: sqlite3.Connection, version: tuple[int, ...]) -> str:
+def _detect_kind(path: Path, base: sqlite3.Connection, version: tuple[int, ...]) -> str:
     """What to read: "spatial" or "flat" scans, or "depth", by the first node that has any.
 
     Raises:
@@ -123,10 +296,10 @@ def _kind(path: Path, base: sqlite3.Connection, version: tuple[int, ...]) -> str
     """
     flat = False
     for node, info, blob in base.execute("SELECT id, scan_info, scan FROM Data WHERE LENGTH(scan) > 4 ORDER BY id LIMIT 1"):
-        blobs.check_bytes(f"{path}: node {node}", info, blob)
-        form, _ = blobs.scan_format(info, version)
-        channels = blobs.matrix(blob, f"{path}: the scan of node {node}").shape[2]
-        flat = form in blobs.FLAT_SCANS or (form == 0 and channels in blobs.FLAT_CHANNELS)
+        check_bytes(f"{path}: node {node}", info, blob)
+        form, _ = decode_scan_format(info, version)
+        channels = decode_matrix(blob, f"{path}: the scan of node {node}").shape[2]
+        flat = form in FLAT_SCANS or (form == 0 and channels in FLAT_CHANNELS)
         if not flat:
             return "spatial"
     if base.execute("SELECT 1 FROM Data WHERE LENGTH(depth) > 4 LIMIT 1").fetchone():
@@ -136,20 +309,20 @@ def _kind(path: Path, base: sqlite3.Connection, version: tuple[int, ...]) -> str
     raise InputError(f"{path}: holds neither laser scans nor depth images; record it with Mem/BinDataKept on")
 
 
-def _scans(
+def _iter_scans(
     path: Path, base: sqlite3.Connection, version: tuple[int, ...], poses: Poses, flat: bool, said: list[str]
 ) -> Iterator[PosedScan]:
     """The laser scans of all nodes that have a pose."""
     count, lost = base.execute("SELECT COUNT(*) FROM Data WHERE LENGTH(scan) > 4").fetchone()[0], 0
     rows = base.execute("SELECT id, scan_info, scan FROM Data WHERE LENGTH(scan) > 4 ORDER BY id")
     for number, (node, info, blob) in enumerate(rows, 1):
-        blobs.check_bytes(f"{path}: node {node}", info, blob)
+        check_bytes(f"{path}: node {node}", info, blob)
         pose = poses.get(node)
         if pose is None:
             lost += 1
             continue
-        form, mount = blobs.scan_format(info, version)
-        points, colors = blobs.scan_points(blob, form, f"{path}: the scan of node {node}")
+        form, mount = decode_scan_format(info, version)
+        points, colors = decode_scan_points(blob, form, f"{path}: the scan of node {node}")
         yield PosedScan(points, pose @ mount, colors, done=number / count)
     if lost == count:
         raise InputError(f"{path}: none of its {count:,} scans has a pose; optimise the graph in RTAB-Map, and save it")
@@ -159,31 +332,31 @@ def _scans(
         said.append("its scans are slices: it has no depth images, nor scans in space")
 
 
-def _frames(path: Path, base: sqlite3.Connection, version: tuple[int, ...], poses: Poses) -> Iterator[Frame | None]:
+def _iter_frames(path: Path, base: sqlite3.Connection, version: tuple[int, ...], poses: Poses) -> Iterator[Frame | None]:
     """The depth images of all nodes; those of several cameras lie side by side in one image."""
     count = base.execute("SELECT COUNT(*) FROM Data WHERE LENGTH(depth) > 4").fetchone()[0]
     rows = base.execute("SELECT id, calibration, depth, image FROM Data WHERE LENGTH(depth) > 4 ORDER BY id")
     for number, (node, calibration, blob, image) in enumerate(rows, 1):
-        blobs.check_bytes(f"{path}: node {node}", calibration, blob, image)
+        check_bytes(f"{path}: node {node}", calibration, blob, image)
         pose = poses.get(node)
         if pose is None:
             yield None
             continue
         what = f"{path}: the depth of node {node}"
-        cameras = blobs.cameras(calibration or b"", version, f"{path}: node {node}")
+        cameras = decode_cameras(calibration or b"", version, f"{path}: node {node}")
         if not cameras:
             raise InputError(f"{path}: node {node} has a depth image and no camera; calibrate it, or mend the database")
-        depth, metre = blobs.depth_values(blob, what)
+        depth, metre = decode_depth(blob, what)
         colors = read_color(image, f"{path}: the image of node {node}") if image and len(image) > 4 else None
         if depth.shape[1] % len(cameras):
             raise InputError(f"{what} is {depth.shape[1]} pixels wide, which {len(cameras)} cameras can't share; it is damaged")
-        shown = _parts(colors, len(cameras))
-        for camera, part, color in zip(cameras, _parts(depth, len(cameras)), shown, strict=True):
+        shown = _split_image(colors, len(cameras))
+        for camera, part, color in zip(cameras, _split_image(depth, len(cameras)), shown, strict=True):
             assert part is not None
-            yield Frame(what, part, camera.for_depth(part.shape, metre), pose @ camera.mount, color, done=number / count)
+            yield Frame(what, part, camera.scale_to_depth(part.shape, metre), pose @ camera.mount, color, done=number / count)
 
 
-def _parts(image: Array | None, count: int) -> list[Array | None]:
+def _split_image(image: Array | None, count: int) -> list[Array | None]:
     """An image of several cameras cut into that of each; None where there is none, or it can't be cut."""
     if image is None or image.shape[1] % count:
         return [None] * count

@@ -18,9 +18,8 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io import pcd, ply
-from topomerge.io.options import ReadOptions
-from topomerge.io.piece import BLOCK_POINTS, Piece, damaged
-from topomerge.io.posed import PosedScan, pieces
+from topomerge.io.depth_images import PosedScan, iter_pieces
+from topomerge.io.piece import BLOCK_POINTS, Piece, ReadOptions, build_damage_error
 from topomerge.io.trajectory import LONGEST_GAP, Trajectory, read_trajectory
 from topomerge.types import Array
 
@@ -42,27 +41,27 @@ INDEX_DIGITS = 8  # at most, of the number of a scan
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """The points of all scans in the frame of the trajectory, scan by scan."""
-    scans = scans_of(path)
-    trajectory_file = Path(options.poses) if options.poses else _trajectory_of(path, scans[0].parent)
+    """Read the points of all scans in the frame of the trajectory, scan by scan."""
+    scans = find_scans(path)
+    trajectory_file = Path(options.poses) if options.poses else _find_trajectory(path, scans[0].parent)
     if trajectory_file is None:
-        yield from pieces(_with_viewpoints(path, scans, options))
+        yield from iter_pieces(_iter_viewpoint_scans(path, scans, options))
         return
-    numbers = [int(t) for scan in scans if _counted(scan) and (t := name_time(scan.stem)) is not None]
+    numbers = [int(t) for scan in scans if _is_numbered(scan) and (t := parse_name_time(scan.stem)) is not None]
     trajectory = read_trajectory(trajectory_file, len(scans), min(max(numbers, default=0), LAST_SCAN))
     poses, said = match_poses(path, scans, trajectory, trajectory_file)
-    yield from pieces(_posed(scans, poses, options), said)
+    yield from iter_pieces(_iter_posed_scans(scans, poses, options), said)
 
 
-def scans_of(path: Path) -> list[Path]:
-    """The scans in a folder, or in the only folder below it that has some, in the order of their numbers.
+def find_scans(path: Path) -> list[Path]:
+    """Find the scans in a folder, or in the only folder below it that has some, in the order of their numbers.
 
     Raises:
         InputError: there are none, or of several kinds.
     """
-    scans = _scans_in(path)
+    scans = _list_scans(path)
     if not scans:
-        below = {p.name: s for p in sorted(path.iterdir()) if p.is_dir() and (s := _scans_in(p))}
+        below = {p.name: s for p in sorted(path.iterdir()) if p.is_dir() and (s := _list_scans(p))}
         if len(below) > 1:
             raise InputError(f"{path}: holds several folders of scans ({', '.join(below)[:200]}); give one of them and --poses")
         scans = next(iter(below.values()), [])
@@ -84,12 +83,12 @@ def scans_of(path: Path) -> list[Path]:
     return scans
 
 
-def _scans_in(folder: Path) -> list[Path]:
+def _list_scans(folder: Path) -> list[Path]:
     scans = [p for p in folder.iterdir() if p.suffix.lower() in SCAN_SUFFIXES and not p.name.startswith(".") and p.is_file()]
     return sorted(scans, key=lambda p: ([int(n) for n in re.findall(r"\d+", p.stem)], p.name))
 
 
-def _trajectory_of(path: Path, beside: Path) -> Path | None:
+def _find_trajectory(path: Path, beside: Path) -> Path | None:
     """The trajectory that belongs to the scans: in the folder that was given, among the scans, or beside their folder."""
     for folder in dict.fromkeys((path, beside, path.resolve().parent)):
         names = [p for p in sorted(folder.iterdir()) if p.suffix in (".txt", ".tum") and p.is_file()]
@@ -103,8 +102,8 @@ def _trajectory_of(path: Path, beside: Path) -> Path | None:
     return None
 
 
-def name_time(stem: str) -> float | None:
-    """The time (s) or the number that stands in the name of a scan, the suffix left out; None: neither.
+def parse_name_time(stem: str) -> float | None:
+    """Parse the time (s) or the number that stands in the name of a scan, the suffix left out; None: neither.
 
     ``1570513628_110666000``, ``1570513628.110666`` and ``1570513628110666000`` are times, ``000017`` and ``scan_17`` numbers.
     """
@@ -117,16 +116,16 @@ def name_time(stem: str) -> float | None:
 
 
 def match_poses(folder: Path, scans: list[Path], trajectory: Trajectory, source: Path) -> tuple[list[Array | None], list[str]]:
-    """The pose (4, 4) of each scan, None where there is none, and what the user should know.
+    """Return the pose (4, 4) of each scan, None where there is none, and what the user should know.
 
     Raises:
         InputError: no pose belongs to a scan, or it can't be said which.
     """
-    names = [name_time(scan.stem) for scan in scans]
+    names = [parse_name_time(scan.stem) for scan in scans]
     times = None if None in names else np.array(names, float)
-    numbered = all(map(_counted, scans))
+    numbered = all(map(_is_numbered, scans))
     if trajectory.times is not None and times is not None and not numbered:
-        return _by_time(folder, times, trajectory, source)
+        return _match_poses_by_time(folder, times, trajectory, source)
     if len(scans) == len(trajectory):
         return list(trajectory.poses), []
     if numbered and times is not None:
@@ -143,34 +142,36 @@ def match_poses(folder: Path, scans: list[Path], trajectory: Trajectory, source:
     )
 
 
-def _counted(scan: Path) -> bool:
+def _is_numbered(scan: Path) -> bool:
     """Does the name end with a number that is no time?"""
     match = NAME_TIME.search(scan.stem)
     return match is not None and match[1] is None and match[3].isdigit() and len(match[3]) <= INDEX_DIGITS
 
 
-def _by_time(folder: Path, times: Array, trajectory: Trajectory, source: Path) -> tuple[list[Array | None], list[str]]:
+def _match_poses_by_time(
+    folder: Path, times: Array, trajectory: Trajectory, source: Path
+) -> tuple[list[Array | None], list[str]]:
     assert trajectory.times is not None
-    near = trajectory.gap(times) <= LONGEST_GAP
+    near = trajectory.measure_gap(times) <= LONGEST_GAP
     if not near.any():
         first, last = trajectory.times[[0, -1]]
         raise InputError(
             f"{source}: its times ({first:.3f} to {last:.3f} s) are not those in the names of the scans in {folder} "
             f"({times.min():.3f} to {times.max():.3f} s); give the trajectory of these scans"
         )
-    poses = [pose if ok else None for pose, ok in zip(trajectory.at(times), near.tolist(), strict=True)]
+    poses = [pose if ok else None for pose, ok in zip(trajectory.interpolate(times), near.tolist(), strict=True)]
     lost = int((~near).sum())
     said = f"{lost:,} of {len(times):,} scans are more than {LONGEST_GAP:g} s from any pose of {source.name} and are left out"
     return poses, [said] if lost else []
 
 
-def _posed(scans: list[Path], poses: list[Array | None], options: ReadOptions) -> Iterator[PosedScan]:
+def _iter_posed_scans(scans: list[Path], poses: list[Array | None], options: ReadOptions) -> Iterator[PosedScan]:
     for number, (scan, pose) in enumerate(zip(scans, poses, strict=True), 1):
         for piece in _read_scan(scan, options) if pose is not None else ():
             yield PosedScan(piece.points, pose, piece.colors, done=number / len(scans))
 
 
-def _with_viewpoints(path: Path, scans: list[Path], options: ReadOptions) -> Iterator[PosedScan]:
+def _iter_viewpoint_scans(path: Path, scans: list[Path], options: ReadOptions) -> Iterator[PosedScan]:
     """Scans in one frame, each with the place of the sensor in its own header."""
     for number, scan in enumerate(scans, 1):
         pose = None
@@ -193,7 +194,7 @@ def _read_scan(path: Path, options: ReadOptions) -> Iterator[Piece]:
     except (InputError, MemoryError):
         raise
     except Exception as error:
-        raise damaged(path, "a scan", error) from error
+        raise build_damage_error(path, "a scan", error) from error
 
 
 def _read_bin(path: Path, options: ReadOptions) -> Iterator[Piece]:

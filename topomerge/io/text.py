@@ -18,8 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.options import ReadOptions
-from topomerge.io.piece import Piece, bytes8, leads_outside
+from topomerge.io.piece import Piece, ReadOptions, convert_to_uint8, is_outside_link
 from topomerge.types import Array
 
 LINES_A_TIME = 1 << 18  # lines parsed at a time
@@ -40,21 +39,21 @@ class _Layout:
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """Blocks of points of a table."""
+    """Read blocks of points of a table."""
     del options
     size = path.stat().st_size
     layout = _sniff(path)
     with path.open("rb") as stream:
         lines = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="replace")
-        for values in rows(path, lines, layout.columns, layout.delimiter, layout.skip, layout.comma):
+        for values in iter_rows(path, lines, layout.columns, layout.delimiter, layout.skip, layout.comma):
             colors = values[:, 3:].clip(0, 65535) if values.shape[1] == 6 else None
             integers = colors is not None and bool((colors == np.rint(colors)).all())
             if colors is not None and integers:
                 colors = colors.astype(np.int64)
-            yield Piece(values[:, :3], None if colors is None else bytes8(colors), done=stream.tell() / size)
+            yield Piece(values[:, :3], None if colors is None else convert_to_uint8(colors), done=stream.tell() / size)
 
 
-def rows(
+def iter_rows(
     path: Path,
     lines: Iterable[str],
     columns: tuple[int, ...],
@@ -62,7 +61,7 @@ def rows(
     skip: int = 0,
     comma: bool = False,
 ) -> Iterator[Array]:
-    """Blocks (n, len(columns)) float64 of a stream of text lines; the first `skip` lines are passed over.
+    """Yield blocks (n, len(columns)) float64 of a stream of text lines; the first `skip` lines are passed over.
 
     Raises:
         InputError: a line that is not a row of numbers, with its number.
@@ -75,12 +74,12 @@ def rows(
         try:
             values = _parse(block, columns, delimiter)
         except (ValueError, IndexError):
-            block = [_bare(line) for line in block]  # comments other than # cost time, so they are sought only now
+            block = [_strip_comment(line) for line in block]  # comments other than # cost time, so they are sought only now
             try:
                 values = _parse(block, columns, delimiter)
             except (ValueError, IndexError) as error:
-                number, line = _first_bad(block, columns, delimiter)
-                shown = "" if leads_outside(path) else f" ({line[:40]!r})"
+                number, line = _find_first_bad_line(block, columns, delimiter)
+                shown = "" if is_outside_link(path) else f" ({line[:40]!r})"
                 what = f"line {before + number} is not a row of numbers{shown}"
                 raise InputError(f"{path}: {what}; mend or remove it") from error
         before += len(block)
@@ -94,14 +93,14 @@ def _parse(block: list[str], columns: tuple[int, ...], delimiter: str | None) ->
         return np.loadtxt(block, np.float64, comments="#", delimiter=delimiter, usecols=columns, ndmin=2)
 
 
-def _bare(line: str) -> str:
+def _strip_comment(line: str) -> str:
     """The line without a comment."""
     for mark in COMMENTS:
         line = line.split(mark, 1)[0]
     return line
 
 
-def _first_bad(block: list[str], columns: tuple[int, ...], delimiter: str | None) -> tuple[int, str]:
+def _find_first_bad_line(block: list[str], columns: tuple[int, ...], delimiter: str | None) -> tuple[int, str]:
     """Number (from 1) and text of the first line of a block that can't be read."""
     for number, line in enumerate(block, 1):
         fields = line.strip().split(delimiter)
@@ -124,19 +123,19 @@ def _sniff(path: Path) -> _Layout:
         lines.pop()  # perhaps half a line
     header: list[str] = []
     for number, line in enumerate(lines):
-        text = _bare(line).strip() or line.strip("#/%! \t")
-        delimiter, comma = _delimiter(text)
+        text = _strip_comment(line).strip() or line.strip("#/%! \t")
+        delimiter, comma = _detect_delimiter(text)
         fields = [f.strip().strip('"').lower() for f in text.split(delimiter)]
         if any(all(n in fields for n in names) for names in AXES):
             header = fields
-        elif _bare(line).strip() and len(_numbers(fields, comma)) >= 3:
-            numbers = _numbers(fields, comma)
-            columns = _named(header, len(fields)) or _guessed(numbers, lines[number:], delimiter)
+        elif _strip_comment(line).strip() and len(_find_numeric_fields(fields, comma)) >= 3:
+            numbers = _find_numeric_fields(fields, comma)
+            columns = _match_header_columns(header, len(fields)) or _guess_columns(numbers, lines[number:], delimiter)
             return _Layout(delimiter, columns, number, comma)
     raise InputError(f"{path}: no line with three numbers found; a table of points has x y z in each line")
 
 
-def _delimiter(text: str) -> tuple[str | None, bool]:
+def _detect_delimiter(text: str) -> tuple[str | None, bool]:
     """Delimiter of a line (None: white space), and whether its numbers have decimal commas."""
     if ";" in text:
         return ";", "," in text and "." not in text
@@ -145,7 +144,7 @@ def _delimiter(text: str) -> tuple[str | None, bool]:
     return next((mark for mark in (",", "|") if mark in text), None), False
 
 
-def _numbers(fields: list[str], comma: bool) -> list[int]:
+def _find_numeric_fields(fields: list[str], comma: bool) -> list[int]:
     """Which of the fields are numbers."""
     numeric_columns = []
     for column, text in enumerate(fields):
@@ -157,7 +156,7 @@ def _numbers(fields: list[str], comma: bool) -> list[int]:
     return numeric_columns
 
 
-def _named(header: list[str], width: int) -> tuple[int, ...]:
+def _match_header_columns(header: list[str], width: int) -> tuple[int, ...]:
     """Columns of x, y, z and of colours by their names; none where no header fits."""
     if len(header) != width:
         return ()
@@ -166,7 +165,7 @@ def _named(header: list[str], width: int) -> tuple[int, ...]:
     return tuple(header.index(n) for n in (*axes, *colors))
 
 
-def _guessed(numbers: list[int], lines: list[str], delimiter: str | None) -> tuple[int, ...]:
+def _guess_columns(numbers: list[int], lines: list[str], delimiter: str | None) -> tuple[int, ...]:
     """Columns of x, y, z and of colours by what stands in them."""
     for start in (3, 4):  # x y z r g b, and x y z intensity r g b
         if len(numbers) >= start + 3 and _are_bytes(lines, numbers[start : start + 3], delimiter):
@@ -175,7 +174,7 @@ def _guessed(numbers: list[int], lines: list[str], delimiter: str | None) -> tup
 
 
 def _are_bytes(lines: list[str], columns: list[int], delimiter: str | None) -> bool:
-    rows = [fields for line in lines if (fields := _bare(line).strip().split(delimiter)) not in ([], [""])]
+    rows = [fields for line in lines if (fields := _strip_comment(line).strip().split(delimiter)) not in ([], [""])]
     return all(
         len(fields) > columns[-1] and all(re.fullmatch(r"\s*\d{1,3}(\.0*)?\s*", fields[c]) for c in columns)
         and all(float(fields[c]) <= 255 for c in columns)

@@ -15,9 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.options import ReadOptions
-from topomerge.io.piece import Piece
-from topomerge.io.points import Format, format_of, guarded
+from topomerge.io.piece import Piece, ReadOptions
+from topomerge.io.points import Format, detect_format, iter_guarded
 
 CLOUD_MODULES = ("ply", "pcd", "las", "e57", "arrays", "text")  # readers of points that know their frame
 NOTES = ("text",)  # in a folder with other files, a text is more likely about them
@@ -28,8 +27,8 @@ WKT_CODE = re.compile(r"(?:AUTHORITY|ID)\s*\[\s*\"EPSG\"\s*,\s*\"?(\d+)\"?\s*\]"
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """The points of all files of a folder as they are, in their common frame."""
-    files = tiles_of(path)
+    """Read the points of all files of a folder as they are, in their common frame."""
+    files = find_tiles(path)
     _check_systems(path, [file for file, form in files if form.module == "las"])
     alike = len({form.module for _, form in files}) == 1
     poses = 0
@@ -47,34 +46,34 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
             )
 
 
-def tiles_of(folder: Path) -> list[tuple[Path, Format]]:
+def find_tiles(folder: Path) -> list[tuple[Path, Format]]:
     """The files of points in a folder, or in the only folder below it that has some, in the order of their names and numbers.
 
     Raises:
         InputError: there are none, or one is empty or can't be opened.
     """
-    names = _tiles_in(folder)
+    names = _list_tiles(folder)
     if not names:
-        below = {p.name: tiles for p in sorted(folder.iterdir()) if p.is_dir() and (tiles := _tiles_in(p))}
+        below = {p.name: tiles for p in sorted(folder.iterdir()) if p.is_dir() and (tiles := _list_tiles(p))}
         if len(below) > 1:
             raise InputError(f"{folder}: holds several folders of files ({', '.join(below)[:200]}); give one of them")
         names = next(iter(below.values()), [])
     if not names:
         raise InputError(f"{folder}: holds no files of points (ply, pcd, las, laz, e57, npy, npz, tables); give their folder")
-    files = [(file, format_of(file)) for file in names]
+    files = [(file, detect_format(file)) for file in names]
     others = [(file, form) for file, form in files if form.module not in NOTES]
     return others or files
 
 
-def tile_suffixes() -> tuple[str, ...]:
-    """How files end that may be parts of one cloud."""
+def list_tile_suffixes() -> tuple[str, ...]:
+    """List the suffixes of files that may be parts of one cloud."""
     from topomerge.io.points import FORMATS
 
     return tuple(suffix for form in FORMATS if form.module in CLOUD_MODULES for suffix in form.suffixes)
 
 
-def _tiles_in(folder: Path) -> list[Path]:
-    able = tile_suffixes()
+def _list_tiles(folder: Path) -> list[Path]:
+    able = list_tile_suffixes()
     files = [p for p in folder.iterdir() if p.suffix.lower() in able and not p.name.startswith(".") and p.is_file()]
     return sorted(files, key=lambda p: ([int(n) for n in re.findall(r"\d+", p.stem)], p.name))
 
@@ -86,7 +85,7 @@ def _read_tile(file: Path, form: Format, options: ReadOptions) -> Iterator[Piece
         InputError: it can't be read.
     """
     try:
-        yield from guarded(file, form, lambda reader: reader.read(file, options))
+        yield from iter_guarded(file, form, lambda reader: reader.read(file, options))
     except InputError as error:
         raise InputError(f"{error} (one of the files of --one-frame: mend it, or take it out of the folder)") from error
 
@@ -95,7 +94,7 @@ def _check_systems(folder: Path, files: list[Path]) -> None:
     """Refuse LAS files that name different coordinate systems: their points lie in different frames."""
     first: tuple[Path, str] | None = None
     for file in files:
-        system = _system_of(file)
+        system = _read_coordinate_system(file)
         if first is None:
             first = (file, system) if system else None
         elif system and system != first[1]:
@@ -105,7 +104,7 @@ def _check_systems(folder: Path, files: list[Path]) -> None:
             )
 
 
-def _system_of(file: Path) -> str:
+def _read_coordinate_system(file: Path) -> str:
     """The coordinate system that a LAS file names, as "EPSG:1234" or by its name; "" for none."""
     import laspy
 

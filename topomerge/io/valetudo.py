@@ -2,7 +2,7 @@
 
 Layers of pixels: `wall`, `floor`, and one `segment` for each room that the robot tells apart, whose pixels are floor. Walls
 become walls as of a floor plan. The frame is the robot's own, so that maps of one home on two days fit: x right, y up, the corner
-of pixel (0, 0) at the origin. The robot's own rooms are no truth and are not kept: `robot_rooms` gives them.
+of pixel (0, 0) at the origin. The robot's own rooms are no truth and are not kept: `parse_robot_map` gives them.
 Source: https://valetudo.cloud (map data format); `pixels` lists x, y, `compressedPixels` x, y and how many follow to the right.
 """
 
@@ -18,9 +18,8 @@ from scipy import ndimage
 
 from topomerge.errors import InputError
 from topomerge.io import grid
-from topomerge.io.grid_doubts import doubt_outside
-from topomerge.io.options import ReadOptions
-from topomerge.io.piece import Piece, damaged
+from topomerge.io.grid import check_outside_floor
+from topomerge.io.piece import Piece, ReadOptions, build_damage_error
 from topomerge.types import Array
 
 KIND = "a vacuum robot's map"
@@ -49,15 +48,15 @@ class RobotMap:
 
 
 def is_robot_map(about: object) -> bool:
-    """Is this a map of Valetudo?"""
+    """Return whether a value is a map of Valetudo."""
     return isinstance(about, dict) and about.get("__class") == "ValetudoMap"
 
 
-def pieces(path: Path, about: Mapping[str, Any], options: ReadOptions) -> Iterator[Piece]:
-    """Floor points, then walls layer by layer, in metres."""
+def iter_pieces(path: Path, about: Mapping[str, Any], options: ReadOptions) -> Iterator[Piece]:
+    """Yield floor points, then walls layer by layer, in metres."""
     if options.resolution is not None:
         raise InputError(f"{path}: states its own resolution; leave --resolution out")
-    drawn = robot_rooms(path, about)
+    drawn = parse_robot_map(path, about)
     free, walls = np.pad(drawn.free, 1), np.pad(drawn.walls, 1)
     outline = ndimage.binary_dilation(free, np.ones((3, 3))) & ~free
     walled = float((outline & ndimage.binary_dilation(walls, np.ones((5, 5)))).sum() / max(outline.sum(), 1))
@@ -65,15 +64,15 @@ def pieces(path: Path, about: Mapping[str, Any], options: ReadOptions) -> Iterat
     if walled < WALLED:
         walls |= outline
         warnings = (f"{path}: draws walls along {walled:.0%} of its floor's outline; the outline was taken for walls",)
-    outside = [f"{path}: {doubt}; save the map again" for doubt in doubt_outside(walls, free, drawn.resolution)]
+    outside = [f"{path}: {doubt}; save the map again" for doubt in check_outside_floor(walls, free, drawn.resolution)]
     yield Piece(np.empty((0, 3)), warnings=(*warnings, *outside), done=0.1)
     x, y = (drawn.origin - drawn.resolution).tolist()
     plan = grid.Plan(path, drawn.resolution, (x, y, 0.0))
     yield from grid.extrude(path, np.flipud(walls), np.flipud(free), plan, options)
 
 
-def robot_rooms(path: Path, about: Mapping[str, Any]) -> RobotMap:
-    """The walls, the floor and the robot's own rooms.
+def parse_robot_map(path: Path, about: Mapping[str, Any]) -> RobotMap:
+    """Parse the walls, the floor and the robot's own rooms.
 
     Args:
         path: of the file, for messages.
@@ -82,17 +81,17 @@ def robot_rooms(path: Path, about: Mapping[str, Any]) -> RobotMap:
     Raises:
         InputError: the map can't be used.
     """
-    cell, layers = _number(about.get("pixelSize")), about.get("layers")
+    cell, layers = _parse_number(about.get("pixelSize")), about.get("layers")
     if not 0.5 <= cell <= 100 or not isinstance(layers, list):
         raise InputError(f"{path}: has no layers, or no pixel size of 0.5 to 100 cm; save the map again")
-    runs = [(layer.get("type"), _name(layer), _runs(path, layer)) for layer in layers if isinstance(layer, dict)]
+    runs = [(layer.get("type"), _get_layer_name(layer), _parse_runs(path, layer)) for layer in layers if isinstance(layer, dict)]
     every = np.concatenate([np.zeros((0, 3), np.int64), *(r for _, _, r in runs)])
     if not len(every):
         raise InputError(f"{path}: shows neither floor nor walls; let the robot drive first")
     low = every[:, :2].min(axis=0)
     width, height = (np.maximum(every[:, 0] + every[:, 2], every[:, 0] + 1).max(), every[:, 1].max() + 1) - low
     if int(every[:, 2].sum()) > grid.PIXELS:
-        raise damaged(path, KIND, f"its layers together have more than {grid.PIXELS:,} pixels")
+        raise build_damage_error(path, KIND, f"its layers together have more than {grid.PIXELS:,} pixels")
     if width * height > grid.PIXELS:
         raise InputError(f"{path}: spans {width} by {height} pixels, more than {grid.PIXELS:,}; it is damaged")
     walls, free = np.zeros((height, width), bool), np.zeros((height, width), bool)
@@ -111,17 +110,17 @@ def robot_rooms(path: Path, about: Mapping[str, Any]) -> RobotMap:
     return RobotMap(np.flipud(walls), np.flipud(free), np.flipud(rooms), tuple(names), cell / 100, origin)
 
 
-def _name(layer: dict[str, Any]) -> str:
+def _get_layer_name(layer: dict[str, Any]) -> str:
     about = layer.get("metaData")
     return str(about.get("name") or "")[:80] if isinstance(about, dict) else ""
 
 
-def _number(value: object) -> float:
+def _parse_number(value: object) -> float:
     """The value, nan where it is no number."""
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else float("nan")
 
 
-def _runs(path: Path, layer: dict[str, Any]) -> Array:
+def _parse_runs(path: Path, layer: dict[str, Any]) -> Array:
     """(n, 3) int64 column, row and length of runs of pixels."""
     compressed = layer.get("compressedPixels") or []
     listed, numbers = (compressed, 3) if compressed else (layer.get("pixels") or [], 2)
@@ -131,14 +130,14 @@ def _runs(path: Path, layer: dict[str, Any]) -> Array:
     try:
         runs = np.array(listed)
     except ValueError as error:
-        raise damaged(path, KIND, f"pixels of the layer {kind} are no numbers") from error
+        raise build_damage_error(path, KIND, f"pixels of the layer {kind} are no numbers") from error
     if runs.ndim != 1 or len(runs) % numbers or not np.issubdtype(runs.dtype, np.integer):
-        raise damaged(path, KIND, f"pixels of the layer {kind} are no list of whole numbers, {numbers} each")
+        raise build_damage_error(path, KIND, f"pixels of the layer {kind} are no list of whole numbers, {numbers} each")
     runs = runs.reshape(-1, numbers).astype(np.int64)
     if numbers == 2:
         runs = np.column_stack([runs, np.ones(len(runs), np.int64)])
     if runs.min() < 0 or runs.max() > grid.PIXELS or int(runs[:, 2].sum()) > grid.PIXELS:
-        raise damaged(path, KIND, f"pixels of the layer {kind} lie outside of any map")
+        raise build_damage_error(path, KIND, f"pixels of the layer {kind} lie outside of any map")
     return runs
 
 

@@ -21,7 +21,7 @@ if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:  # TBB is there with Open
 def _probe() -> None: ...
 
 
-def _private_folder() -> Path:
+def _create_private_folder() -> Path:
     """A folder that nobody else can write to: what is kept there is code.
 
     Raises:
@@ -39,4 +39,4 @@ def _private_folder() -> Path:
 try:
     njit(cache=True)(_probe)  # compiles nothing yet
 except RuntimeError:  # no place to keep it
-    config.CACHE_DIR = str(_private_folder())  # type: ignore[attr-defined]
+    config.CACHE_DIR = str(_create_private_folder())  # type: ignore[attr-defined]

@@ -7,7 +7,7 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def move_scores(points, sector, start, places, turns, yaws, shifts, gain, origin, edge):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def score_moves(points, sector, start, places, turns, yaws, shifts, gain, origin, edge):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(K, Y, S, S) sums of the gain at the points of each piece under each turn and shift.
 
     Args:
@@ -43,7 +43,7 @@ def move_scores(points, sector, start, places, turns, yaws, shifts, gain, origin
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def shifted_sums(points, weights, owner, owners, shifts, values, origin, edge):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def sum_shifted_values(points, weights, owner, owners, shifts, values, origin, edge):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(S, owners) sums of the values of a raster (nx, ny) at weighted points (n, 2) of each owner, moved by each shift (S, 2)."""
     out = np.zeros((len(shifts), owners))
     for k in range(len(shifts)):
@@ -56,7 +56,7 @@ def shifted_sums(points, weights, owner, owners, shifts, values, origin, edge): 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def line_normals(row, points, columns, reach, least):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def estimate_line_normals(row, points, columns, reach, least):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(n, 2) unit normals of the lines through the points within `reach` columns of each one, and (n,) how straight these are
     (0 to 1); 0 where fewer than `least` points are near.
 
@@ -88,7 +88,9 @@ def line_normals(row, points, columns, reach, least):  # type: ignore[no-untyped
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def line_steps(points, normal, faced, start, places, turns, row, target, target_normal, target_faced, origin, edge, reach, sigma):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def build_line_equations(
+    points, normal, faced, start, places, turns, row, target, target_normal, target_faced, origin, edge, reach, sigma
+):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Normal equations of a shift and a turn of each piece: each of its points and the nearest one of the target whose normal is
     alike, within `reach` columns; two sides of a wall are not alike.
 
@@ -142,7 +144,7 @@ def line_steps(points, normal, faced, start, places, turns, row, target, target_
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def interpolated(points, origin, step, nodes):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def interpolate_nodes(points, origin, step, nodes):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(n, 2) bilinear values at points (n, 2) of those at the nodes (nx, ny, 2) of a lattice; outside the value at its rim.
 
     Args:
@@ -163,7 +165,7 @@ def interpolated(points, origin, step, nodes):  # type: ignore[no-untyped-def]  
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def wall_gain(level, table, lost, seen):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def compute_wall_gain(level, table, lost, seen):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(Q, nx, ny) float32: the entry of a table (256,) at each level (Q, nx, ny) uint8, less what is lost there (nx, ny) float32;
     0 where nothing was seen (nx, ny) and the entry is not above 0."""
     out = np.zeros(level.shape, np.float32)
@@ -177,7 +179,7 @@ def wall_gain(level, table, lost, seen):  # type: ignore[no-untyped-def]  # prag
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def blended_moves(points, distance, nearest, anchors, moves, reach):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def blend_moves(points, distance, nearest, anchors, moves, reach):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(n, 2) m: shifts of points (n, 2) by the moves (k, 4) of pieces about their anchors (k, 2).
 
     Args:

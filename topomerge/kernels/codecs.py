@@ -48,13 +48,13 @@ def _unpack(data, out):  # type: ignore[no-untyped-def]  # pragma: no cover - co
     return o
 
 
-def lzf_unpack(data: NDArray[np.uint8], size: int) -> NDArray[np.uint8] | None:
-    """The `size` bytes that LZF data unpacks to, or None where it does not (Lehmann, liblzf: the format)."""
+def unpack_lzf(data: NDArray[np.uint8], size: int) -> NDArray[np.uint8] | None:
+    """Return the `size` bytes that LZF data unpacks to, or None where it does not (Lehmann, liblzf: the format)."""
     out = np.empty(size, np.uint8)
     return out if int(_unpack(data, out)) == size else None
 
 
-def _crc_table() -> NDArray[np.uint32]:
+def _build_crc_table() -> NDArray[np.uint32]:
     table = np.arange(256, dtype=np.uint32)
     for _ in range(8):
         table = np.where(table & 1, (table >> 1) ^ np.uint32(0x82F63B78), table >> 1).astype(np.uint32)
@@ -62,7 +62,7 @@ def _crc_table() -> NDArray[np.uint32]:
 
 
 @njit(cache=True)
-def _crc_pages(pages, table, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _compute_crc_pages(pages, table, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     for p in range(pages.shape[0]):
         crc = np.uint32(0xFFFFFFFF)
         for k in range(pages.shape[1]):
@@ -70,15 +70,15 @@ def _crc_pages(pages, table, out):  # type: ignore[no-untyped-def]  # pragma: no
         out[p] = crc ^ np.uint32(0xFFFFFFFF)
 
 
-def crc32c(pages: NDArray[np.uint8]) -> NDArray[np.uint32]:
-    """(n,) CRC-32C (Castagnoli, RFC 3720) of each row of (n, k) bytes."""
+def compute_crc32c(pages: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """Return (n,) CRC-32C (Castagnoli, RFC 3720) of each row of (n, k) bytes."""
     out = np.empty(len(pages), np.uint32)
-    _crc_pages(pages, _crc_table(), out)
+    _compute_crc_pages(pages, _build_crc_table(), out)
     return out
 
 
 @njit(cache=True)
-def _octree(data, keys, depths, states, stack):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _walk_octree(data, keys, depths, states, stack):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Walk the nodes; returns (leaves, bytes read), leaves -1 where the tree is broken."""
     count, at = 0, 0
     top = 1
@@ -107,7 +107,7 @@ def _octree(data, keys, depths, states, stack):  # type: ignore[no-untyped-def] 
     return count, at
 
 
-def octree_leaves(data: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None:
+def read_octree_leaves(data: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None:
     """Leaves of an OctoMap's nodes in depth-first order, or None where they are cut short or broken.
 
     Returns:
@@ -117,14 +117,14 @@ def octree_leaves(data: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[Any], 
     room = int(((pairs == FREE_LEAF) | (pairs == OCCUPIED_LEAF)).sum())
     keys, depths, states = np.empty((room, 3), np.int32), np.empty(room, np.int8), np.empty(room, np.int8)
     stack = np.empty((8 * LEAF_LEVEL + 8, 4), np.int32)
-    count, read = _octree(data, keys, depths, states, stack)
+    count, read = _walk_octree(data, keys, depths, states, stack)
     if count < 0 or read != len(data):
         return None
     return keys[:count], depths[:count], states[:count]
 
 
 @njit(cache=True)
-def _full_octree(data, width, keys, depths, states, stack):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _walk_full_octree(data, width, keys, depths, states, stack):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Walk the nodes of `width` bytes, log-odds first and bits of the children last; returns as `_octree`."""
     top, count, at = 1, 0, 0
     stack[0, :] = 0
@@ -154,12 +154,12 @@ def _full_octree(data, width, keys, depths, states, stack):  # type: ignore[no-u
     return count, at
 
 
-def full_octree_leaves(data: NDArray[np.uint8], width: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None:
-    """As `octree_leaves`, of the nodes of a full OctoMap, each of `width` bytes; the root may be a leaf (of depth 0)."""
+def read_full_octree_leaves(data: NDArray[np.uint8], width: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None:
+    """As `read_octree_leaves`, of the nodes of a full OctoMap, each of `width` bytes; the root may be a leaf (of depth 0)."""
     room = len(data) // width
     keys, depths, states = np.empty((room, 3), np.int32), np.empty(room, np.int8), np.empty(room, np.int8)
     stack = np.empty((8 * LEAF_LEVEL + 8, 4), np.int32)
-    count, read = _full_octree(data, width, keys, depths, states, stack)
+    count, read = _walk_full_octree(data, width, keys, depths, states, stack)
     if count < 0 or read != len(data):
         return None
     return keys[:count], depths[:count], states[:count]

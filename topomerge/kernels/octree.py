@@ -29,7 +29,7 @@ class Nodes(NamedTuple):
 
 
 @njit(cache=True)
-def _bucket(codes, child, parents, first):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _build_buckets(codes, child, parents, first):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     count = 0
     for i in range(len(codes)):
         parent = codes[i] >> np.uint64(3)
@@ -40,7 +40,7 @@ def _bucket(codes, child, parents, first):  # type: ignore[no-untyped-def]  # pr
 
 
 @njit(cache=True)
-def _bound(cells, child, span, box):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _compute_bounds(cells, child, span, box):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     n = len(cells)
     for j in range(len(span)):
         a, b = child[j], child[j + 1] - 1
@@ -59,14 +59,14 @@ def build(cells: NDArray[np.int32], codes: NDArray[np.uint64]) -> Nodes:
     parts: list[tuple[NDArray[Any], NDArray[Any]]] = []
     while len(codes) and (not parts or len(level) > 1):
         parents, first = np.empty(len(level), np.uint64), np.empty(len(level), np.int64)
-        count = _bucket(level, start, parents, first)
+        count = _build_buckets(level, start, parents, first)
         start, level = start + len(level), parents[:count].copy()
         parts.append((level, first[:count]))
     sizes = np.array([len(p) for p, _ in parts], np.int64)
     child = np.concatenate([f for _, f in parts] + [np.array([start], np.int64)])
     size = int(sizes.sum())
     span, box = np.empty((size, 2), np.int64), np.empty((size, 6), np.int32)
-    _bound(cells, child, span, box)
+    _compute_bounds(cells, child, span, box)
     prefixes = np.concatenate([p for p, _ in parts]) if parts else np.empty(0, np.uint64)
     return Nodes(child, span, box, prefixes, np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64))
 
@@ -81,7 +81,7 @@ def _descend(child, j, stack, top):  # type: ignore[no-untyped-def]  # pragma: n
 
 
 @njit(cache=True, error_model="numpy")
-def _bricks(centre, reach, size):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _find_bricks(centre, reach, size):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """First and last + 1 of the bricks that an axis of the ball may touch; an empty range where it lies outside."""
     low = min(max(np.ceil(centre - reach), 0.0), 8.0 * size)  # clipped as floats: a far point is no integer
     high = max(min(np.floor(centre + reach), 8.0 * size - 1.0), -1.0)
@@ -90,13 +90,13 @@ def _bricks(centre, reach, size):  # type: ignore[no-untyped-def]  # pragma: no 
 
 
 @njit(cache=True, error_model="numpy")
-def _start(table, first_brick, centre, reach, root, stack):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _push_start_nodes(table, first_brick, centre, reach, root, stack):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Put the nodes where a ball query starts on the stack, the last row's first: the few bricks that a small ball can
     touch, which are the third level of the tree and numbered as it is, else the root. Returns how many."""
     stack[0] = root
-    x0, x1 = _bricks(centre[0], reach, table.shape[0])
-    y0, y1 = _bricks(centre[1], reach, table.shape[1])
-    z0, z1 = _bricks(centre[2], reach, table.shape[2])
+    x0, x1 = _find_bricks(centre[0], reach, table.shape[0])
+    y0, y1 = _find_bricks(centre[1], reach, table.shape[1])
+    z0, z1 = _find_bricks(centre[2], reach, table.shape[2])
     if first_brick < 0 or (x1 - x0) * (y1 - y0) * (z1 - z0) > MOST_BRICKS:
         return 1
     top = 0
@@ -115,7 +115,7 @@ def _start(table, first_brick, centre, reach, root, stack):  # type: ignore[no-u
 
 
 @njit(cache=True, error_model="numpy")
-def _in_ball(cells, child, span, box, centre, square, top, stack, out, fill):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _find_in_ball(cells, child, span, box, centre, square, top, stack, out, fill):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Rows of the cells whose squared distance to `centre` (in cells) is at most `square`, below the `top` nodes on the
     stack; returns how many."""
     n, count = len(cells), 0
@@ -147,25 +147,27 @@ def _in_ball(cells, child, span, box, centre, square, top, stack, out, fill):  #
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _task(tree, centres, reach, indptr, out, fill, begin, end):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _query_ball_task(tree, centres, reach, indptr, out, fill, begin, end):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     cells, child, span, box, table, first_brick = tree
     root, stack = len(cells) + len(span) - 1, np.empty(STACK_SIZE, np.int64)
     for i in range(begin, end):
         part = out[indptr[i] : indptr[i + 1]] if fill else out
-        top = _start(table, first_brick, centres[i], reach, root, stack)
-        count = _in_ball(cells, child, span, box, centres[i], reach * reach, top, stack, part, fill)
+        top = _push_start_nodes(table, first_brick, centres[i], reach, root, stack)
+        count = _find_in_ball(cells, child, span, box, centres[i], reach * reach, top, stack, part, fill)
         if not fill:
             indptr[i + 1] = count
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
-def _tasks(tree, centres, reach, indptr, out, fill):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _query_balls(tree, centres, reach, indptr, out, fill):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     for task in prange((len(centres) + QUERIES_A_TASK - 1) // QUERIES_A_TASK):
-        _task(tree, centres, reach, indptr, out, fill, task * QUERIES_A_TASK, min((task + 1) * QUERIES_A_TASK, len(centres)))
+        _query_ball_task(
+            tree, centres, reach, indptr, out, fill, task * QUERIES_A_TASK, min((task + 1) * QUERIES_A_TASK, len(centres))
+        )
 
 
 @njit(cache=True, error_model="numpy")
-def _in_box(cells, child, span, box, low, high, stack, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _collect_in_box(cells, child, span, box, low, high, stack, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Rows of the cells low <= cell < high into `out`; returns how many."""
     n, count, top = len(cells), 0, 1
     stack[0] = n + len(span) - 1
@@ -192,16 +194,16 @@ def _in_box(cells, child, span, box, low, high, stack, out):  # type: ignore[no-
     return count
 
 
-def in_box(cells: NDArray[np.int32], nodes: Nodes, low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Ascending rows of the cells low <= cell < high."""
+def find_in_box(cells: NDArray[np.int32], nodes: Nodes, low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return ascending rows of the cells low <= cell < high."""
     out = np.empty(len(cells), np.int64)
     if not len(cells):
         return out
     stack = np.empty(STACK_SIZE, np.int64)
-    return out[: _in_box(cells, *nodes[:3], low, high, stack, out)].copy()
+    return out[: _collect_in_box(cells, *nodes[:3], low, high, stack, out)].copy()
 
 
-def in_balls(
+def find_in_balls(
     cells: NDArray[np.int32], nodes: Nodes, table: NDArray[np.int32], centres: NDArray[np.float64], radius: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """CSR (indptr, ascending rows) of the cells within `radius` of (q, 3) centres, all in cells; `table` is `lookup.build`'s."""
@@ -216,7 +218,7 @@ def in_balls(
             np.cumsum(indptr, out=indptr)
             rows = np.empty(indptr[-1], np.int64)
         if len(centres) > QUERIES_A_TASK:
-            _tasks(tree, centres, radius, indptr, rows, fill)
+            _query_balls(tree, centres, radius, indptr, rows, fill)
         else:  # waking the other cores costs more than so few queries
-            _task(tree, centres, radius, indptr, rows, fill, 0, len(centres))
+            _query_ball_task(tree, centres, radius, indptr, rows, fill, 0, len(centres))
     return indptr, rows

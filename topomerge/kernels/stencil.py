@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from topomerge.kernels.lookup import row
+from topomerge.kernels.voxels import find_row
 
 CELLS_A_TASK = 2048  # scratch memory is made once a task, and two cores stay level
 Arrays2 = tuple[NDArray[Any], NDArray[Any]]  # table and bricks of `lookup.build`; offsets and weights of a stencil
@@ -26,15 +26,15 @@ def _fill_columns(cells, table, out):  # type: ignore[no-untyped-def]  # pragma:
         out[table[x >> 3, y >> 3, z >> 3], ((x & 7) << 3) | (y & 7)] |= np.uint8(1 << (z & 7))
 
 
-def columns(cells: NDArray[Any], table: NDArray[Any], bricks: NDArray[Any]) -> NDArray[np.uint8]:
-    """(bricks, 64) uint8: bit z of column 8 x + y is set where cell (x, y, z) of the brick is occupied."""
+def build_columns(cells: NDArray[Any], table: NDArray[Any], bricks: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return (bricks, 64) uint8: bit z of column 8 x + y is set where cell (x, y, z) of the brick is occupied."""
     out = np.zeros((len(bricks), 64), np.uint8)
     _fill_columns(cells, table, out)
     return out
 
 
 @njit(cache=True, error_model="numpy")
-def _column(table, bits, x, y, low, high, stop):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _count_in_column(table, bits, x, y, low, high, stop):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Occupied cells (x, y, low .. high); with `stop` the count ends in the first brick that holds one."""
     low, high = max(low, 0), min(high, table.shape[2] * 8 - 1)
     if x < 0 or y < 0 or (x >> 3) >= table.shape[0] or (y >> 3) >= table.shape[1] or low > high:
@@ -62,18 +62,18 @@ def _count(table, bits, cells, runs, weights, out):  # type: ignore[no-untyped-d
         total = 0.0
         for j in range(len(runs)):
             low, high = z + runs[j, 2], z + runs[j, 3]
-            total += weights[j] * _column(table, bits, x + runs[j, 0], y + runs[j, 1], low, high, False)
+            total += weights[j] * _count_in_column(table, bits, x + runs[j, 0], y + runs[j, 1], low, high, False)
         out[i] = total
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
-def _any(table, bits, cells, runs, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _find_any(table, bits, cells, runs, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     for i in prange(len(cells)):
         x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
         occupied = False
         for j in range(len(runs)):
             low, high = z + runs[j, 2], z + runs[j, 3]
-            if _column(table, bits, x + runs[j, 0], y + runs[j, 1], low, high, True):
+            if _count_in_column(table, bits, x + runs[j, 0], y + runs[j, 1], low, high, True):
                 occupied = True
                 break
         out[i] = occupied
@@ -85,7 +85,7 @@ def _weigh(table, bricks, cells, offsets, weights, values, largest, out):  # typ
         x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
         out[i] = -np.inf if largest else 0.0
         for j in range(len(offsets)):
-            r = row(table, bricks, x + offsets[j, 0], y + offsets[j, 1], z + offsets[j, 2])
+            r = find_row(table, bricks, x + offsets[j, 0], y + offsets[j, 1], z + offsets[j, 2])
             if r < 0:
                 continue
             for c in range(values.shape[1]):
@@ -97,7 +97,7 @@ def _weigh(table, bricks, cells, offsets, weights, values, largest, out):  # typ
 
 
 @njit(cache=True, error_model="numpy")
-def _winner(voted, votes, count, present):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _find_winner(voted, votes, count, present):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """The label with most votes: of several `own`, else the smallest; -1 where nobody voted."""
     best, most = -1, 0.0
     for k in range(count):
@@ -115,7 +115,7 @@ def _vote(table, bricks, cells, offsets, weights, labels, out):  # type: ignore[
             x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
             count = 0
             for j in range(len(offsets)):
-                r = row(table, bricks, x + offsets[j, 0], y + offsets[j, 1], z + offsets[j, 2])
+                r = find_row(table, bricks, x + offsets[j, 0], y + offsets[j, 1], z + offsets[j, 2])
                 if r < 0 or labels[r] < 0:
                     continue
                 k = 0
@@ -125,7 +125,7 @@ def _vote(table, bricks, cells, offsets, weights, labels, out):  # type: ignore[
                     voted[k], votes[k] = labels[r], 0.0
                     count += 1
                 votes[k] += weights[j]
-            out[i] = _winner(voted, votes, count, labels[i])
+            out[i] = _find_winner(voted, votes, count, labels[i])
 
 
 def count(
@@ -137,10 +137,10 @@ def count(
     return out
 
 
-def any_(table: NDArray[Any], bits: NDArray[Any], cells: NDArray[Any], runs: NDArray[Any]) -> NDArray[np.bool_]:
+def is_any_occupied(table: NDArray[Any], bits: NDArray[Any], cells: NDArray[Any], runs: NDArray[Any]) -> NDArray[np.bool_]:
     """(m,) is any cell under the runs placed at each of (m, 3) int64 cells occupied?"""
     out = np.empty(len(cells), np.bool_)
-    _any(table, bits, cells, runs, out)
+    _find_any(table, bits, cells, runs, out)
     return out
 
 
@@ -152,7 +152,7 @@ def weigh(bricks: Arrays2, cells: NDArray[Any], stencil: Arrays2, values: NDArra
 
 
 def vote(bricks: Arrays2, cells: NDArray[Any], stencil: Arrays2, labels: NDArray[Any]) -> NDArray[np.int64]:
-    """(n,) most voted of the (n,) int64 labels under the stencil; negative labels do not vote."""
+    """Return (n,) most voted of the (n,) int64 labels under the stencil; negative labels do not vote."""
     out = np.empty(len(cells), np.int64)
     _vote(*bricks, cells, *stencil, labels, out)
     return out

@@ -1,29 +1,60 @@
-"""Two maps -> which rooms are the same (seeds 3.3)."""
+"""Match two maps: which rooms are the same (seeds 3.3)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from topomerge.embedding.embedders import DEFAULT
-from topomerge.embedding.embedders import embedder as make_embedder
-from topomerge.embedding.room_cells import Descriptor
-from topomerge.embedding.turns import Rows, TurnedRows
+from topomerge.embedding.learned import DEFAULT
+from topomerge.embedding.learned import build_embedder as make_embedder
+from topomerge.embedding.quarter_turns import Descriptor, Rows, TurnedRows
 from topomerge.errors import InputError
-from topomerge.matching.assignment import assign
-from topomerge.matching.consistency import hypotheses, voted_pose
-from topomerge.matching.costs import descriptor_costs, similarities, usual_best
-from topomerge.matching.growing import align, grow
-from topomerge.matching.odds import match_probability
+from topomerge.io.listing import convert_to_plain
+from topomerge.matching.assignment import (
+    align,
+    assign,
+    assign_certain,
+    compute_descriptor_costs,
+    compute_similarities,
+    compute_usual_best_cost,
+    grow,
+)
+from topomerge.matching.consistency import compute_match_probability, find_voted_pose, propose_hypotheses
 from topomerge.matching.poses import PoseHypothesis
-from topomerge.matching.result import Matching
-from topomerge.matching.room_matcher import RoomOdds, certainty_of_turns, room_odds
-from topomerge.matching.scores import assign_certain
-from topomerge.matching.unknown_scale import odds_at_best_scale
-from topomerge.types import Array, TopometricMap
+from topomerge.matching.room_matcher import RoomOdds, combine_turn_certainties, compute_room_odds, find_best_scale
+from topomerge.types import LEVELLED, Array, Sim3, TopometricMap, convert_pose_to_files, is_level
+
+
+def _build_empty_rooms() -> Array:
+    return np.zeros((0, 2), np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Matching:
+    """Rooms of map a that are rooms of map b.
+
+    Args:
+        rooms: (M, 2) int64, ascending; most rooms are in one row at most, one that is cut in two in the other map is in two.
+        probability: (M,) float64.
+        transform: T_ab of the best hypothesis; None where rooms were matched without geometry.
+        alternatives: all hypotheses, best first (the first one is that of `transform`).
+        statistics: of the cost matrix and the search.
+    """
+
+    rooms: Array = field(default_factory=_build_empty_rooms)
+    probability: Array = field(default_factory=lambda: np.zeros(0))
+    transform: Sim3 | None = None
+    alternatives: tuple[PoseHypothesis, ...] = ()
+    statistics: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.rooms.shape != (len(self.probability), 2):
+            raise ValueError(f"rooms must be (M, 2) with a probability each, not {self.rooms.shape}")
+
 
 METHODS = ("consistent", "attention", "growing", "assignment", "thesis")
 THESIS: dict[str, Any] = {"laplacian": "graph", "values": 256, "normalise": "first", "k": 1}
@@ -57,7 +88,7 @@ def match(
     growing: GrowingLimits = GrowingLimits(),
     **options: Any,
 ) -> Matching:
-    """Rooms of a that are rooms of b.
+    """Return rooms of a that are rooms of b.
 
     Args:
         embedder: ``"learned"``, ``"engineered"``, ``"shapedna"``, ``"feather"``, the folder of a trained one, or a callable
@@ -80,44 +111,44 @@ def match(
         raise InputError(f"matching method {method!r}: {', '.join(METHODS)} are possible")
     check(a, b)
     describe = make_embedder("shapedna", **THESIS) if method == "thesis" else make_embedder(embedder, k, **options)
-    rows = checked(describe, a), checked(describe, b)
-    cost = descriptor_costs(*rows)
-    similarity = similarities(cost)
+    rows = embed_rooms(describe, a), embed_rooms(describe, b)
+    cost = compute_descriptor_costs(*rows)
+    similarity = compute_similarities(cost)
     statistics = {"rooms_a": float(len(a.rooms)), "rooms_b": float(len(b.rooms)), "median_cost": float(np.median(cost))}
-    statistics["usual_best_cost"] = usual_best(cost)
+    statistics["usual_best_cost"] = compute_usual_best_cost(cost)
     if method == "assignment":
-        pairs = assign(cost, 2 * usual_best(cost) if largest_cost is None else largest_cost)
+        pairs = assign(cost, 2 * compute_usual_best_cost(cost) if largest_cost is None else largest_cost)
         return Matching(pairs, similarity[tuple(pairs.T)], statistics=statistics)
     odds: tuple[RoomOdds, ...] = ()
     if method in ("attention", "consistent"):
-        odds = _odds(describe, rows, b, scale_free, statistics)
+        odds = _compute_odds(describe, rows, b, scale_free, statistics)
     if method == "attention":
-        return _by_attention(a, b, odds, statistics)
+        return _match_by_attention(a, b, odds, statistics)
     if method == "consistent":
-        likely = certainty_of_turns(odds) if odds else similarity
-        ranked = hypotheses(
+        likely = combine_turn_certainties(odds) if odds else similarity
+        ranked = propose_hypotheses(
             a, b, 1 - likely if odds else cost, likely, scale_free, MOST_HYPOTHESES, statistics.get("scale") if odds else None
         )
-        rooms, probability = marginal(a, b, ranked)
+        rooms, probability = select_marginal_matches(a, b, ranked)
     else:  # one hypothesis wins as a whole, as in the thesis
-        ranked = _from_growing(a, b, cost, similarity, growing)
+        ranked = _grow_ranked_hypotheses(a, b, cost, similarity, growing)
         rooms, probability = (ranked[0].rooms, ranked[0].fit) if ranked else (np.zeros((0, 2), np.int64), np.zeros(0))
     return Matching(rooms, probability, ranked[0].transform if ranked else None, ranked, statistics)
 
 
-def _odds(
+def _compute_odds(
     describe: Descriptor, rows: tuple[Rows, Rows], b: TopometricMap, scale_free: bool, statistics: dict[str, float]
 ) -> tuple[RoomOdds, ...]:
     """Partners of rooms by `room_matcher`; of unknown scale at that at which they are surest, which goes into the statistics."""
     if not scale_free:
-        return room_odds(*rows)
+        return compute_room_odds(*rows)
     if not hasattr(describe, "at_scales"):
         return ()
-    statistics["scale"], odds = odds_at_best_scale(*rows, describe.at_scales(b))
+    statistics["scale"], odds = find_best_scale(*rows, describe.at_scales(b))
     return odds
 
 
-def _by_attention(a: TopometricMap, b: TopometricMap, odds: Sequence[RoomOdds], statistics: dict[str, float]) -> Matching:
+def _match_by_attention(a: TopometricMap, b: TopometricMap, odds: Sequence[RoomOdds], statistics: dict[str, float]) -> Matching:
     """Matches of `room_matcher`, and the pose that most of their doors and middles vote for.
 
     Raises:
@@ -125,9 +156,9 @@ def _by_attention(a: TopometricMap, b: TopometricMap, odds: Sequence[RoomOdds], 
     """
     if not odds:
         raise InputError("method attention needs the embedder that ships; take method consistent")
-    certain = max(odds, key=lambda turned: turned.sureness).certainty
+    certain = max(odds, key=lambda turned: turned.confidence).certainty
     rooms = assign_certain(certain, LEAST_CERTAINTY)
-    pose = voted_pose(a, b, certain, statistics.get("scale"))
+    pose = find_voted_pose(a, b, certain, statistics.get("scale"))
     probability = certain[tuple(rooms.T)]
     ranked = () if pose is None else (PoseHypothesis(pose, float(len(rooms)), 1.0, {}, True, rooms, probability),)
     return Matching(rooms, probability, pose, ranked, statistics)
@@ -147,8 +178,8 @@ def check(a: TopometricMap, b: TopometricMap) -> None:
         raise InputError(f"{b.source or 'the second map'}: is the same map as {a.source or 'the first'}; give two different maps")
 
 
-def checked(describe: Descriptor, map: TopometricMap) -> Rows:
-    """What an embedder gives, if it is a finite row for each room, or one for each quarter turn of it.
+def embed_rooms(describe: Descriptor, map: TopometricMap) -> Rows:
+    """Embed a map and check the result: a finite row for each room, or one for each quarter turn of it.
 
     Raises:
         InputError: it is not.
@@ -161,14 +192,14 @@ def checked(describe: Descriptor, map: TopometricMap) -> Rows:
     return replace(given, rows=rows) if isinstance(given, TurnedRows) else rows
 
 
-def marginal(a: TopometricMap, b: TopometricMap, ranked: tuple[PoseHypothesis, ...]) -> tuple[Array, Array]:
+def select_marginal_matches(a: TopometricMap, b: TopometricMap, ranked: tuple[PoseHypothesis, ...]) -> tuple[Array, Array]:
     """Matches of the best hypothesis, and all whose probability over the hypotheses is above 0.5 and that exclude none of those.
 
     The probability of a match is the sum, over the hypotheses that have it, of theirs times that rooms which fit so are one.
     """
     total: dict[tuple[int, int], float] = {}
     for h in ranked:
-        chance = match_probability(a, b, h.rooms, h.fit)
+        chance = compute_match_probability(a, b, h.rooms, h.fit)
         for (i, j), p in zip(h.rooms.tolist(), chance.tolist(), strict=True):
             total[i, j] = total.get((i, j), 0.0) + h.probability * p
     best = {(i, j) for i, j in ranked[0].rooms.tolist()} if ranked else set()
@@ -178,7 +209,7 @@ def marginal(a: TopometricMap, b: TopometricMap, ranked: tuple[PoseHypothesis, .
     return np.array(chosen, np.int64).reshape(-1, 2), np.array([min(total[p], 1.0) for p in chosen])
 
 
-def _from_growing(
+def _grow_ranked_hypotheses(
     a: TopometricMap, b: TopometricMap, cost: Array, similarity: Array, limits: GrowingLimits
 ) -> tuple[PoseHypothesis, ...]:
     """Hypotheses of the growing; their probability goes with the square of the number of matches."""
@@ -191,3 +222,55 @@ def _from_growing(
         fit = similarity[tuple(rooms.T)]
         ranked.append(PoseHypothesis(pose, float(len(rooms)), float(share), {"error_m": error}, True, rooms, fit))
     return tuple(ranked)
+
+
+MATCHING_FORMAT = 1
+
+
+def serialise_matching(matching: Matching, a: TopometricMap, b: TopometricMap) -> dict[str, Any]:
+    """Rooms with their probabilities and all hypotheses; matrices are row-major and map points of the file of b into
+    the frame of that of a."""
+    rows = zip(matching.rooms.tolist(), matching.probability.tolist(), strict=True)
+    listing = {
+        "format": MATCHING_FORMAT,
+        "maps": [describe_map(m) for m in (a, b)],
+        "matches": [{"rooms": rooms, "probability": round(p, 4)} for rooms, p in rows],
+        "hypotheses": [
+            _serialise_hypothesis(h, convert_pose_to_files(h.transform, b.levelling, a.levelling)) for h in matching.alternatives
+        ],
+        "statistics": dict(matching.statistics),
+    }
+    out: dict[str, Any] = convert_to_plain(listing)
+    return out
+
+
+def describe_map(map: TopometricMap) -> dict[str, Any]:
+    """Describe a map for a listing of several: its file, its rooms and storeys, and how it was levelled."""
+    levelled = {} if is_level(map.levelling) else {LEVELLED: map.levelling.tolist()}
+    return {"source": map.source, "rooms": len(map.rooms), "storeys": len(map.storeys), **levelled}
+
+
+def _serialise_hypothesis(h: PoseHypothesis, matrix: Array) -> dict[str, Any]:
+    return {
+        "probability": round(h.probability, 4),
+        "score": round(h.score, 3),
+        "transform": {"matrix": matrix.tolist(), "scale": h.transform.scale, "yaw": h.transform.yaw},
+        "rooms": h.rooms.tolist(),
+        "evidence": dict(h.features),
+    }
+
+
+def format_matching(matching: Matching, a: TopometricMap, b: TopometricMap) -> str:
+    """Return the table that `topomerge match` prints."""
+    lines = [f"{len(matching.rooms)} matches of {len(a.rooms)} and {len(b.rooms)} rooms"]
+    if len(matching.rooms):
+        lines += ["", "room a  area m2   room b  area m2   probability"]
+    for (i, j), p in zip(matching.rooms.tolist(), matching.probability.tolist(), strict=True):
+        lines.append(f"{i:>6}  {a.rooms['area'][i]:>7.1f}   {j:>6}  {b.rooms['area'][j]:>7.1f}   {p:>11.2f}")
+    if matching.alternatives:
+        lines += ["", "hypothesis  probability  matches  yaw deg        x        y        z  scale"]
+    for k, h in enumerate(matching.alternatives[:5]):
+        numbers = "  ".join(f"{v:>7.2f}" for v in h.transform.translation)
+        yaw = math.degrees(h.transform.yaw)
+        lines.append(f"{k:>10}  {h.probability:>11.2f}  {len(h.rooms):>7}  {yaw:>7.1f}  {numbers}  {h.transform.scale:>5.3f}")
+    return "\n".join(lines)

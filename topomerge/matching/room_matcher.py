@@ -1,27 +1,19 @@
-"""Which rooms of two maps are one: a small network that looks at both maps at once.
-
-Each room starts as what it looks like (its rows, `embedding.turns`), then looks at the rooms of its own map and at those of the
-other one (attention within and across; Lindenberger et al. 2023, LightGlue). Both maps are turned into the direction of their
-walls, so that the way from one room to another is told without any common frame. Rooms that are one are all moved by one way
-from one map to the other: how much of the matching so far agrees with the way of a pair is shown to each layer. Trained by
-``train.py task=room_matcher`` with the rows of the embedder that ships, and for no others.
-"""
+"""The network that says which rooms of two maps are one."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
-from topomerge.embedding.turns import FACTS, QUARTERS, Rows, TurnedRows, quarters_between
+from topomerge.embedding.quarter_turns import FACTS, QUARTERS, Rows, TurnedRows, estimate_quarter_turns
 from topomerge.errors import InputError
-from topomerge.io.weight_files import weights_file
-from topomerge.kernels.votes import summed_votes
-from topomerge.networks.network import WEIGHTS_PACKAGE, Run, load_network, read_card
-from topomerge.networks.signature import Signature, Tensor
+from topomerge.io.archive import find_weights_file
+from topomerge.kernels.registration import sum_votes
+from topomerge.networks.network import WEIGHTS_PACKAGE, Run, Signature, Tensor, load_network, read_card
 from topomerge.types import Array
 
 MATCHER_FILE = "room_matcher.onnx"
@@ -65,7 +57,7 @@ class RoomsSeen:
     """What the network sees of the rooms of a map.
 
     Args:
-        rows: (R, 4 D) of length 1, of the map as it is turned (`TurnedRows.flat`).
+        rows: (R, 4 D) of length 1, of the map as it is turned (`TurnedRows.flatten`).
         places: (R, 2) m, middles of the rooms in the direction of the walls.
         heights: (R,) m.
         facts: (R, FACTS).
@@ -98,51 +90,51 @@ class RoomOdds:
         return out
 
     @property
-    def sureness(self) -> float:
+    def confidence(self) -> float:
         """Sum of the squares of all certainties: one sure match tells more than several doubtful ones."""
         return float((self.certainty**2).sum())
 
 
-def room_odds(a: Rows, b: Rows, likeliest: bool = False) -> tuple[RoomOdds, ...]:
+def compute_room_odds(a: Rows, b: Rows, likeliest: bool = False) -> tuple[RoomOdds, ...]:
     """Partners of the rooms of two maps at each of four quarter turns of the second one; none where the rows are not those of the
     embedder that the network was trained with, or a map has no rooms. Which map is given first changes nothing.
 
     Args:
-        likeliest: only at the turn that rows vote for (`turns.quarters_between`).
+        likeliest: only at the turn that rows vote for (`turns.estimate_quarter_turns`).
 
     Raises:
         InputError: the network is damaged.
     """
-    matcher = matcher_weights()
+    matcher = load_matcher_weights()
     for rows in (a, b):
         if not isinstance(rows, TurnedRows) or not len(rows) or rows.facts is None or rows.embedder != matcher.embedder:
             return ()
     assert isinstance(a, TurnedRows) and isinstance(b, TurnedRows)
-    if _order(b) < _order(a):  # rows are read as they are turned: the second map as the first one stands
-        swapped = [RoomOdds(o.columns, o.rows, -o.quarters % QUARTERS) for o in room_odds(b, a, likeliest)]
+    if _compute_order_key(b) < _compute_order_key(a):  # rows are read as they are turned: the second map as the first one stands
+        swapped = [RoomOdds(o.columns, o.rows, -o.quarters % QUARTERS) for o in compute_room_odds(b, a, likeliest)]
         return tuple(sorted(swapped, key=lambda turned: turned.quarters))
     if likeliest:
-        k = quarters_between(a, b)
-        return (replace(odds_of(rooms_seen(a), rooms_seen(b, k), matcher), quarters=k),)
-    return every_turn(rooms_seen(a), [rooms_seen(b, k) for k in range(QUARTERS)], matcher)
+        k = estimate_quarter_turns(a, b)
+        return (replace(run_network(build_rooms_seen(a), build_rooms_seen(b, k), matcher), quarters=k),)
+    return match_every_turn(build_rooms_seen(a), [build_rooms_seen(b, k) for k in range(QUARTERS)], matcher)
 
 
-def _order(rows: TurnedRows) -> tuple[int, float]:
+def _compute_order_key(rows: TurnedRows) -> tuple[int, float]:
     """That of two maps, whichever is given first."""
     assert rows.facts is not None
     return len(rows), float(rows.facts.sum())
 
 
-def certainty_of_turns(odds: Sequence[RoomOdds]) -> Array:
-    """(R_a, R_b) certainty of pairs over all turns, each as likely as it is sure of itself."""
-    sure = np.array([turned.sureness for turned in odds])
+def combine_turn_certainties(odds: Sequence[RoomOdds]) -> Array:
+    """Return (R_a, R_b) certainty of pairs over all turns, each as likely as it is sure of itself."""
+    sure = np.array([turned.confidence for turned in odds])
     share = np.exp(sure - sure.max())
     out: Array = np.tensordot(share / share.sum(), [turned.certainty for turned in odds], axes=1)
     return out
 
 
-def rooms_seen(rows: TurnedRows, quarters: int = 0) -> RoomsSeen:
-    """A map that is turned by so many quarter turns.
+def build_rooms_seen(rows: TurnedRows, quarters: int = 0) -> RoomsSeen:
+    """Return a map that is turned by so many quarter turns.
 
     Args:
         rows: with facts.
@@ -150,15 +142,15 @@ def rooms_seen(rows: TurnedRows, quarters: int = 0) -> RoomsSeen:
     assert rows.facts is not None
     turned = (rows.places @ np.array([1, 1j])) * 1j**quarters
     places = np.stack([turned.real, turned.imag], axis=1)
-    return RoomsSeen(rows.flat(quarters), places - places.mean(axis=0), rows.facts[:, -1], rows.facts)
+    return RoomsSeen(rows.flatten(quarters), places - places.mean(axis=0), rows.facts[:, -1], rows.facts)
 
 
-def every_turn(a: RoomsSeen, turned: Sequence[RoomsSeen], matcher: Matcher) -> tuple[RoomOdds, ...]:
-    """The network on a map and another one in each of its quarter turns."""
-    return tuple(replace(odds_of(a, b, matcher), quarters=k) for k, b in enumerate(turned))
+def match_every_turn(a: RoomsSeen, turned: Sequence[RoomsSeen], matcher: Matcher) -> tuple[RoomOdds, ...]:
+    """Return the network on a map and another one in each of its quarter turns."""
+    return tuple(replace(run_network(a, b, matcher), quarters=k) for k, b in enumerate(turned))
 
 
-def odds_of(a: RoomsSeen, b: RoomsSeen, matcher: Matcher) -> RoomOdds:
+def run_network(a: RoomsSeen, b: RoomsSeen, matcher: Matcher) -> RoomOdds:
     """Run the network on two maps as they are turned, stage by stage: before each of them, pairs of rooms vote (`agreement`)."""
     feeds: dict[str, Array] = {}
     for side, map in (("a", a), ("b", b)):
@@ -166,7 +158,7 @@ def odds_of(a: RoomsSeen, b: RoomsSeen, matcher: Matcher) -> RoomOdds:
         feeds |= {f"heights_{side}": map.heights - map.heights.mean(), f"state_{side}": np.zeros((len(map.rows), matcher.width))}
     likely = compute_first_guess(a.rows @ b.rows.T)
     for stage in range(matcher.stages):
-        feeds |= {"stage": np.arange(matcher.stages) == stage, "votes": agreement(likely, a, b)}
+        feeds |= {"stage": np.arange(matcher.stages) == stage, "votes": compute_agreement(likely, a, b)}
         feeds["state_a"], feeds["state_b"], rows, columns = matcher.run(**feeds)
         likely = np.sqrt(rows[:, :-1] * columns[:, :-1].T)
     return RoomOdds(rows.astype(float), columns.astype(float))
@@ -180,7 +172,7 @@ def compute_first_guess(cosine: Array) -> Array:
     return likely
 
 
-def agreement(likely: Array, a: RoomsSeen, b: RoomsSeen) -> Array:
+def compute_agreement(likely: Array, a: RoomsSeen, b: RoomsSeen) -> Array:
     """(R_a, R_b, 2) how much of a matching agrees with each pair of rooms on the way from one map to the other.
 
     Args:
@@ -194,7 +186,7 @@ def agreement(likely: Array, a: RoomsSeen, b: RoomsSeen) -> Array:
     voters, voted = order[: min(VOTERS * (n + m), MOST_VOTERS)], np.sort(order[:MOST_VOTED])
     room = np.stack(np.divmod(np.arange(n * m), m), axis=1)
     chance = likely.ravel().astype(np.float64)
-    out[voted] = np.log1p(VOTE_UNIT * summed_votes(way, rise, room, chance, voted, voters, np.array(AGREEMENT), LEVEL_GAP))
+    out[voted] = np.log1p(VOTE_UNIT * sum_votes(way, rise, room, chance, voted, voters, np.array(AGREEMENT), LEVEL_GAP))
     return out.reshape(n, m, len(AGREEMENT))
 
 
@@ -224,9 +216,9 @@ def build_signature(numbers: int, width: int, stages: int) -> Signature:
     return Signature("Says which rooms of two maps are one; each call runs one stage.", inputs, outputs)
 
 
-def matcher_weights() -> Matcher:
+def load_matcher_weights() -> Matcher:
     """Load the network that ships, or the one in its place (`io.weight_files`)."""
-    return read_matcher(weights_file(WEIGHTS_PACKAGE, MATCHER_FILE))
+    return read_matcher(find_weights_file(WEIGHTS_PACKAGE, MATCHER_FILE))
 
 
 def read_matcher(path: Path) -> Matcher:
@@ -244,3 +236,31 @@ def read_matcher(path: Path) -> Matcher:
     if not 0 < width <= MOST_SIZE or not 0 < stages <= MOST_SIZE:
         raise InputError(f"{path}: its card is of no network that matches rooms (width {width}); copy both files again")
     return Matcher(load_network(path, build_signature(numbers, width, stages)), width, stages, embedder)
+
+
+COARSE_SCALES = tuple(np.exp(np.linspace(np.log(0.5), np.log(2.0), 8)).tolist())  # steps of a fifth: crops still look alike
+FINE_STEP = COARSE_SCALES[1] / COARSE_SCALES[0]
+RowsAt = Callable[[float], Rows]
+
+
+def find_best_scale(of_a: Rows, of_b: Rows, rows_at: RowsAt) -> tuple[float, tuple[RoomOdds, ...]]:
+    """m that the unit of the second map is taken for, and the partners of the rooms of both maps at each quarter turn then; 1 and
+    none where the rows are of an embedder for which there is no such network.
+
+    Args:
+        of_a: rows of the first map, whose scale is known.
+        of_b: rows of the second one as it is.
+        rows_at: scale -> rows of the second one (`Learned.at_scales`).
+    """
+    if not compute_room_odds(of_a, of_b, likeliest=True):
+        return 1.0, ()
+    rows: dict[float, Rows] = {}
+
+    def sureness(scale: float) -> float:
+        """At the quarter turn that most rooms which look alike vote for: all four take four times as long."""
+        rows[scale] = rows[scale] if scale in rows else rows_at(scale)
+        return compute_room_odds(of_a, rows[scale], likeliest=True)[0].confidence
+
+    best = max(COARSE_SCALES, key=sureness)
+    best = max([best, best / FINE_STEP**0.5, best * FINE_STEP**0.5], key=sureness)
+    return best, compute_room_odds(of_a, rows[best])

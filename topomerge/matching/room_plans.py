@@ -10,8 +10,8 @@ from scipy import ndimage
 
 from topomerge.extraction.plans import storey_plan
 from topomerge.extraction.plans.storey_plan import HEIGHT_BANDS, WALL_RULE, StoreyPlan
-from topomerge.kernels.plan import column_bits
-from topomerge.matching.plan_fields import PlanFields
+from topomerge.kernels.rasters import compute_column_bits
+from topomerge.matching.poses import PlanFields
 from topomerge.types import Array, TopometricMap
 
 DIRECTION_BLUR = 1.5  # cells, before the direction of walls is measured
@@ -94,7 +94,7 @@ class RoomPlans:
             weight += float(size.sum())
         return float(np.angle(total) / 4 % (np.pi / 2)), abs(total) / max(weight, 1e-9)
 
-    def samples(self, number: int) -> tuple[Array, Array, Array, Array]:
+    def sample_columns(self, number: int) -> tuple[Array, Array, Array, Array]:
         """Up to `number` wall columns and as many of the floor, evenly spread: places (n, 2), storey, is it a wall?, and (2,) how
         many columns of walls and of floor each sample stands for."""
         parts, each = [], np.zeros(2)
@@ -108,8 +108,8 @@ class RoomPlans:
         return places, storey.astype(np.int64), is_wall, each
 
 
-def room_plans(map: TopometricMap) -> RoomPlans:
-    """The plans of a map's storeys, with its rooms."""
+def build_room_plans(map: TopometricMap) -> RoomPlans:
+    """Return the plans of a map's storeys, with its rooms."""
     grid, nav = map.grid, map.navigable
     shape = (len(map.storeys), *grid.shape[:2])
     label = np.full(shape, -1, np.int32)
@@ -123,18 +123,18 @@ def room_plans(map: TopometricMap) -> RoomPlans:
     rows = np.flatnonzero(map.room >= 0)
     room = map.room[rows]
     footprint[map.rooms["storey"][room], grid.cells[rows, 0], grid.cells[rows, 1]] = room
-    plans = tuple(_plan(map, s, label[s] >= 0) for s in range(shape[0]))
+    plans = tuple(_build_storey_plan(map, s, label[s] >= 0) for s in range(shape[0]))
     return RoomPlans(plans, label, np.where(label >= 0, label, footprint))
 
 
-def _plan(map: TopometricMap, storey: int, navigable: Array) -> StoreyPlan:
+def _build_storey_plan(map: TopometricMap, storey: int, navigable: Array) -> StoreyPlan:
     """The plan of a storey; its inside is its navigable floor (nx, ny)."""
     grid, levels = map.grid, (float(map.storeys["floor"][storey]), float(map.storeys["ceiling"][storey]))
     floor = np.full(navigable.shape, levels[0])
     ix, iy = np.ascontiguousarray(grid.cells[:, :2].T.astype(np.int64))
     z = grid.origin[2] + (grid.cells[:, 2] + 0.5) * grid.edge
-    profile = column_bits(ix, iy, z, floor, -HEIGHT_BANDS.below * HEIGHT_BANDS.step, HEIGHT_BANDS.step)
-    filled = storey_plan.band_stack(profile, HEIGHT_BANDS, storey_plan.WALL_HEIGHTS)
-    wall = storey_plan.wall_columns(filled[storey_plan.observed_bands(filled)], WALL_RULE)
+    profile = compute_column_bits(ix, iy, z, floor, -HEIGHT_BANDS.below * HEIGHT_BANDS.step, HEIGHT_BANDS.step)
+    filled = storey_plan.build_band_stack(profile, HEIGHT_BANDS, storey_plan.WALL_HEIGHTS)
+    wall = storey_plan.detect_wall_columns(filled[storey_plan.is_observed_band(filled)], WALL_RULE)
     ceiling = np.full(navigable.shape, levels[1] - levels[0])
     return StoreyPlan(grid.origin[:2], grid.edge, wall, navigable & ~wall, profile, HEIGHT_BANDS, floor, ceiling, levels=levels)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
@@ -17,11 +18,50 @@ from typing import Any, Protocol
 import numpy as np
 
 from topomerge.errors import InputError, is_memory_short
-from topomerge.io.atomic import replacing
-from topomerge.io.listing import plain
-from topomerge.io.weight_files import weights_file
-from topomerge.networks.signature import Signature
+from topomerge.io.archive import find_weights_file, replace_on_success
+from topomerge.io.listing import convert_to_plain
 from topomerge.types import Array
+
+Dimension = int | str  # a number, or the name of what is counted
+
+
+@dataclass(frozen=True)
+class Tensor:
+    """An input or an output of a network.
+
+    Args:
+        shape: numbers, and names of sizes that may differ from call to call.
+        meaning: what it holds, with units.
+        dtype: as NumPy names it.
+    """
+
+    shape: tuple[Dimension, ...]
+    meaning: str
+    dtype: str = "float32"
+
+    def describe(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return {"shape": list(self.shape), "dtype": self.dtype, "meaning": self.meaning}
+
+
+@dataclass(frozen=True, eq=False)
+class Signature:
+    """A network as those who call it see it.
+
+    Args:
+        what: it does, in one sentence.
+        inputs, outputs: by name, in the order of the network's arguments.
+    """
+
+    what: str
+    inputs: Mapping[str, Tensor]
+    outputs: Mapping[str, Tensor]
+
+    def describe(self) -> dict[str, Any]:
+        """As JSON has it: what a card begins with."""
+        sides = {"inputs": self.inputs, "outputs": self.outputs}
+        return {"what": self.what, **{side: {n: t.describe() for n, t in some.items()} for side, some in sides.items()}}
+
 
 WEIGHTS_PACKAGE = "topomerge.networks"  # where the files ship
 CARD = ".card.json"
@@ -85,7 +125,7 @@ def load_network(path: Path, signature: Signature) -> Network:
 
 def load_shipped_network(name: str, signature: Signature) -> Network:
     """Load a network that ships, or the one in its place (`io.weight_files`)."""
-    return load_network(weights_file(WEIGHTS_PACKAGE, name), signature)
+    return load_network(find_weights_file(WEIGHTS_PACKAGE, name), signature)
 
 
 def card_of(path: Path) -> Path:
@@ -115,8 +155,8 @@ def write_card(path: Path, values: Mapping[str, Any]) -> Path:
     """Write the card of a file of weights beside it, with its digest; the same values give the same bytes."""
     card = card_of(path)
     known = {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
-    with replacing(card) as beside:
-        beside.write_text(json.dumps(plain({**values, **known}), indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    with replace_on_success(card) as beside:
+        beside.write_text(json.dumps(convert_to_plain({**values, **known}), indent=1, sort_keys=True) + "\n", encoding="utf-8")
     return card
 
 
@@ -151,9 +191,9 @@ def open_network(path: Path, digest: str, signature: Signature, card: Mapping[st
         for name in sorted({*expected, *found}):
             tensor = expected.get(name)
             if tensor is None or name not in found or not _fits(tensor.shape, DTYPES[tensor.dtype], *found[name]):
-                wanted = f"{tensor.dtype} {list(tensor.shape)}" if tensor else "none"
+                requested = f"{tensor.dtype} {list(tensor.shape)}" if tensor else "none"
                 has = " ".join(map(str, found[name])) if name in found else "none"
-                raise InputError(f"{path}: is of other {kind}s: {name[:40]} is {has[:80]}, not {wanted}; export it again")
+                raise InputError(f"{path}: is of other {kind}s: {name[:40]} is {has[:80]}, not {requested}; export it again")
     return Network(session, signature, path, card)
 
 

@@ -9,16 +9,15 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.extraction.plans.storey_plan import HEIGHT_BANDS
-from topomerge.kernels import align
-from topomerge.kernels.bend import shifted_sums
-from topomerge.matching.plan_fields import FREE_MARGIN, PlanFields
-from topomerge.matching.refinement import storeys_at
+from topomerge.kernels import registration
+from topomerge.kernels.bend import sum_shifted_values
+from topomerge.matching.poses import FREE_MARGIN, PlanFields, pair_storeys
 from topomerge.types import Array, Sim3
 
 SAME_WALL = 0.15  # m: walls that near are one
 JUDGED_COLUMNS = 40_000  # of a storey; of larger ones so many
 INNER_REACH = 0.3  # m from walls, whose noise is no clutter
-SLICE_BITS = HEIGHT_BANDS.mask(0.0, 0.75)  # where the lasers of robots look
+SLICE_BITS = HEIGHT_BANDS.build_mask(0.0, 0.75)  # where the lasers of robots look
 CEILING_BLOCK = 12  # columns
 LEAST_LIFTS = 50  # columns under both ceilings, by which a pose is raised
 WALL_RUN = 0.8  # m, length from which walls on free ground are no noise
@@ -47,13 +46,13 @@ class Judge:
         """Features of a pose. Areas, and walls as areas of columns, in m2; shares of 1. `step`: only so many of the columns."""
         counts = self.tally(pose, step)
         gaps = [0.0]
-        for v, w in storeys_at(self.a, self.b, pose.translation[2], pose.scale):
+        for v, w in pair_storeys(self.a, self.b, pose.translation[2], pose.scale):
             heights = list(zip(v.plan.levels, w.plan.levels, strict=True))
             if pose.scale != 1.0:  # a drawing of unknown scale was raised by a height of nobody's measuring
                 heights.pop()
             seen = [h for h in heights if np.isfinite(h).all()]
             gaps += [abs(h - (pose.scale * k + pose.translation[2])) for h, k in seen]
-        unlike, area = self._ceilings(pose, step)
+        unlike, area = self._compare_ceilings(pose, step)
         sliced = any(v.plan.sliced for v in (*self.a, *self.b))
         return {**_features(counts, max(gaps)), "sliced": float(sliced), "ceilings": unlike, "ceiling_area": area}
 
@@ -61,7 +60,7 @@ class Judge:
         """(2, 11) of `align.tally`, m2 in a's frame: of the columns of b, and of those of a; of every n-th one, times n."""
         out = np.zeros((2, 11))
         back = pose.inverse()
-        for v, w in storeys_at(self.a, self.b, pose.translation[2], pose.scale):
+        for v, w in pair_storeys(self.a, self.b, pose.translation[2], pose.scale):
             if (id(v), id(w)) not in self._sides:
                 self._sides[id(v), id(w)] = (Side(v, w), Side(w, v))
             p, q = self._sides[id(v), id(w)]
@@ -69,37 +68,37 @@ class Judge:
             out[1] += p.tally(q, back, step)
         return out
 
-    def _ceilings(self, pose: Sim3, step: int = 1) -> tuple[float, float]:
+    def _compare_ceilings(self, pose: Sim3, step: int = 1) -> tuple[float, float]:
         """How unlike the ceilings are where both maps saw free ground: mean deviation from their median difference, m, and the
         area, m2. Storeys of one plan often differ in nothing else."""
         deviations, area = [], 0.0
-        for v, w in storeys_at(self.a, self.b, pose.translation[2], pose.scale):
+        for v, w in pair_storeys(self.a, self.b, pose.translation[2], pose.scale):
             if not (np.isfinite(v.plan.levels[1]) and np.isfinite(w.plan.levels[1])):
                 continue
-            gap, at = self._gap(v, w, pose, step)
+            gap, at = self._measure_ceiling_gap(v, w, pose, step)
             if len(gap):
-                deviations.append(np.minimum(np.abs(_smooth(gap, at) - np.median(gap)), 0.4))
+                deviations.append(np.minimum(np.abs(_smooth_blocks(gap, at) - np.median(gap)), 0.4))
                 area += len(gap) * w.plan.edge**2 * self._steps[id(w)] * step
         return (float(np.concatenate(deviations).mean()), area) if deviations else (0.0, 0.0)
 
-    def lifted(self, pose: Sim3) -> Sim3:
+    def lift_pose(self, pose: Sim3) -> Sim3:
         """The pose raised so that ceilings meet, where the floor of a map was not seen: rooms' ceilings differ in height, so that
         the storey's alone is no good measure."""
         gaps = []
-        for v, w in storeys_at(self.a, self.b, pose.translation[2], pose.scale):
+        for v, w in pair_storeys(self.a, self.b, pose.translation[2], pose.scale):
             floors, ceilings = (np.isfinite([v.plan.levels[k], w.plan.levels[k]]).all() for k in (0, 1))
             if ceilings and not floors:
-                gaps.append(self._gap(v, w, pose)[0] - pose.translation[2])
+                gaps.append(self._measure_ceiling_gap(v, w, pose)[0] - pose.translation[2])
         lifts = np.concatenate(gaps) if gaps else np.zeros(0)
         if len(lifts) < LEAST_LIFTS:
             return pose
         x, y, z = pose.translation
         return replace(pose, translation=(x, y, z + float(np.clip(np.median(lifts), -1.2, 1.2))))
 
-    def _gap(self, v: PlanFields, w: PlanFields, pose: Sim3, step: int = 1) -> tuple[Array, Array]:
+    def _measure_ceiling_gap(self, v: PlanFields, w: PlanFields, pose: Sim3, step: int = 1) -> tuple[Array, Array]:
         """(n,) m by which the ceilings of a lie above those of b before any shift, where both saw free ground; and the columns
         (n, 2) of a."""
-        under = self._under(w)[::step]
+        under = self._sample_ceilings(w)[::step]
         c, s = pose.scale * np.cos(pose.yaw), pose.scale * np.sin(pose.yaw)
         x, y = under[:, 0], under[:, 1]
         i = np.floor((c * x - s * y + pose.translation[0] - v.plan.origin[0]) / v.plan.edge).astype(np.int64)
@@ -112,7 +111,7 @@ class Judge:
         compared = np.isfinite(gap) & v.plan.free[i, j]
         return gap[compared], np.column_stack([i[compared], j[compared]])
 
-    def _under(self, fields: PlanFields) -> Array:
+    def _sample_ceilings(self, fields: PlanFields) -> Array:
         """(n, 4) place, ceiling and floor, m, of some of the free columns under a ceiling."""
         if id(fields) not in self._rows:
             p = fields.plan
@@ -124,7 +123,7 @@ class Judge:
         return self._rows[id(fields)]
 
 
-def _smooth(values: Array, columns: Array) -> Array:
+def _smooth_blocks(values: Array, columns: Array) -> Array:
     """The median of the values in each block of `CEILING_BLOCK` columns a side: rooms differ in height, lamps do not count."""
     block = columns // CEILING_BLOCK
     _, owner = np.unique(block[:, 0] << 32 | block[:, 1], return_inverse=True)
@@ -148,13 +147,15 @@ class Side:
         flat = fields.plan.sliced or other.plan.sliced  # slices tell nothing of heights
         self.bits = np.ones_like(fields.plan.profile) if flat else fields.plan.profile & np.uint32(common)
         if common and not fields.plan.sliced:
-            kind[(kind == align.CLUTTER_STATE) & ((fields.plan.profile & np.uint32(common)) == 0)] = align.FREE_STATE
-        clutter_around = ndimage.uniform_filter((kind == align.CLUTTER_STATE).astype(np.float32), 3) * 9
-        clutter = kind == align.CLUTTER_STATE
+            kind[(kind == registration.CLUTTER_STATE) & ((fields.plan.profile & np.uint32(common)) == 0)] = (
+                registration.FREE_STATE
+            )
+        clutter_around = ndimage.uniform_filter((kind == registration.CLUTTER_STATE).astype(np.float32), 3) * 9
+        clutter = kind == registration.CLUTTER_STATE
         solid = clutter & (clutter_around > 4.5)
-        kind[clutter & ~solid] = align.HAZE_STATE
+        kind[clutter & ~solid] = registration.HAZE_STATE
         self.kind = kind
-        self.open = (solid | ((kind == align.FREE_STATE) & (clutter_around < 1.5))) & (fields.to_wall >= INNER_REACH)
+        self.open = (solid | ((kind == registration.FREE_STATE) & (clutter_around < 1.5))) & (fields.to_wall >= INNER_REACH)
         rows = np.argwhere(kind > 0)
         self.weight = fields.plan.edge**2 * max(len(rows) / JUDGED_COLUMNS, 1.0)
         if len(rows) > JUDGED_COLUMNS:
@@ -164,7 +165,7 @@ class Side:
         self.kinds, self.faces, self.inner, self.filled = kind[at], fields.face[at], self.open[at], self.bits[at]
         self._parts: dict[int, tuple[Array, ...]] = {}
 
-    def _sampled(self, step: int) -> tuple[Array, ...]:
+    def _sample_columns(self, step: int) -> tuple[Array, ...]:
         """Every n-th of the columns."""
         if step not in self._parts:
             columns = (self.points, self.kinds, self.faces, self.inner, self.filled)
@@ -172,12 +173,12 @@ class Side:
         return self._parts[step]
 
     def tally(self, on: Side, pose: Sim3, step: int) -> Array:
-        """(11,) of `align.tally`, m2."""
+        """Return (11,) of `align.tally`, m2."""
         at = np.array([*pose.translation[:2], pose.yaw, np.log(pose.scale)])
         v = on.fields
         seen = (on.kind, v.to_wall, v.to_any, v.face, on.open, on.bits, v.plan.origin, v.plan.edge)
-        points, kinds, faces, inner, filled = self._sampled(step)
-        counts: Array = align.tally(points, kinds, faces, inner, filled, *seen, at, SAME_WALL, FREE_MARGIN)
+        points, kinds, faces, inner, filled = self._sample_columns(step)
+        counts: Array = registration.tally(points, kinds, faces, inner, filled, *seen, at, SAME_WALL, FREE_MARGIN)
         return counts * self.weight * step
 
 
@@ -202,15 +203,15 @@ def _features(t: Array, level: float) -> dict[str, float]:
     }
 
 
-def winner_features(judge: Judge, pose: Sim3) -> dict[str, float]:
-    """Further features of a pose: m2, shares, and numbers of squares and of pieces of furniture."""
+def compute_winner_features(judge: Judge, pose: Sim3) -> dict[str, float]:
+    """Return further features of a pose: m2, shares, and numbers of squares and of pieces of furniture."""
     walls = np.zeros((0, 6))
     conflict, back = np.zeros(2), pose.inverse()
     main = judge.a[0].main_direction
     moved = np.zeros(2)
-    for v, w in storeys_at(judge.a, judge.b, pose.translation[2], pose.scale):
+    for v, w in pair_storeys(judge.a, judge.b, pose.translation[2], pose.scale):
         for source, target, move, side in ((w, v, pose, 0), (v, w, back, 1)):
-            rows, stuck = _walls(source, target, move)
+            rows, stuck = _compare_walls(source, target, move)
             moved += _moved(rows, target, main if side == 0 else main - pose.yaw)
             rows[:, 5] *= (pose.scale if side == 0 else 1.0) ** 2
             if side == 1:  # all in the frame of a
@@ -219,12 +220,12 @@ def winner_features(judge: Judge, pose: Sim3) -> dict[str, float]:
                 rows[:, 4] += pose.yaw
             walls = np.concatenate([walls, rows])
             conflict[side] += stuck * (pose.scale if side == 0 else 1.0) ** 2
-    shares = _shares(walls, float(conflict.sum()), main)
+    shares = _compute_shares(walls, float(conflict.sum()), main)
     shares["moved_walls"] = float(moved[0] / max(moved[1], 1e-6))
-    return {**shares, **_furniture(judge, pose), **_overhead(judge, pose)}
+    return {**shares, **_count_furniture(judge, pose), **_count_overhead(judge, pose)}
 
 
-def _walls(source: PlanFields, target: PlanFields, move: Sim3) -> tuple[Array, float]:
+def _compare_walls(source: PlanFields, target: PlanFields, move: Sim3) -> tuple[Array, float]:
     """(n, 6) of each wall column: place in the other map, is it on known ground, does it agree, direction, m2; and the m2 of high
     walls in runs that stand on free ground."""
     points = source.walls
@@ -234,7 +235,7 @@ def _walls(source: PlanFields, target: PlanFields, move: Sim3) -> tuple[Array, f
     i, j = np.where(inside[:, None], cells, 0).T
     near = inside & (target.to_wall[i, j] <= SAME_WALL)
     seen = inside & (near | (target.kind[i, j] != 0))
-    clash = inside & (target.kind[i, j] == align.FREE_STATE) & (target.to_any[i, j] >= FREE_MARGIN)
+    clash = inside & (target.kind[i, j] == registration.FREE_STATE) & (target.to_any[i, j] >= FREE_MARGIN)
     area = source.plan.edge**2
     rows = np.column_stack([at, seen, near, source.directions, np.full(len(at), area)])
     mask = np.zeros(source.plan.wall.shape, bool)
@@ -262,14 +263,14 @@ def _moved(rows: Array, target: PlanFields, main: float) -> Array:
         _, owner = np.unique(square[:, 0] << 32 | (square[:, 1] & 0xFFFFFFFF), return_inverse=True)
         area = np.bincount(owner, weights=rows[:, 5], minlength=1)
         plan = target.plan
-        fit = shifted_sums(rows[:, :2], rows[:, 5], owner, len(area), shifts, fitting, plan.origin, plan.edge)
+        fit = sum_shifted_values(rows[:, :2], rows[:, 5], owner, len(area), shifts, fitting, plan.origin, plan.edge)
         compared = area >= WINDOW_WALLS
         gain = np.maximum(fit[1:].max(axis=0) - fit[0], 0.0)
         out += gain[compared].sum(), area[compared].sum()
     return out
 
 
-def _shares(walls: Array, conflict: float, main: float) -> dict[str, float]:
+def _compute_shares(walls: Array, conflict: float, main: float) -> dict[str, float]:
     seen, near = (walls[:, k] * walls[:, 5] for k in (2, 3))
     across = np.abs(np.sin(walls[:, 4] - main)) > np.sqrt(0.5)
     agree = [float(near[side].sum()) / 2 for side in (across, ~across)]
@@ -288,12 +289,12 @@ def _shares(walls: Array, conflict: float, main: float) -> dict[str, float]:
     }
 
 
-def _overhead(judge: Judge, pose: Sim3) -> dict[str, float]:
+def _count_overhead(judge: Judge, pose: Sim3) -> dict[str, float]:
     """Pieces of what hangs from ceilings (lamps, beams, ducts) that hang in the other map, too, and of all that both maps would
     show: it stays when furniture moves, and no storey has that of another. Counted for the map that shows less: the other one may
     look higher."""
     pieces, back = np.zeros((2, 2)), pose.inverse()
-    for v, w in storeys_at(judge.a, judge.b, pose.translation[2], pose.scale):
+    for v, w in pair_storeys(judge.a, judge.b, pose.translation[2], pose.scale):
         for side, (source, target, move) in enumerate(((w, v, pose), (v, w, back))):
             rows = np.argwhere(source.hung == 2)
             if not len(rows):
@@ -309,7 +310,7 @@ def _overhead(judge: Judge, pose: Sim3) -> dict[str, float]:
     return {"hanging": total, "hanging_met": met}
 
 
-def _furniture(judge: Judge, pose: Sim3) -> dict[str, float]:
+def _count_furniture(judge: Judge, pose: Sim3) -> dict[str, float]:
     """How many pieces of furniture stand in place, of how many, and how many would by chance: where all is moved
     by `FURNITURE_SHIFT`.
 

@@ -12,19 +12,27 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from topomerge.blas import one_blas_thread
+from topomerge.blas import limit_blas_threads
 from topomerge.errors import InputError
 from topomerge.extraction.stopwatch import Stopwatch
-from topomerge.matching.poses import PoseHypothesis, distinct_hypotheses, wrapped
-from topomerge.matching.refinement import refine
+from topomerge.matching.poses import PoseHypothesis, refine, select_distinct_hypotheses, wrap_yaw
 from topomerge.registration.bend.bend import Bend, bend
-from topomerge.registration.evidence.places import Places, places
-from topomerge.registration.judge import Judge, winner_features
+from topomerge.registration.evidence.places import Places, score_places
+from topomerge.registration.judge import Judge, compute_winner_features
 from topomerge.registration.posterior import check_same
 from topomerge.registration.prepared import Map, Prepared, prepare
 from topomerge.registration.refine import refine_pose
 from topomerge.registration.search import search, search_scaled
-from topomerge.registration.verify import BASIN, MARGIN_CAP, Verdict, bent_score, model, quality_lag, rank, verdict
+from topomerge.registration.verify import (
+    BASIN,
+    MARGIN_CAP,
+    Verdict,
+    compute_quality_lag,
+    compute_verdict,
+    load_model,
+    rank,
+    score_bent,
+)
 from topomerge.types import Sim3, VoxelGrid
 
 AS_GOOD = 1.5  # log odds: less is no lead
@@ -55,50 +63,50 @@ class Candidate:
     features: dict[str, float]
     score: float
 
-    def closely(self) -> dict[str, float]:
-        """What is asked of the best one only (`winner_features`), and all other features."""
-        return {**self.features, **winner_features(self.judge, self.bend.transform)}
+    def compute_all_features(self) -> dict[str, float]:
+        """Compute all features, with those that only the best candidate needs (`compute_winner_features`)."""
+        return {**self.features, **compute_winner_features(self.judge, self.bend.transform)}
 
 
-def repeats(ranked: Sequence[PoseHypothesis]) -> int:
-    """How many other places of the maps ratios speak for nearly as well: of a building that repeats itself, more."""
-    return int((quality_lag(ranked)[1:] < AS_GOOD).sum())
+def count_repeats(ranked: Sequence[PoseHypothesis]) -> int:
+    """Count the other places that ratios speak for nearly as well: more in a building that repeats itself."""
+    return int((compute_quality_lag(ranked)[1:] < AS_GOOD).sum())
 
 
-def candidate(a: Prepared, b: Prepared, hypothesis: PoseHypothesis, scaled: bool) -> Candidate:
-    """Both maps bent near the pose T_ab of a hypothesis, and what they show then."""
+def build_candidate(a: Prepared, b: Prepared, hypothesis: PoseHypothesis, scaled: bool) -> Candidate:
+    """Return both maps bent near the pose T_ab of a hypothesis, and what they show then."""
     bent = bend(a, b, hypothesis.transform, scaled=scaled)
-    storeys = bent.storeys(b.storeys)
+    storeys = bent.bend_storeys(b.storeys)
     judge = Judge(a.storeys, storeys)
-    seen = places(a.storeys, storeys, bent.transform)
+    seen = score_places(a.storeys, storeys, bent.transform)
     features = {**judge(bent.transform), **RIGID_FEATURES, **bent.features, **seen.features}
-    return Candidate(hypothesis, bent, judge, seen, features, bent_score(features))
+    return Candidate(hypothesis, bent, judge, seen, features, score_bent(features))
 
 
-def rivals(ranked: Sequence[PoseHypothesis]) -> list[int]:
+def select_rivals(ranked: Sequence[PoseHypothesis]) -> list[int]:
     """Which of ranked hypotheses to look at closely: the first, those next to it that are not far behind, and the one that ratios
     speak for most, of those that explain enough: a shift along a row of rooms explains less, but is no worse."""
     near = [k for k, h in enumerate(ranked[:CLOSELY]) if h.score >= ranked[0].score - MARGIN_CAP]
-    lag = quality_lag(ranked)
+    lag = compute_quality_lag(ranked)
     rest = [k for k in range(1, len(ranked)) if k not in near and lag[k] < MARGIN_CAP / 2]
     return near + sorted(rest, key=lambda k: lag[k])[:1]
 
 
-def candidates(
+def build_candidates(
     a: Prepared, b: Prepared, ranked: Sequence[PoseHypothesis], scaled: bool, bent: dict[int, Candidate] | None = None
 ) -> list[Candidate]:
-    """The hypotheses worth it, each with the maps bent, best first; those that end in one pose once.
+    """Return the hypotheses worth it, each with the maps bent, best first; those that end in one pose once.
 
     Args:
         bent: id of a hypothesis -> what was made of it before; new ones are added.
     """
     bent = {} if bent is None else bent
-    near = [ranked[k] for k in rivals(ranked)]
-    bent |= {id(h): candidate(a, b, h, scaled) for h in near if id(h) not in bent}
+    near = [ranked[k] for k in select_rivals(ranked)]
+    bent |= {id(h): build_candidate(a, b, h, scaled) for h in near if id(h) not in bent}
     looked = sorted((bent[id(h)] for h in near), key=lambda c: -c.score)
-    looked[0].features["repeats"] = float(repeats(ranked))  # asked of the best one only
+    looked[0].features["repeats"] = float(count_repeats(ranked))  # asked of the best one only
     moved = [replace(c.hypothesis, transform=c.bend.transform) for c in looked]
-    single = {id(h) for h in distinct_hypotheses(moved, np.append(b.storeys[0].middle, 0.0), BASIN)}
+    single = {id(h) for h in select_distinct_hypotheses(moved, np.append(b.storeys[0].middle, 0.0), BASIN)}
     return [c for c, h in zip(looked, moved, strict=True) if id(h) in single]
 
 
@@ -111,7 +119,7 @@ class FallbackProposals:
 
     def inverse(self) -> FallbackProposals:
         """That of the maps the other way round."""
-        return replace(self, make=lambda: _inverses(self.make()))
+        return replace(self, make=lambda: _invert_poses(self.make()))
 
 
 @dataclass(frozen=True)
@@ -122,7 +130,7 @@ class Registration:
         transform: T_ab of the best hypothesis, believed or not; None where there was none.
         probability: that it is right, calibrated on simulated pairs; 0 without a hypothesis.
         accepted: is the probability above the threshold of the calibration?
-        features: what it was judged by (`Judge`, `winner_features`), with ``margin`` and ``rmse`` (m).
+        features: what it was judged by (`Judge`, `compute_winner_features`), with ``margin`` and ``rmse`` (m).
         alternatives: the hypotheses, best first, their scores the log odds of each seen by itself (`verify.rank`); the first one
             is the best before its fine registration.
         reason: in words.
@@ -144,7 +152,7 @@ class Registration:
     posterior: dict[str, float] = field(default_factory=dict)
 
 
-@one_blas_thread
+@limit_blas_threads
 def register(
     a: Map | Prepared,
     b: Map | Prepared,
@@ -156,7 +164,7 @@ def register(
     rigid: bool = False,
     same: str = "nothing",
 ) -> Registration:
-    """The pose of map b in map a's frame. `register(b, a)` gives its inverse.
+    """Estimate the pose of map b in map a's frame. `register(b, a)` gives its inverse.
 
     Args:
         a, b: topometric maps or occupied cells, or what `prepare` made of them.
@@ -179,23 +187,23 @@ def register(
     a, b = (m if isinstance(m, Prepared) else prepare(m, f) for m, f in zip((a, b), free, strict=True))
     clock.lap("plans")
     if b.order < a.order:  # so that nothing depends on which comes first
-        poses = proposed.inverse() if isinstance(proposed, FallbackProposals) else _inverses(proposed)
+        poses = proposed.inverse() if isinstance(proposed, FallbackProposals) else _invert_poses(proposed)
         swapped = register(b, a, scale=scale, proposed=poses, searched=searched, rigid=rigid, same=same)
-        return replace(_inverse(swapped), seconds={**swapped.seconds, **clock.seconds})
+        return replace(_invert_registration(swapped), seconds={**swapped.seconds, **clock.seconds})
     pair = _Pair(a, b, scale == "free", clock)
     fallback, first = (proposed, ()) if isinstance(proposed, FallbackProposals) else (None, proposed)
     if searched:
         pair.search(first)
     else:
         pair.add(first)
-    chance = pair.look(same)
+    chance = pair.score_candidates(same)
     if fallback is not None and chance < fallback.below:
         pair.add(fallback.make())
-        pair.look(same)
+        pair.score_candidates(same)
     if pair.verdict is None:
         reason = "the maps show no walls that could be compared" if searched else "no two matched rooms could be aligned"
         return Registration(None, 0.0, False, reason=reason, seconds=clock.seconds)
-    return replace(pair.registration(pair.verdict, rigid), seconds=clock.seconds)
+    return replace(pair.build_registration(pair.verdict, rigid), seconds=clock.seconds)
 
 
 class _Pair:
@@ -224,35 +232,35 @@ class _Pair:
         self.ranked = rank(hypotheses, self.judge, self.ranked)
         self.clock.lap("verify")
 
-    def look(self, same: str) -> float:
+    def score_candidates(self, same: str) -> float:
         """Look closely at the best hypotheses there are; the probability of the best one."""
         if not self.ranked:
             return 0.0
-        self.looked = candidates(self.a, self.b, self.ranked, self.scaled, self.bent)
-        self.verdict = verdict([c.features for c in self.looked], self.looked[0].closely(), same)
+        self.looked = build_candidates(self.a, self.b, self.ranked, self.scaled, self.bent)
+        self.verdict = compute_verdict([c.features for c in self.looked], self.looked[0].compute_all_features(), same)
         self.clock.lap("bend")
         return self.verdict.each[0]
 
-    def registration(self, said: Verdict, rigid: bool) -> Registration:
-        """The best hypothesis, finely registered, with what was said of it."""
-        bent, rmse = _refined(self.a, self.b, self.looked[0], self.scaled, rigid)
+    def build_registration(self, said: Verdict, rigid: bool) -> Registration:
+        """Return the best hypothesis, finely registered, with what was said of it."""
+        bent, rmse = _refine_candidate(self.a, self.b, self.looked[0], self.scaled, rigid)
         self.clock.lap("refine")
-        believed = _verdict(self.ranked, self.looked, said)
+        believed = _build_registration(self.ranked, self.looked, said)
         features = {**believed.features, "rmse": rmse}
         return replace(believed, transform=bent.transform, features=features, bend=None if rigid else bent)
 
 
-def _inverses(poses: Sequence[Sim3]) -> list[Sim3]:
+def _invert_poses(poses: Sequence[Sim3]) -> list[Sim3]:
     return [pose.inverse() for pose in poses]
 
 
-def _refined(a: Prepared, b: Prepared, best: Candidate, scaled: bool, rigid: bool) -> tuple[Bend, float]:
+def _refine_candidate(a: Prepared, b: Prepared, best: Candidate, scaled: bool, rigid: bool) -> tuple[Bend, float]:
     """The bending of the best candidate with its pose by surfaces (all of it where the maps stay rigid, else its height), and the
     root mean square distance of the surfaces, m. A slice has no planes, and stays as it is."""
     bent = best.bend
     if any(v.plan.sliced for v in (*a.storeys, *b.storeys)):
         return bent, best.features["rmse"]
-    aligned, misfit = fine(a, b, best.hypothesis.transform, scaled)
+    aligned, misfit = refine_by_surfaces(a, b, best.hypothesis.transform, scaled)
     if rigid or bent.reason:
         return replace(bent, transform=aligned), misfit
     pose = bent.transform  # bending is level: floors and ceilings say how high
@@ -260,12 +268,12 @@ def _refined(a: Prepared, b: Prepared, best: Candidate, scaled: bool, rigid: boo
     return replace(bent, transform=replace(pose, translation=(*pose.translation[:2], height))), best.features["rmse"]
 
 
-def _verdict(ranked: Sequence[PoseHypothesis], looked: Sequence[Candidate], said: Verdict) -> Registration:
+def _build_registration(ranked: Sequence[PoseHypothesis], looked: Sequence[Candidate], said: Verdict) -> Registration:
     """The best of the candidates, with its probability and the reason in words."""
     best, chance = looked[0], said.each[0]
     margin = min(best.score - looked[1].score, MARGIN_CAP) if len(looked) > 1 else MARGIN_CAP
     features = {**said.features, "rigid_conflict_share": best.hypothesis.features["conflict_share"], "margin": margin}
-    accepted = chance >= model()["threshold"]
+    accepted = chance >= load_model()["threshold"]
     share = 100 * features["conflict_share"]
     reason = (
         f"{'believed' if accepted else 'not believed'}: {features['walls']:.0f} m2 of walls agree, {features['free']:.0f} m2 of "
@@ -282,18 +290,18 @@ def _verdict(ranked: Sequence[PoseHypothesis], looked: Sequence[Candidate], said
     return Registration(pose, chance, accepted, features, alternatives, reason, places=best.places, posterior=said.posterior)
 
 
-def fine(a: Prepared, b: Prepared, start: Sim3, scaled: bool = False) -> tuple[Sim3, float]:
+def refine_by_surfaces(a: Prepared, b: Prepared, start: Sim3, scaled: bool = False) -> tuple[Sim3, float]:
     """Point-to-plane refinement of T_ab, unless it runs away, and the root mean square distance of the surfaces, m."""
     moved = refine_pose(a.surface, b.surface, start, scaled)
     shift = float(np.linalg.norm(moved.pose.apply(b.middle[None]) - start.apply(b.middle[None])))
-    turn = abs(wrapped(moved.pose.yaw - start.yaw))
+    turn = abs(wrap_yaw(moved.pose.yaw - start.yaw))
     if not np.isfinite(moved.rmse) or shift > DRIFTED[0] or turn > DRIFTED[1]:
         log.debug("refinement moved %.2f m, %.1f degrees: left out", shift, np.degrees(turn))
         return start, float("nan")
     return moved.pose, moved.rmse
 
 
-def _inverse(registration: Registration) -> Registration:
+def _invert_registration(registration: Registration) -> Registration:
     """The same registration seen from the other map."""
     others = tuple(replace(h, transform=h.transform.inverse()) for h in registration.alternatives)
     transform = None if registration.transform is None else registration.transform.inverse()

@@ -45,8 +45,8 @@ def check_same(same: str) -> None:
         raise InputError(f"same must be {', '.join(SAME)}, not {same!r}")
 
 
-def posterior(here: float, plan: float, kinds: Mapping[str, Any], x: Array, same: str = "nothing") -> dict[str, float]:
-    """Probability of each of `POSTERIOR`; they sum to 1.
+def compute_posterior(here: float, plan: float, kinds: Mapping[str, Any], x: Array, same: str = "nothing") -> dict[str, float]:
+    """Return probability of each of `POSTERIOR`; they sum to 1.
 
     Args:
         here: probability of this place where nothing is known, against all but another place of the same plan.
@@ -67,7 +67,7 @@ def posterior(here: float, plan: float, kinds: Mapping[str, Any], x: Array, same
     return {name: p / total for name, p in possible.items()} if total > 0 else {**dict.fromkeys(POSTERIOR, 0.0), "elsewhere": 1.0}
 
 
-def limited(each: Mapping[str, float], most: float) -> dict[str, float]:
+def limit_posterior(each: Mapping[str, float], most: float) -> dict[str, float]:
     """A posterior in which this place has at most the probability `most`; the alternatives get the rest as they share theirs."""
     if each["here"] <= most:
         return dict(each)
@@ -77,12 +77,12 @@ def limited(each: Mapping[str, float], most: float) -> dict[str, float]:
     return {"here": most, **{n: (1 - most) * share.get(n, 0.0) for n in WRONG}}
 
 
-def evidence_limit(features: Mapping[str, float]) -> float:
-    """The most that a pose may be believed for how much both maps show at all."""
+def compute_evidence_limit(features: Mapping[str, float]) -> float:
+    """Return the most that a pose may be believed for how much both maps show at all."""
     return FEW if features["walls"] < COMMON_WALLS or features["free"] < COMMON_FLOOR else 1.0
 
 
-def threshold_of(risk: float, curve: Sequence[Sequence[float]]) -> float:
+def find_threshold(risk: float, curve: Sequence[Sequence[float]]) -> float:
     """The probability from which on a merge is believed so that of a thousand pairs, drawn by `PRIORS`, at most `risk` are merged
     falsely.
 
@@ -100,8 +100,8 @@ def threshold_of(risk: float, curve: Sequence[Sequence[float]]) -> float:
     return float(least)
 
 
-def in_words(each: Mapping[str, float], threshold: float) -> str:
-    """What is likely beside this place: a sentence for a refusal, or nothing where no alternative stands out."""
+def describe_posterior(each: Mapping[str, float], threshold: float) -> str:
+    """Describe the likeliest alternative: a sentence for a refusal, or nothing where none stands out."""
     if each["here"] >= threshold:
         return ""
     name = max(WRONG, key=lambda n: each[n])

@@ -9,12 +9,12 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from topomerge.extraction.cleaning import cell_middles
-from topomerge.matching.plan_fields import PlanFields
-from topomerge.registration.bend.measure import Target, WallLines, samples, wall_lines
-from topomerge.registration.bend.pieces import Pieces, map_sensor, pieces_of
-from topomerge.registration.refine import Surface, surface
-from topomerge.registration.storeys import plans
+from topomerge.extraction.cleaning import compute_cell_means
+from topomerge.matching.poses import PlanFields
+from topomerge.registration.bend.measure import Target, WallLines, build_wall_lines, sample_walls
+from topomerge.registration.bend.pieces import Pieces, build_pieces, detect_sensor
+from topomerge.registration.refine import Surface, build_surface
+from topomerge.registration.storeys import build_plans
 from topomerge.types import Array, TopometricMap, VoxelGrid
 
 Map = TopometricMap | VoxelGrid
@@ -49,18 +49,18 @@ class Prepared:
     def pieces(self) -> Pieces:
         """The pieces that it is bent by."""
         map = self.load()
-        return pieces_of(self.storeys, map if isinstance(map, TopometricMap) else None)
+        return build_pieces(self.storeys, map if isinstance(map, TopometricMap) else None)
 
     @cached_property
     def samples(self) -> tuple[Array, Array]:
         """The walls by which each piece is registered."""
-        return samples(self.pieces)
+        return sample_walls(self.pieces)
 
     @cached_property
     def lines(self) -> tuple[WallLines, ...]:
         """The walls of each storey as lines."""
-        middles = cell_middles(grid_of(self.load()))
-        return tuple(wall_lines(s, middles) for s in self.storeys)
+        middles = compute_cell_means(get_grid(self.load()))
+        return tuple(build_wall_lines(s, middles) for s in self.storeys)
 
     @cached_property
     def targets(self) -> tuple[Target, ...]:
@@ -77,19 +77,26 @@ def prepare(map: Map, free: VoxelGrid | None = None) -> Prepared:
     Raises:
         InputError: an empty map.
     """
-    storeys = tuple(PlanFields(p) for p in plans(map, free))
-    grid = grid_of(map)
-    make_surface = cache(lambda: surface(grid))
-    return Prepared(lambda: map, storeys, registration_order(map), cell_middles(grid).mean(axis=0), map_sensor(map), make_surface)
+    storeys = tuple(PlanFields(p) for p in build_plans(map, free))
+    grid = get_grid(map)
+    make_surface = cache(lambda: build_surface(grid))
+    return Prepared(
+        lambda: map,
+        storeys,
+        compute_registration_order(map),
+        compute_cell_means(grid).mean(axis=0),
+        detect_sensor(map),
+        make_surface,
+    )
 
 
-def grid_of(map: Map) -> VoxelGrid:
-    """The occupied cells of a map."""
+def get_grid(map: Map) -> VoxelGrid:
+    """Return the occupied cells of a map."""
     return map.grid if isinstance(map, TopometricMap) else map
 
 
-def registration_order(map: Map) -> tuple[int, str]:
+def compute_registration_order(map: Map) -> tuple[int, str]:
     """Larger maps come first; among equal ones the order is arbitrary, but always the same."""
-    grid = grid_of(map)
+    grid = get_grid(map)
     digest = hashlib.sha256(np.ascontiguousarray(grid.cells).tobytes() + grid.origin.tobytes()).hexdigest()
     return -len(grid), digest

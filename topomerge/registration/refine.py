@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from topomerge.extraction.cleaning import cell_middles
-from topomerge.kernels import icp
+from topomerge.extraction.cleaning import compute_cell_means
+from topomerge.kernels import registration
 from topomerge.types import Array, Sim3, VoxelGrid
 
 SURFACE_BLOCK = 2  # cells
@@ -39,12 +39,12 @@ class Surface:
     flat: Array
 
 
-def surface(grid: VoxelGrid) -> Surface:
+def build_surface(grid: VoxelGrid) -> Surface:
     """Blocks of cells, their mean points, and normals from the cells within two of the block's first one."""
-    points = cell_middles(grid)
+    points = compute_cell_means(grid)
     coarse = grid.cells // SURFACE_BLOCK
     blocks = VoxelGrid.from_cells(coarse, grid.origin, grid.edge * SURFACE_BLOCK)
-    owner = blocks.rows(coarse)
+    owner = blocks.find_rows(coarse)
     sizes = np.bincount(owner, minlength=len(blocks))
     middle = np.column_stack([np.bincount(owner, points[:, k], len(blocks)) / sizes for k in range(3)])
     gap = ((points - middle[owner]) ** 2).sum(axis=1)
@@ -53,7 +53,7 @@ def surface(grid: VoxelGrid) -> Surface:
     first = np.full(len(blocks), -1, np.int64)
     at = np.flatnonzero(gap <= nearest[owner])
     first[owner[at]] = at
-    direction, flat = icp.normals(*grid._bricks, grid.cells, np.ascontiguousarray(points), first, 2, 6)
+    direction, flat = registration.estimate_normals(*grid._bricks, grid.cells, np.ascontiguousarray(points), first, 2, 6)
     return Surface(blocks, np.ascontiguousarray(middle), direction, flat)
 
 
@@ -66,7 +66,7 @@ def refine_pose(
     """
     rows = np.flatnonzero(b.flat >= LEAST_FLATNESS)
     if len(rows) > MOVED_POINTS:
-        rows = _spread(b, rows)
+        rows = _sample_points(b, rows)
     middle = b.points[rows].mean(axis=0) if len(rows) else np.zeros(3)
     moving, direction = np.ascontiguousarray(b.points[rows] - middle), np.ascontiguousarray(b.normals[rows])
     pose = np.array([*start.apply(middle[None])[0], start.yaw, np.log(start.scale)])
@@ -74,11 +74,11 @@ def refine_pose(
     rmse, share = float("nan"), 0.0
     for reach, sigma in stages:
         for _ in range(STAGE_ROUNDS):
-            h, g, partners, weight, square = icp.gather(*fixed, pose, reach, sigma, scaled)
+            h, g, partners, weight, square = registration.build_normal_equations(*fixed, pose, reach, sigma, scaled)
             if partners < LEAST_PARTNERS:
                 return Refined(start, float("nan"), partners / max(len(rows), 1))
             rmse, share = float(np.sqrt(square / weight)), partners / len(rows)
-            step = _step(h, g, weight, scaled)
+            step = _solve_step(h, g, weight, scaled)
             pose = pose + step
             if np.abs(step[:3]).max() < STILL_STEP[0] and abs(step[3]) < STILL_STEP[1]:
                 break
@@ -87,7 +87,7 @@ def refine_pose(
     return Refined(Sim3(float(turn.yaw), (x, y, z), turn.scale), rmse, share)
 
 
-def _spread(b: Surface, rows: Array) -> Array:
+def _sample_points(b: Surface, rows: Array) -> Array:
     """A sample that has as many upright planes as level ones: floors fix the height only."""
     level = np.abs(b.normals[rows, 2]) > 0.7
     rng = np.random.default_rng(0)
@@ -95,7 +95,7 @@ def _spread(b: Surface, rows: Array) -> Array:
     return np.sort(np.concatenate(chosen))
 
 
-def _step(h: Array, g: Array, weight: float, scaled: bool) -> Array:
+def _solve_step(h: Array, g: Array, weight: float, scaled: bool) -> Array:
     """Solve for the step; a weak pull to stay keeps what the planes do not fix."""
     free = 5 if scaled else 4
     step = np.zeros(5)

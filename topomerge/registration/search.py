@@ -13,9 +13,7 @@ import numpy as np
 from scipy import fft, ndimage
 
 from topomerge.extraction.plans.storey_plan import StoreyPlan
-from topomerge.matching.plan_fields import DIRECTION_STEP, PlanFields
-from topomerge.matching.poses import PoseHypothesis, wrapped
-from topomerge.matching.refinement import refine, storeys_at
+from topomerge.matching.poses import DIRECTION_STEP, PlanFields, PoseHypothesis, pair_storeys, refine, wrap_yaw
 from topomerge.types import Array, Sim3
 
 YAW_PEAKS = 10  # of the correlated direction profiles
@@ -32,7 +30,7 @@ SHARED_SCALES = 0.2  # of the logarithm: nearer scales share images that are lar
 PROJECTED_WALLS = 4000  # wall columns that are projected
 
 
-def yaw_candidates(a: Array, b: Array, peaks: int = YAW_PEAKS) -> list[float]:
+def find_yaw_candidates(a: Array, b: Array, peaks: int = YAW_PEAKS) -> list[float]:
     """Yaws (rad) that turn b's direction profile into a's, best first; each with its half turn, the best ones in all quarters:
     where one map shows the walls of one direction only, those of the other direction are the nearest peak."""
     blur = 1.5 / DIRECTION_STEP
@@ -47,19 +45,19 @@ def yaw_candidates(a: Array, b: Array, peaks: int = YAW_PEAKS) -> list[float]:
         left, at, right = match[k - 1], match[k], match[(k + 1) % len(match)]
         bend = left - 2 * at + right
         shift = 0.5 * (left - right) / bend if bend < 0 else 0.0
-        yaws += [wrapped(np.radians((k + shift) * DIRECTION_STEP) + half) for half in (0.0, np.pi)]
+        yaws += [wrap_yaw(np.radians((k + shift) * DIRECTION_STEP) + half) for half in (0.0, np.pi)]
     for yaw in yaws[: 2 * QUARTER_PEAKS]:
-        aside = wrapped(yaw + np.pi / 2)
-        if all(abs(wrapped(aside - other)) > QUARTER_GAP for other in yaws):
+        aside = wrap_yaw(yaw + np.pi / 2)
+        if all(abs(wrap_yaw(aside - other)) > QUARTER_GAP for other in yaws):
             yaws.append(aside)
     return yaws
 
 
-def distinct_yaws(yaws: Iterable[float]) -> list[float]:
-    """Those (rad) that are not near one before them: matched rooms often propose what the walls did."""
+def select_distinct_yaws(yaws: Iterable[float]) -> list[float]:
+    """Return those (rad) that are not near one before them: matched rooms often propose what the walls did."""
     out: list[float] = []
     for yaw in yaws:
-        if all(abs(wrapped(yaw - other)) > SAME_YAW for other in out):
+        if all(abs(wrap_yaw(yaw - other)) > SAME_YAW for other in out):
             out.append(yaw)
     return out
 
@@ -94,39 +92,39 @@ class Correlator:
     """Correlates one plan with another in many turned positions; what concerns the fixed one is transformed once."""
 
     def __init__(self, a: PlanFields, b: PlanFields, scale: float = 1.0) -> None:
-        spans = [np.ptp(v.plan.points(v.plan.explored), axis=0) for v in (a, b)]
+        spans = [np.ptp(v.plan.compute_points(v.plan.explored), axis=0) for v in (a, b)]
         reach = float(np.hypot(*spans[1])) * scale
         self.cell = max(SEARCH.cell, (float(spans[0].max()) + reach + 4) / SEARCH.largest_image)
         self.a, self.b = a, b
         self.low = a.plan.origin
         shape = np.array(a.plan.wall.shape) * a.plan.edge
         self.size = [fft.next_fast_len(int(np.ceil((s + reach) / self.cell)) + 4, real=True) for s in shape]
-        wall = np.minimum(self._image(a.walls - self.low), 1.0)
+        wall = np.minimum(self._rasterise(a.walls - self.low), 1.0)
         near = ndimage.gaussian_filter(wall, 0.2 / self.cell) * 2
-        core = self._image(a.plan.points(a.core) - self.low) * (a.plan.edge / self.cell) ** 2
+        core = self._rasterise(a.plan.compute_points(a.core) - self.low) * (a.plan.edge / self.cell) ** 2
         self.agree = fft.rfft2(near - SEARCH.conflict_weight * np.minimum(core, 1.0))
         self.against = fft.rfft2(wall) * SEARCH.conflict_weight
-        self.cores = b.plan.points(b.core)
+        self.cores = b.plan.compute_points(b.core)
         self.span = np.ceil(shape / self.cell)  # a shift beyond the fixed plan is one back
 
-    def _image(self, points: Array) -> Array:
+    def _rasterise(self, points: Array) -> Array:
         cells = np.floor(points / self.cell).astype(np.int64)
         flat = cells[:, 0] * self.size[1] + cells[:, 1]
         image: Array = np.bincount(flat, minlength=self.size[0] * self.size[1]).reshape(self.size).astype(np.float32)
         return image
 
-    def translations(self, yaw: float, number: int = SEARCH.per_yaw, scale: float = 1.0) -> list[tuple[float, float, float]]:
+    def find_translations(self, yaw: float, number: int = SEARCH.per_yaw, scale: float = 1.0) -> list[tuple[float, float, float]]:
         """(score, x, y): the translations of T_ab at the best peaks that are `peak_distance` from each other."""
         c, s = scale * np.cos(yaw), scale * np.sin(yaw)
         turn = np.array([[c, s], [-s, c]])
         walls, cores = self.b.walls @ turn, self.cores @ turn
         low = np.concatenate([walls, cores]).min(axis=0)
-        wall = np.minimum(self._image(walls - low), 1.0)
-        core = np.minimum(self._image(cores - low) * (self.b.plan.edge * scale / self.cell) ** 2, 1.0)
+        wall = np.minimum(self._rasterise(walls - low), 1.0)
+        core = np.minimum(self._rasterise(cores - low) * (self.b.plan.edge * scale / self.cell) ** 2, 1.0)
         product = self.agree * np.conj(fft.rfft2(wall)) - self.against * np.conj(fft.rfft2(core))
-        return self._peaks(fft.irfft2(product, self.size), self.low - low, number)
+        return self._find_peaks(fft.irfft2(product, self.size), self.low - low, number)
 
-    def _peaks(self, image: Array, start: Array, number: int) -> list[tuple[float, float, float]]:
+    def _find_peaks(self, image: Array, start: Array, number: int) -> list[tuple[float, float, float]]:
         pool = min(number * (2 * round(SEARCH.peak_distance / self.cell) + 1) ** 2, image.size - 1)
         flat = image.ravel()
         best = np.argpartition(flat, -pool)[-pool:]
@@ -143,7 +141,7 @@ class Correlator:
         return peaks
 
 
-def height_offsets(a: Sequence[StoreyPlan], b: Sequence[StoreyPlan], scale: float = 1.0) -> list[float]:
+def find_height_offsets(a: Sequence[StoreyPlan], b: Sequence[StoreyPlan], scale: float = 1.0) -> list[float]:
     """z offsets, m, that bring a storey of b to one of a: by their floors, or by their ceilings where a floor was not seen."""
     offsets: list[float] = []
     for p in a:
@@ -160,7 +158,7 @@ def height_offsets(a: Sequence[StoreyPlan], b: Sequence[StoreyPlan], scale: floa
 def search(
     a: Sequence[PlanFields], b: Sequence[PlanFields], proposed: Sequence[Sim3] = (), yaws: Sequence[float] = ()
 ) -> list[PoseHypothesis]:
-    """Hypotheses of T_ab of known scale, refined, best first.
+    """Return hypotheses of T_ab of known scale, refined, best first.
 
     Args:
         a, b: the storeys of the two maps.
@@ -168,19 +166,21 @@ def search(
         yaws: further yaws to try, rad.
     """
     hypotheses = [PoseHypothesis(pose, from_rooms=True) for pose in proposed]
-    for offset in height_offsets([v.plan for v in a], [w.plan for w in b]):
-        for v, w in storeys_at(a, b, offset):
+    for offset in find_height_offsets([v.plan for v in a], [w.plan for w in b]):
+        for v, w in pair_storeys(a, b, offset):
             if min(len(v.walls), len(w.walls)) < SEARCH.least_walls:
                 continue
             correlator = Correlator(v, w)
-            for yaw in distinct_yaws([*yaw_candidates(v.profile, w.profile), *yaws, *(pose.yaw for pose in proposed)]):
-                for score, x, y in correlator.translations(yaw):
+            for yaw in select_distinct_yaws(
+                [*find_yaw_candidates(v.profile, w.profile), *yaws, *(pose.yaw for pose in proposed)]
+            ):
+                for score, x, y in correlator.find_translations(yaw):
                     hypotheses.append(PoseHypothesis(Sim3(yaw, (x, y, offset)), score))
-    return refine(a, b, strongest(hypotheses))
+    return refine(a, b, select_strongest(hypotheses))
 
 
-def strongest(hypotheses: list[PoseHypothesis]) -> list[PoseHypothesis]:
-    """Those of rooms, and of the others the best `SEARCH.hypotheses`, best first."""
+def select_strongest(hypotheses: list[PoseHypothesis]) -> list[PoseHypothesis]:
+    """Return those of rooms, and of the others the best `SEARCH.hypotheses`, best first."""
     ordered = sorted(hypotheses, key=lambda h: (not h.from_rooms, -h.score))
     return ordered[: SEARCH.hypotheses + sum(h.from_rooms for h in hypotheses)]
 
@@ -188,26 +188,26 @@ def strongest(hypotheses: list[PoseHypothesis]) -> list[PoseHypothesis]:
 def search_scaled(
     a: Sequence[PlanFields], b: Sequence[PlanFields], proposed: Sequence[Sim3] = (), yaws: Sequence[float] = ()
 ) -> list[PoseHypothesis]:
-    """Hypotheses of T_ab with their scale, refined, best first. Arguments as of `search.search`."""
+    """Return hypotheses of T_ab with their scale, refined, best first. Arguments as of `search.search`."""
     hypotheses = [PoseHypothesis(pose, from_rooms=True) for pose in proposed]
     pairs = [(v, w) for v in a for w in b if min(len(v.walls), len(w.walls)) >= SEARCH.least_walls]
     pairs.sort(key=lambda p: -min(len(p[0].walls), len(p[1].walls)))
     for v, w in pairs[:4]:
-        turns = distinct_yaws([*yaw_candidates(v.profile, w.profile, 5), *yaws, *(pose.yaw for pose in proposed)])
+        turns = select_distinct_yaws([*find_yaw_candidates(v.profile, w.profile, 5), *yaws, *(pose.yaw for pose in proposed)])
         correlators: dict[float, Correlator] = {}
-        for _, yaw, scale in scale_candidates(v, w, turns)[:SCALE_YAWS]:
-            offset = height_offsets([v.plan], [w.plan], scale)[0]
+        for _, yaw, scale in find_scale_candidates(v, w, turns)[:SCALE_YAWS]:
+            offset = find_height_offsets([v.plan], [w.plan], scale)[0]
             upper = float(np.exp(np.ceil(np.log(scale) / SHARED_SCALES) * SHARED_SCALES))
             if upper not in correlators:  # half of the time is what concerns map a alone
                 correlators[upper] = Correlator(v, w, upper)
-            for score, x, y in correlators[upper].translations(yaw, PER_SCALE_YAW, scale):
+            for score, x, y in correlators[upper].find_translations(yaw, PER_SCALE_YAW, scale):
                 share = score / max(np.sqrt(len(v.walls) * len(w.walls)) * scale, 1.0)  # larger maps meet more walls
                 hypotheses.append(PoseHypothesis(Sim3(yaw, (x, y, offset), scale), share))
-    best = refine(a, b, strongest(hypotheses), True)
+    best = refine(a, b, select_strongest(hypotheses), True)
     return [h for h in best if h.from_rooms or TRIED_SCALES[0] <= h.transform.scale <= TRIED_SCALES[1]]  # refinement may run away
 
 
-def scale_candidates(v: PlanFields, w: PlanFields, yaws: Sequence[float]) -> list[tuple[float, float, float]]:
+def find_scale_candidates(v: PlanFields, w: PlanFields, yaws: Sequence[float]) -> list[tuple[float, float, float]]:
     """(score, yaw, scale) whose wall spacings agree, best first; for each yaw the separate peaks over the scale."""
     logs = np.arange(np.log(TRIED_SCALES[0]), np.log(TRIED_SCALES[1]) + SCALE_STEP, SCALE_STEP)
     main = v.main_direction
@@ -215,14 +215,14 @@ def scale_candidates(v: PlanFields, w: PlanFields, yaws: Sequence[float]) -> lis
     first, second = _sample(v.walls), _sample(w.walls)
     span = np.hypot(*np.ptp(first, axis=0)) + TRIED_SCALES[1] * np.hypot(*np.ptp(second, axis=0))
     size = fft.next_fast_len(int(span / HEAP_BIN) + 16, real=True)
-    fixed = [np.conj(fft.rfft(_heaps((first - first.min(axis=0)) @ axes[:, k : k + 1], size)[0])) for k in (0, 1)]
+    fixed = [np.conj(fft.rfft(_compute_heap_profiles((first - first.min(axis=0)) @ axes[:, k : k + 1], size)[0])) for k in (0, 1)]
     candidates = []
     for yaw in yaws:
         c, s = np.cos(yaw), np.sin(yaw)
         turned = second @ np.array([[c, s], [-s, c]])
         score = np.zeros(len(logs))
         for k in (0, 1):
-            heaps = _heaps((turned @ axes[:, k])[:, None] * np.exp(logs), size)
+            heaps = _compute_heap_profiles((turned @ axes[:, k])[:, None] * np.exp(logs), size)
             score += fft.irfft(fft.rfft(heaps, axis=1) * fixed[k], size, axis=1).max(axis=1)
         wide = ndimage.maximum_filter1d(score, 7)
         for i in np.flatnonzero(score >= wide):
@@ -234,7 +234,7 @@ def _sample(walls: Array) -> Array:
     return walls if len(walls) <= PROJECTED_WALLS else walls[np.random.default_rng(0).permutation(len(walls))[:PROJECTED_WALLS]]
 
 
-def _heaps(at: Array, size: int) -> Array:
+def _compute_heap_profiles(at: Array, size: int) -> Array:
     """(S, size) how much higher than around it the projections (n, S), m, are heaped up; unit norm."""
     columns = np.floor((at - at.min(axis=0)) / HEAP_BIN).astype(np.int64)
     flat = (columns + np.arange(at.shape[1]) * size).ravel()

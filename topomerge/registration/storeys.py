@@ -19,11 +19,11 @@ from topomerge.extraction.plans.storey_plan import (
     WALL_HEIGHTS,
     WALL_RULE,
     StoreyPlan,
-    band_stack,
-    observed_bands,
-    wall_columns,
+    build_band_stack,
+    detect_wall_columns,
+    is_observed_band,
 )
-from topomerge.kernels.plan import column_bits, on_lines
+from topomerge.kernels.rasters import compute_column_bits, find_line_columns
 from topomerge.types import Array, TopometricMap, VoxelGrid
 
 STOREY_GAP = 1.9  # m of empty height between a floor and its ceiling
@@ -42,7 +42,7 @@ STRAIGHT_RUN = 1.2  # m; what a slice shows in no straight run of this length is
 BESIDE_RUN = 0.35  # m from such a run, and on one side of it at least, hardly anything stands
 
 
-def extruded(grid: VoxelGrid) -> bool:
+def is_extruded(grid: VoxelGrid) -> bool:
     """Was a map made from lines, which were given walls? Then all of its levels but the lowest hold the same columns."""
     if not len(grid):
         return False
@@ -54,7 +54,7 @@ def extruded(grid: VoxelGrid) -> bool:
     return all(np.array_equal(grid.cells[level == k, :2], first) for k in range(2, len(counts) + 1))
 
 
-def lines_of(grid: VoxelGrid) -> tuple[VoxelGrid, VoxelGrid]:
+def extract_lines(grid: VoxelGrid) -> tuple[VoxelGrid, VoxelGrid]:
     """The lines of such a map at the height of the floor that it was given, where its sensor looked; and that floor, over which
     it looked."""
     level = grid.cells[:, 2] - grid.cells[:, 2].min()
@@ -63,12 +63,12 @@ def lines_of(grid: VoxelGrid) -> tuple[VoxelGrid, VoxelGrid]:
     return drawn, VoxelGrid.from_cells(floor[~drawn.contains(floor)], grid.origin, grid.edge, grid.shape)
 
 
-def slices(grid: VoxelGrid) -> list[float]:
+def find_slices(grid: VoxelGrid) -> list[float]:
     """Heights of the layers of a map that was seen at one height a storey only, lowest first; none for other maps.
 
     Nearly all cells lie in a few thin layers, and these show lines, where floors and ceilings would show areas.
     """
-    z = grid.centroids()[:, 2]
+    z = grid.compute_centroids()[:, 2]
     if float(np.ptp(z)) + grid.edge <= SLICE_HEIGHT:
         return [] if _filled(grid.cells, grid.edge) else [float(np.median(z))]
     thick = max(round(SLICE_HEIGHT / 2 / grid.edge), 1)
@@ -96,16 +96,16 @@ def _filled(cells: Array, edge: float) -> bool:
     return columns > 0.6 * blocks * side**2
 
 
-def levels(grid: VoxelGrid) -> list[tuple[float, float, float]]:
+def find_levels(grid: VoxelGrid) -> list[tuple[float, float, float]]:
     """(floor, ceiling, base) of each storey, m, lowest first: nan where not seen; bands are counted from the base.
 
     A floor and its ceiling bound empty columns; where hardly any column has both, the largest level is a floor if most of the
     map lies above it, else a ceiling.
     """
-    bottom, top = _gaps(grid)
+    bottom, top = _find_gaps(grid)
     columns = len(np.unique(grid.cells[:, 0].astype(np.int64) * grid.shape[1] + grid.cells[:, 1]))
     if len(bottom) > 0.15 * columns:
-        storeys = _closed(grid, bottom, top)
+        storeys = _find_closed_storeys(grid, bottom, top)
         if storeys:
             return storeys
     area = np.convolve(np.bincount(grid.cells[:, 2], minlength=grid.shape[2]), np.ones(3), "same")
@@ -115,7 +115,7 @@ def levels(grid: VoxelGrid) -> list[tuple[float, float, float]]:
     return [(z, np.nan, z)] if above >= below else [(np.nan, z, z - USUAL_HEIGHT)]
 
 
-def _gaps(grid: VoxelGrid) -> tuple[Array, Array]:
+def _find_gaps(grid: VoxelGrid) -> tuple[Array, Array]:
     """Levels of the cells below and above each run of empty cells of at least `STOREY_GAP` in a column."""
     x, y, z = grid.cells.T.astype(np.int64)
     key = np.sort((x * grid.shape[1] + y) * (1 << 21) + z)
@@ -125,7 +125,7 @@ def _gaps(grid: VoxelGrid) -> tuple[Array, Array]:
     return key[:-1][wide] & mask, key[1:][wide] & mask
 
 
-def _closed(grid: VoxelGrid, bottom: Array, top: Array) -> list[tuple[float, float, float]]:
+def _find_closed_storeys(grid: VoxelGrid, bottom: Array, top: Array) -> list[tuple[float, float, float]]:
     area = np.convolve(np.bincount(bottom, minlength=grid.shape[2]).astype(float), np.ones(3), "same") * grid.edge**2
     least = min(max(STOREY_LEAST_AREA, STOREY_LEAST_SHARE * area.max()), area.max())
     floors: list[int] = []
@@ -147,8 +147,8 @@ def _closed(grid: VoxelGrid, bottom: Array, top: Array) -> list[tuple[float, flo
     return storeys
 
 
-def plans(map: TopometricMap | VoxelGrid, free: VoxelGrid | None = None, cell: float = COLUMN_EDGE) -> list[StoreyPlan]:
-    """The storeys of a map, lowest first.
+def build_plans(map: TopometricMap | VoxelGrid, free: VoxelGrid | None = None, cell: float = COLUMN_EDGE) -> list[StoreyPlan]:
+    """Return the storeys of a map, lowest first.
 
     Args:
         map: a topometric map (its `free` is used) or occupied cells.
@@ -162,19 +162,19 @@ def plans(map: TopometricMap | VoxelGrid, free: VoxelGrid | None = None, cell: f
     free = map.free if isinstance(map, TopometricMap) and free is None else free
     if not len(grid):
         raise InputError("the map has no occupied cells: there is nothing to register")
-    if extruded(grid):
-        grid, free = lines_of(grid)
+    if is_extruded(grid):
+        grid, free = extract_lines(grid)
     cell = max(cell, grid.edge)
-    points = grid.centroids()  # as the verdict was fitted: to half a cell
+    points = grid.compute_centroids()  # as the verdict was fitted: to half a cell
     corner = grid.origin[:2]  # columns are those of the cells: on another lattice some get two rows of cells, and some none
     low = np.floor((points[:, :2].min(axis=0) - corner) / cell + 1e-6).astype(np.int64)
     columns = np.floor((points[:, :2] - corner) / cell + 1e-6).astype(np.int64) - low
     corner = corner + low * cell
     shape = tuple((columns.max(axis=0) + 1).tolist())
     ix, iy = np.ascontiguousarray(columns.T)
-    empty = None if free is None or not len(free) else _crossed(free, corner, cell)
-    layers, storeys_seen = slices(grid), []
-    storeys = [(z - SLICE_ABOVE_FLOOR, np.nan, z - SLICE_DRAWN) for z in layers] if layers else levels(grid)
+    empty = None if free is None or not len(free) else _find_crossed_columns(free, corner, cell)
+    layers, storeys_seen = find_slices(grid), []
+    storeys = [(z - SLICE_ABOVE_FLOOR, np.nan, z - SLICE_DRAWN) for z in layers] if layers else find_levels(grid)
     above = [base for _, _, base in storeys[1:]] + [np.inf]
     for (floor, ceiling, base), next_floor in zip(storeys, above, strict=True):
         z, crossing = points[:, 2], empty
@@ -184,27 +184,27 @@ def plans(map: TopometricMap | VoxelGrid, free: VoxelGrid | None = None, cell: f
             crossing = empty and (*empty[:2], np.where(np.abs(empty[2] - level) <= SLICE_HEIGHT / 2, level, np.nan))
         heights = np.full(shape, base)
         if np.isfinite(floor) and not layers:
-            heights = _local_floor(ix, iy, z, heights)
+            heights = _estimate_local_floor(ix, iy, z, heights)
         lattice = (heights, -HEIGHT_BANDS.below * HEIGHT_BANDS.step, HEIGHT_BANDS.step)
-        occupied = column_bits(ix, iy, z, *lattice)
-        crossed = column_bits(*crossing, *lattice) if crossing else np.zeros(shape, np.uint32)
-        high = _ceiling(ix, iy, np.where(z < next_floor - SLAB, z, np.nan), base, ceiling, shape)
+        occupied = compute_column_bits(ix, iy, z, *lattice)
+        crossed = compute_column_bits(*crossing, *lattice) if crossing else np.zeros(shape, np.uint32)
+        high = _estimate_ceiling(ix, iy, np.where(z < next_floor - SLAB, z, np.nan), base, ceiling, shape)
         rasters = (occupied, crossed, heights, high - heights)
-        storeys_seen.append(_plan(rasters, corner, cell, (floor, ceiling), bool(layers)))
+        storeys_seen.append(_build_plan(rasters, corner, cell, (floor, ceiling), bool(layers)))
     return storeys_seen
 
 
-def _crossed(free: VoxelGrid, corner: Array, cell: float) -> tuple[Array, Array, Array]:
+def _find_crossed_columns(free: VoxelGrid, corner: Array, cell: float) -> tuple[Array, Array, Array]:
     """Columns ix, iy and heights, m, of empty cells; one that is wider than a column is in several."""
     side = max(round(free.edge / cell), 1)
-    at = free.centroids()
+    at = free.compute_centroids()
     steps = (np.arange(side) - (side - 1) / 2) * free.edge / side
     parts = [np.floor((at[:, :2] + (dx, dy) - corner) / cell + 1e-6).astype(np.int64) for dx in steps for dy in steps]
     ix, iy = np.ascontiguousarray(np.concatenate(parts).T)
     return ix, iy, np.tile(at[:, 2], side**2)
 
 
-def _local_floor(ix: Array, iy: Array, z: Array, heights: Array) -> Array:
+def _estimate_local_floor(ix: Array, iy: Array, z: Array, heights: Array) -> Array:
     """The floor under each column: drift and a tilted map raise and lower it by a few centimetres."""
     near = np.abs(z - heights[ix, iy]) < 0.3
     lowest = np.full(heights.shape, np.inf)
@@ -217,7 +217,7 @@ def _local_floor(ix: Array, iy: Array, z: Array, heights: Array) -> Array:
     return heights + np.where(weight > 0.02, total / np.maximum(weight, 1e-6), 0.0)
 
 
-def _ceiling(ix: Array, iy: Array, z: Array, base: float, ceiling: float, shape: tuple[int, ...]) -> Array:
+def _estimate_ceiling(ix: Array, iy: Array, z: Array, base: float, ceiling: float, shape: tuple[int, ...]) -> Array:
     """(H, W) m: the highest cell of each column that may be this storey's ceiling; nan where none is."""
     high = np.full(shape, -np.inf)
     if np.isfinite(ceiling):
@@ -226,7 +226,7 @@ def _ceiling(ix: Array, iy: Array, z: Array, base: float, ceiling: float, shape:
     return np.where(np.isfinite(high), high, np.nan)
 
 
-def _plan(rasters: tuple[Array, ...], origin: Array, cell: float, levels: tuple[float, float], sliced: bool) -> StoreyPlan:
+def _build_plan(rasters: tuple[Array, ...], origin: Array, cell: float, levels: tuple[float, float], sliced: bool) -> StoreyPlan:
     """The plan of a storey.
 
     Args:
@@ -236,25 +236,25 @@ def _plan(rasters: tuple[Array, ...], origin: Array, cell: float, levels: tuple[
         sliced: was it seen at one height only?
     """
     occupied, crossed, floor, ceiling = rasters
-    filled = band_stack(occupied, HEIGHT_BANDS, BODY_BANDS)
-    looked = observed_bands(filled)
-    masks = [HEIGHT_BANDS.mask(low, high) for low, high in pairwise(BODY_BANDS)]
+    filled = build_band_stack(occupied, HEIGHT_BANDS, BODY_BANDS)
+    looked = is_observed_band(filled)
+    masks = [HEIGHT_BANDS.build_mask(low, high) for low, high in pairwise(BODY_BANDS)]
     observed = sum(mask for mask, seen in zip(masks, looked.tolist(), strict=True) if seen)
-    wall = wall_columns(filled[1:][looked[1:]], WALL_RULE)
+    wall = detect_wall_columns(filled[1:][looked[1:]], WALL_RULE)
     standing = filled.any(axis=0)
-    shut = (occupied & ~np.uint32(HEIGHT_BANDS.mask(*BODY_HEIGHTS))) > 0
-    rays = np.bitwise_count(crossed & np.uint32(HEIGHT_BANDS.mask(*BODY_HEIGHTS))) >= max(int(looked.sum()) // 2, 1)
+    shut = (occupied & ~np.uint32(HEIGHT_BANDS.build_mask(*BODY_HEIGHTS))) > 0
+    rays = np.bitwise_count(crossed & np.uint32(HEIGHT_BANDS.build_mask(*BODY_HEIGHTS))) >= max(int(looked.sum()) // 2, 1)
     if sliced:
-        wall = _straight(wall, cell)
+        wall = _find_straight_runs(wall, cell)
     inside = ~wall & (standing | rays | (shut & (not sliced)))
     return StoreyPlan(
         origin, cell, wall, inside, occupied, HEIGHT_BANDS, floor, ceiling, levels=levels, observed=observed, sliced=sliced
     )
 
 
-def _straight(mask: Array, cell: float) -> Array:
+def _find_straight_runs(mask: Array, cell: float) -> Array:
     """What a slice shows of walls: straight runs beside which little stands. Legs and chairs are as dense, but stand in heaps."""
     angles = np.pi * np.arange(24) / 24
     long = max(round(STRAIGHT_RUN / cell), 3)
-    straight: Array = on_lines(mask, np.cos(angles), np.sin(angles), long, long - 1, max(round(BESIDE_RUN / cell), 2))
+    straight: Array = find_line_columns(mask, np.cos(angles), np.sin(angles), long, long - 1, max(round(BESIDE_RUN / cell), 2))
     return straight

@@ -15,7 +15,7 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.matching.poses import pose_difference
-from topomerge.registration.refine import Surface, refine_pose, surface
+from topomerge.registration.refine import Surface, build_surface, refine_pose
 from topomerge.types import Array, Sim3, TopometricMap, VoxelGrid
 
 FEATURE_RADIUS = 1.0  # m
@@ -51,7 +51,7 @@ def check_open3d() -> None:
         raise InputError("poses of surfaces (--poses surfaces) need Open3D: pip install topomerge[open3d]") from error
 
 
-def fpfh(points: Array, normals: Array) -> Features:
+def compute_fpfh(points: Array, normals: Array) -> Features:
     """Fast point feature histograms of oriented points.
 
     Args:
@@ -66,7 +66,7 @@ def fpfh(points: Array, normals: Array) -> Features:
     return Features(points, cloud, open3d.pipelines.registration.compute_fpfh_feature(cloud, neighbours))
 
 
-def sampled_pose(a: Features, b: Features, seed: int = 0) -> Sim3 | None:
+def estimate_pose(a: Features, b: Features, seed: int = 0) -> Sim3 | None:
     """T_ab that brings most points of b near those of a with the likest histograms, of triples with like edges; None where there
     is none, or only one that tilts the floor. The same seed gives the same pose.
 
@@ -93,11 +93,11 @@ def sampled_pose(a: Features, b: Features, seed: int = 0) -> Sim3 | None:
     matrix = np.asarray(result.transformation)
     if result.fitness == 0 or matrix[2, 2] < LEAST_UPRIGHT:
         return None
-    return upright(matrix, b.points.mean(axis=0))
+    return convert_to_upright(matrix, b.points.mean(axis=0))
 
 
-def upright(matrix: Array, anchor: Array) -> Sim3:
-    """The pose under gravity that is nearest to a rigid one in its turn, and places a point as it does.
+def convert_to_upright(matrix: Array, anchor: Array) -> Sim3:
+    """Return the pose under gravity that is nearest to a rigid one in its turn, and places a point as it does.
 
     Args:
         matrix: (4, 4).
@@ -108,8 +108,8 @@ def upright(matrix: Array, anchor: Array) -> Sim3:
     return Sim3(yaw, (x, y, z))
 
 
-def mean_yaw(yaws: Array | Sequence[float], weights: Array | Sequence[float] | None = None) -> float:
-    """Mean angle, rad in [-pi, pi): the direction of the summed unit vectors.
+def compute_mean_yaw(yaws: Array | Sequence[float], weights: Array | Sequence[float] | None = None) -> float:
+    """Return mean angle, rad in [-pi, pi): the direction of the summed unit vectors.
 
     Raises:
         ValueError: no yaw, or they cancel each other.
@@ -124,8 +124,8 @@ def mean_yaw(yaws: Array | Sequence[float], weights: Array | Sequence[float] | N
     return float((np.angle(total) + np.pi) % (2 * np.pi) - np.pi)
 
 
-def mean_pose(poses: Sequence[Sim3], weights: Array | Sequence[float] | None = None, anchor: Array | None = None) -> Sim3:
-    """Mean of similarities: angle as an angle, scale in logarithms, translation where they place `anchor`.
+def compute_mean_pose(poses: Sequence[Sim3], weights: Array | Sequence[float] | None = None, anchor: Array | None = None) -> Sim3:
+    """Return mean of similarities: angle as an angle, scale in logarithms, translation where they place `anchor`.
 
     Args:
         poses: one or more.
@@ -138,7 +138,7 @@ def mean_pose(poses: Sequence[Sim3], weights: Array | Sequence[float] | None = N
     """
     weights = np.ones(len(poses)) if weights is None else np.asarray(weights, np.float64)
     anchor = np.zeros(3) if anchor is None else np.asarray(anchor, np.float64)
-    yaw = mean_yaw([p.yaw for p in poses], weights)
+    yaw = compute_mean_yaw([p.yaw for p in poses], weights)
     share = weights / weights.sum()
     scale = float(np.exp((share * np.log([p.scale for p in poses])).sum()))
     placed = share @ np.array([p.apply(anchor[None])[0] for p in poses])
@@ -146,7 +146,7 @@ def mean_pose(poses: Sequence[Sim3], weights: Array | Sequence[float] | None = N
     return Sim3(yaw, (x, y, z), scale)
 
 
-def pose_clusters(
+def cluster_poses(
     poses: Sequence[Sim3], weights: Array | Sequence[float], anchor: Array | None = None
 ) -> list[tuple[Sim3, float, list[int]]]:
     """Clusters of weighted poses, heaviest first: (mean, weight, members).
@@ -155,27 +155,27 @@ def pose_clusters(
     changes.
 
     Args:
-        anchor: see `mean_pose`.
+        anchor: see `compute_mean_pose`.
     """
     anchor = np.zeros(3) if anchor is None else np.asarray(anchor, np.float64)
     weights = np.asarray(weights, np.float64)
     left = list(range(len(poses)))
     clusters = []
     while left:
-        neighbours = [[j for j in left if _near(poses[i], poses[j], anchor)] for i in left]
+        neighbours = [[j for j in left if _is_near(poses[i], poses[j], anchor)] for i in left]
         members = max(neighbours, key=lambda m: float(weights[m].sum()))
-        mean = mean_pose([poses[i] for i in members], weights[members], anchor)
+        mean = compute_mean_pose([poses[i] for i in members], weights[members], anchor)
         for _ in range(CLUSTER_ROUNDS):
-            around = [j for j in left if _near(mean, poses[j], anchor)]
+            around = [j for j in left if _is_near(mean, poses[j], anchor)]
             if around == members or not around:
                 break
-            members, mean = around, mean_pose([poses[i] for i in around], weights[around], anchor)
+            members, mean = around, compute_mean_pose([poses[i] for i in around], weights[around], anchor)
         clusters.append((mean, float(weights[members].sum()), members))
         left = [i for i in left if i not in members]
     return sorted(clusters, key=lambda c: -c[1])
 
 
-def _near(p: Sim3, q: Sim3, anchor: Array) -> bool:
+def _is_near(p: Sim3, q: Sim3, anchor: Array) -> bool:
     return all(d <= limit for d, limit in zip(pose_difference(p, q, anchor), CLUSTER_RADIUS, strict=True))
 
 
@@ -186,7 +186,7 @@ ALIGNED_PAIRS = 30  # of rooms, the likeliest ones
 Room = tuple[Surface, Features]
 
 
-def room_poses(a: TopometricMap, b: TopometricMap, rooms: Array, weights: Array) -> list[tuple[Sim3, float]]:
+def estimate_room_poses(a: TopometricMap, b: TopometricMap, rooms: Array, weights: Array) -> list[tuple[Sim3, float]]:
     """Poses T_ab of clusters of pairs of rooms, with their weight, heaviest first; none where no pair can be aligned.
 
     Args:
@@ -197,12 +197,12 @@ def room_poses(a: TopometricMap, b: TopometricMap, rooms: Array, weights: Array)
     sides = [{k: described(m, k) for k in np.unique(rooms[order, s]).tolist()} for s, m in enumerate((a, b))]
     poses, areas = [], []
     for i, j in rooms[order].tolist():
-        pose = aligned(sides[0][i], sides[1][j])
+        pose = align_rooms(sides[0][i], sides[1][j])
         if pose is not None:
             poses.append(pose)
             areas.append(float(min(a.rooms["area"][i], b.rooms["area"][j])))
-    middle = b.grid.centroids().mean(axis=0) if len(b.grid) else np.zeros(3)
-    return [(pose, weight) for pose, weight, _ in pose_clusters(poses, np.array(areas), middle)]
+    middle = b.grid.compute_centroids().mean(axis=0) if len(b.grid) else np.zeros(3)
+    return [(pose, weight) for pose, weight, _ in cluster_poses(poses, np.array(areas), middle)]
 
 
 def described(map: TopometricMap, room: int) -> Room | None:
@@ -210,7 +210,7 @@ def described(map: TopometricMap, room: int) -> Room | None:
     cells = map.grid.cells[map.room == room]
     if len(cells) < ROOM_LEAST_POINTS:
         return None
-    room_surface = surface(VoxelGrid.from_cells(cells, map.grid.origin, map.grid.edge))
+    room_surface = build_surface(VoxelGrid.from_cells(cells, map.grid.origin, map.grid.edge))
     flat = np.flatnonzero(room_surface.flat > 0)
     if len(flat) < ROOM_LEAST_POINTS:
         return None
@@ -218,14 +218,14 @@ def described(map: TopometricMap, room: int) -> Room | None:
         flat = np.sort(np.random.default_rng(0).permutation(flat)[:ROOM_POINTS])
     points, normals = room_surface.points[flat], room_surface.normals[flat]
     inward = ((map.rooms["centroid"][room] - points) * normals).sum(axis=1)
-    return room_surface, fpfh(points, normals * np.where(inward < 0, -1.0, 1.0)[:, None])
+    return room_surface, compute_fpfh(points, normals * np.where(inward < 0, -1.0, 1.0)[:, None])
 
 
-def aligned(a: Room | None, b: Room | None) -> Sim3 | None:
+def align_rooms(a: Room | None, b: Room | None) -> Sim3 | None:
     """T_ab of one room: sample consensus, then refinement; None where the surfaces stay apart."""
     if a is None or b is None:
         return None
-    start = sampled_pose(a[1], b[1])
+    start = estimate_pose(a[1], b[1])
     if start is None:
         return None
     refined = refine_pose(a[0], b[0], start)

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from scipy.special import betaln
 
-from topomerge.io.weight_files import read_weights_json
-from topomerge.matching.poses import PoseHypothesis, PoseTolerance, distinct_hypotheses
+from topomerge.io.archive import read_weights_json
+from topomerge.matching.poses import PoseHypothesis, PoseTolerance, select_distinct_hypotheses
 from topomerge.registration.judge import Judge
-from topomerge.registration.posterior import evidence_limit, limited, posterior
+from topomerge.registration.posterior import compute_evidence_limit, compute_posterior, limit_posterior
 from topomerge.types import Array
 
 JUDGED_FULLY, GLANCE_STEP = 30, 7  # hypotheses that are judged by all columns; more of them by every seventh first
@@ -39,7 +39,7 @@ QUALITY_NAMES = ("ratio", "conflict", "worst", "opposed", "lift", "sliced_confli
 QUALITY = [POSE_VECTOR.index(n) for n in QUALITY_NAMES]
 
 
-def vector(f: Features) -> Array:
+def compute_pose_vector(f: Features) -> Array:
     """(12,) what the logistic models see of a pose, named `POSE_VECTOR`: amounts in logarithms, clutter weighed by how much."""
     amount = f["walls"] + f["conflict"]  # shares of little are drawn towards what is usual: no conflict of nothing is no praise
     shares = f["conflict_share"], f["worst_conflict"]
@@ -66,38 +66,38 @@ def vector(f: Features) -> Array:
     )
 
 
-def model() -> dict[str, Any]:
+def load_model() -> dict[str, Any]:
     """Coefficients and the threshold, fitted on simulated training pairs (`train.py task=merge_belief`): of two models each for
     pairs of maps with heights (``solid``) and for those of which one is a slice or a drawing (``flat``)."""
     return read_weights_json("topomerge.registration", "calibration.json")
 
 
-def _models(f: Features) -> dict[str, Any]:
+def _select_models(f: Features) -> dict[str, Any]:
     """What pairs with these features are judged by: a slice shows no heights, and is another matter."""
-    models: dict[str, Any] = model()["flat" if f["sliced"] else "solid"]
+    models: dict[str, Any] = load_model()["flat" if f["sliced"] else "solid"]
     return models
 
 
-def plausibility(f: Features) -> float:
-    """Log odds that a pose is right, seen by itself: what hypotheses are ranked by."""
-    return _logit(_models(f)["pose"], vector(f))
+def score_plausibility(f: Features) -> float:
+    """Return log odds that a pose is right, seen by itself: what hypotheses are ranked by."""
+    return _compute_logit(_select_models(f)["pose"], compute_pose_vector(f))
 
 
-def quality_lag(ranked: Sequence[PoseHypothesis]) -> Array:
+def compute_quality_lag(ranked: Sequence[PoseHypothesis]) -> Array:
     """(n,) by how many log odds each hypothesis is behind the first one without the amounts; inf where it explains too little to
     be a rival."""
-    fitted = _models(ranked[0].features)["pose"]
-    vectors = np.array([vector(h.features) for h in ranked])
+    fitted = _select_models(ranked[0].features)["pose"]
+    vectors = np.array([compute_pose_vector(h.features) for h in ranked])
     quality = vectors[:, QUALITY] @ (np.array(fitted["weight"]) / fitted["scale"])[QUALITY]
     return np.where(vectors[:, 1] >= vectors[0, 1] + np.log(RIVAL_WALLS), quality[0] - quality, np.inf)
 
 
-def bent_score(f: Features) -> float:
-    """Log odds that a pose is right, seen by itself, once the maps are bent."""
-    return _logit(_models(f)["bent"], bent_pose_vector(f))
+def score_bent(f: Features) -> float:
+    """Return log odds that a pose is right, seen by itself, once the maps are bent."""
+    return _compute_logit(_select_models(f)["bent"], compute_bent_pose_vector(f))
 
 
-def lead(scores: Array, vectors: Array, weights: Array, scales: Array) -> tuple[float, float, float, float]:
+def compute_lead(scores: Array, vectors: Array, weights: Array, scales: Array) -> tuple[float, float, float, float]:
     """How far the first of ranked hypotheses is ahead, named `LEAD_VECTOR`: in log odds; in log odds without the amounts, of
     those that explain a share of what it does; in log odds of its share of the odds of all; and its share where the amounts of
     rivals count in part (`AMOUNT_COUNTS`).
@@ -129,37 +129,41 @@ class Verdict:
     features: dict[str, float]
 
 
-def verdict(rivals: Sequence[Features], winner: Features, same: str = "nothing") -> Verdict:
+def compute_verdict(rivals: Sequence[Features], winner: Features, same: str = "nothing") -> Verdict:
     """Is the first of ranked poses right? At most its share of the odds of all, and at most what so much evidence can carry.
 
     Args:
         rivals: features of each pose once the maps are bent, best first.
-        winner: features of the first one, with those of `winner_features`.
+        winner: features of the first one, with those of `compute_winner_features`.
         same: what the user knows the maps to be of, a key of `posterior.SAME`.
     """
-    models = _models(rivals[0])
-    scores = np.array([bent_score(f) for f in rivals])
-    vectors = np.array([bent_pose_vector(f) for f in rivals])
-    leads = lead(scores, vectors, np.array(models["bent"]["weight"]), np.array(models["bent"]["scale"]))
-    seen = belief_vector(vectors[0], leads[:3], winner)
-    here = float(1 / (1 + np.exp(-_logit(models["winner"], seen))))
-    plan = float(plan_odds(models["plan"], plan_vector(winner)[None])[0])
-    every = limited(posterior(here, plan, models["kinds"], seen, same), min(leads[3], evidence_limit(winner)))
+    models = _select_models(rivals[0])
+    scores = np.array([score_bent(f) for f in rivals])
+    vectors = np.array([compute_bent_pose_vector(f) for f in rivals])
+    leads = compute_lead(scores, vectors, np.array(models["bent"]["weight"]), np.array(models["bent"]["scale"]))
+    seen = compute_belief_vector(vectors[0], leads[:3], winner)
+    here = float(1 / (1 + np.exp(-_compute_logit(models["winner"], seen))))
+    plan = float(compute_plan_odds(models["plan"], compute_plan_vector(winner)[None])[0])
+    every = limit_posterior(
+        compute_posterior(here, plan, models["kinds"], seen, same), min(leads[3], compute_evidence_limit(winner))
+    )
     shares = np.exp(scores - scores[0])
     return Verdict(every, (every["here"] * shares).tolist(), dict(winner))
 
 
-def belief_vector(bent: Array, leads: Sequence[float], winner: Features) -> Array:
-    """What the models of the best pose see, named `BELIEF_VECTOR`: the pose once the maps are bent (`bent_pose_vector`), its
+def compute_belief_vector(bent: Array, leads: Sequence[float], winner: Features) -> Array:
+    """Build the input of the models of the best pose, `BELIEF_VECTOR`: the pose after bending (`compute_bent_pose_vector`), its
     lead, and what only it is asked."""
-    return np.concatenate([bent, leads, [np.log1p(winner["repeats"])], winner_vector(winner), bend_vector(winner)])
+    return np.concatenate(
+        [bent, leads, [np.log1p(winner["repeats"])], compute_winner_vector(winner), compute_bend_vector(winner)]
+    )
 
 
-def _logit(fitted: Mapping[str, Any], x: Array) -> float:
-    return float(_logits(fitted, x))
+def _compute_logit(fitted: Mapping[str, Any], x: Array) -> float:
+    return float(_compute_logits(fitted, x))
 
 
-def _logits(fitted: Mapping[str, Any], x: Array) -> Array:
+def _compute_logits(fitted: Mapping[str, Any], x: Array) -> Array:
     return np.asarray(np.dot((x - fitted["mean"]) / fitted["scale"], fitted["weight"]) + fitted["bias"])
 
 
@@ -174,7 +178,7 @@ USUAL_STRAIN = 0.6  # of joints: the captures of a real floor need as much (deve
 BEND_VECTOR = ("strain", "doubted")
 
 
-def bend_vector(f: Features) -> Array:
+def compute_bend_vector(f: Features) -> Array:
     """(2,) what the model of the best hypothesis sees of the bending, named `BEND_VECTOR`: how much more than in real maps the
     joints give way, and the share of the pieces that were voted out. How far pieces moved is left out: simulated maps drift less
     than real ones, and a model that sees it takes real drift for a wrong pose."""
@@ -188,18 +192,19 @@ BELIEF_VECTOR = (*BENT_POSE_VECTOR, *LEAD_VECTOR, *WINNER_VECTOR, *BEND_VECTOR)
 PLACE_AREA = 20.0  # m2 of floor that count as one place that tells something by itself
 
 
-def bent_pose_vector(f: Features) -> Array:
+def compute_bent_pose_vector(f: Features) -> Array:
     """(17,) what the models see of a pose once the maps are bent, named `BENT_POSE_VECTOR`: places depend on each other, so that
     their log odds do not add up; how much their number counts is fitted."""
     mean = f["place_mean"]
-    return np.append(vector(f), [mean, mean * np.log1p(f["place_area"] / PLACE_AREA), f["place_worst"]])
+    return np.append(compute_pose_vector(f), [mean, mean * np.log1p(f["place_area"] / PLACE_AREA), f["place_worst"]])
 
 
-def furniture_log_odds(f: Features) -> float:
+def compute_furniture_log_odds(f: Features) -> float:
     """Log odds that furniture which both maps could see is of one room at two visits and not of two rooms of one plan.
 
     Of n pieces m stand in place: a beta-binomial likelihood of m by what stays over time (`FURNITURE_STAYS`) against that by what
-    would meet by chance, measured where all furniture is moved (`winner_features`). The three numbers are the most likely ones of
+    would meet by chance, measured where all furniture is moved (`compute_winner_features`). The three numbers are the most likely
+    ones of
     98 right pairs and 69 of other furniture, from training buildings. Nothing is said where a map shows no furniture.
     """
     n = INDEPENDENT_PIECES * f["pieces"]
@@ -211,8 +216,8 @@ def furniture_log_odds(f: Features) -> float:
     return float(betaln(a + met, b + n - met) - betaln(a, b) - betaln(c + met, d + n - met) + betaln(c, d))
 
 
-def winner_vector(f: Features) -> Array:
-    """(12,) what the model of the best hypothesis sees of `winner_features`, named `WINNER_VECTOR`.
+def compute_winner_vector(f: Features) -> Array:
+    """Return (12,) what the model of the best hypothesis sees of `compute_winner_features`, named `WINNER_VECTOR`.
 
     Amounts are those of `ENOUGH_FLOOR` m2 at most: on a floor ten times as large ten times as much is out of place, and says
     no more.
@@ -240,18 +245,19 @@ def winner_vector(f: Features) -> Array:
 PLAN_VECTOR = ("furniture", "furniture_sliced")
 
 
-def plan_vector(f: Features) -> Array:
+def compute_plan_vector(f: Features) -> Array:
     """(2,) what tells a place from another one of the same plan (another storey, the other half of the building), named
     `PLAN_VECTOR`: how much walls agree is no evidence there. Slices see legs in place of furniture, and are weighed apart."""
-    furniture, sliced = furniture_log_odds(f), f["sliced"]
+    furniture, sliced = compute_furniture_log_odds(f), f["sliced"]
     return np.array([furniture * (1 - sliced), furniture * sliced])
 
 
-def plan_odds(fitted: Mapping[str, Any], x: Array) -> Array:
-    """(n,) odds of another place of the same plan against this one, of vectors (n, 2) as `plan_vector`: by how much they are
+def compute_plan_odds(fitted: Mapping[str, Any], x: Array) -> Array:
+    """(n,) odds of another place of the same plan against this one, of vectors (n, 2) as `compute_plan_vector`: by how much they
+    are
     above those of maps that show no furniture. Where nothing tells, the model of the place has weighed what walls say already."""
-    nothing = np.exp(-_logits(fitted, np.zeros_like(x)))
-    return np.asarray(np.maximum(np.exp(-_logits(fitted, x)) - nothing, 0.0))
+    nothing = np.exp(-_compute_logits(fitted, np.zeros_like(x)))
+    return np.asarray(np.maximum(np.exp(-_compute_logits(fitted, x)) - nothing, 0.0))
 
 
 def rank(hypotheses: Sequence[PoseHypothesis], judge: Judge, ranked: Sequence[PoseHypothesis] = ()) -> list[PoseHypothesis]:
@@ -261,12 +267,12 @@ def rank(hypotheses: Sequence[PoseHypothesis], judge: Judge, ranked: Sequence[Po
     The findings' two-stage rule (shortlist what reaches 0.6 of the best agreement, then least conflict) put the right pose
     first in 76 of 82 training pairs, the logistic model in 80: a flipped plan can agree in more walls than a true overlap.
     """
-    lifted = [replace(h, transform=judge.lifted(h.transform)) for h in hypotheses]
+    lifted = [replace(h, transform=judge.lift_pose(h.transform)) for h in hypotheses]
     if len(lifted) > JUDGED_FULLY:
-        lifted.sort(key=lambda h: -plausibility(judge(h.transform, GLANCE_STEP)))
+        lifted.sort(key=lambda h: -score_plausibility(judge(h.transform, GLANCE_STEP)))
     judged = list(ranked)
     for hypothesis in lifted[:JUDGED_FULLY]:
         features = judge(hypothesis.transform)
-        judged.append(replace(hypothesis, features=features, score=plausibility(features)))
+        judged.append(replace(hypothesis, features=features, score=score_plausibility(features)))
     judged.sort(key=lambda h: -h.score)
-    return distinct_hypotheses(judged, np.append(judge.b[0].middle, 0.0), BASIN)
+    return select_distinct_hypotheses(judged, np.append(judge.b[0].middle, 0.0), BASIN)

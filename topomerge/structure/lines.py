@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from topomerge.kernels.hough import strongest
+from topomerge.kernels.rasters import find_strongest_line
 from topomerge.types import Array
 
 HOUGH_TURN = np.radians(3.0)
@@ -51,8 +51,8 @@ class Line:
         return self.middle + np.outer([self.start, self.end], self.along)
 
 
-def straight_lines(points: Array, weights: Array, main: float | None = None) -> list[Line]:
-    """Lines among points, the longest support first.
+def detect_lines(points: Array, weights: Array, main: float | None = None) -> list[Line]:
+    """Return lines among points, the longest support first.
 
     Args:
         points: (n, 2) m.
@@ -63,11 +63,11 @@ def straight_lines(points: Array, weights: Array, main: float | None = None) -> 
     angles = np.arange(round(np.pi / HOUGH_TURN)) * HOUGH_TURN + (main or 0.0)
     left = np.arange(len(points))
     while len(left) > 2 and len(lines) < MOST_LINES:
-        rows = _strongest(points[left], weights[left], angles)
+        rows = _find_strongest_run(points[left], weights[left], angles)
         if weights[left[rows]].sum() < LEAST_LINE:
             break
-        line = _fitted(points[left[rows]], weights[left[rows]], main)
-        own = _near(points[left], line)
+        line = _fit_line(points[left[rows]], weights[left[rows]], main)
+        own = _find_near_points(points[left], line)
         weight = float(weights[left[own]].sum())
         if weight >= max(DENSE * line.length, LEAST_LINE / 2):
             lines.append(replace(line, weight=weight))
@@ -75,7 +75,7 @@ def straight_lines(points: Array, weights: Array, main: float | None = None) -> 
     return lines
 
 
-def main_direction(lines: list[Line]) -> float | None:
+def estimate_main_direction(lines: list[Line]) -> float | None:
     """rad in [0, pi/2), along or across which most metres of lines run; None without any."""
     if not lines:
         return None
@@ -87,10 +87,10 @@ def main_direction(lines: list[Line]) -> float | None:
     return float((turn[best] + np.average(apart[near, best], weights=length[near] ** 3)) % (np.pi / 2))
 
 
-def _strongest(points: Array, weights: Array, angles: Array) -> Array:
+def _find_strongest_run(points: Array, weights: Array, angles: Array) -> Array:
     """Rows of the points of the run that holds most: of a direction and an offset across it."""
     middle = points.mean(axis=0)
-    angle, offset = strongest(points - middle, weights, angles, HOUGH_BIN)
+    angle, offset = find_strongest_line(points - middle, weights, angles, HOUGH_BIN)
     across = (points - middle) @ (-np.sin(angle), np.cos(angle))
     rows = np.flatnonzero(np.abs(across - offset) <= LINE_REACH)
     order = rows[np.argsort((points[rows] - middle) @ (np.cos(angle), np.sin(angle)), kind="stable")]
@@ -99,9 +99,9 @@ def _strongest(points: Array, weights: Array, angles: Array) -> Array:
     return max(runs, key=lambda run: float(weights[run].sum()))
 
 
-def _fitted(points: Array, weights: Array, main: float | None) -> Line:
+def _fit_line(points: Array, weights: Array, main: float | None) -> Line:
     """The line through most of the points."""
-    middle, along = _least_squares(points, weights)
+    middle, along = _fit_least_squares(points, weights)
     t = (points - middle) @ along
     length = float(np.ptp(t))
     if main is not None:
@@ -110,14 +110,14 @@ def _fitted(points: Array, weights: Array, main: float | None) -> Line:
         straight = abs(off) < ALIGNED and abs(off) * length / 2 < OFF_LINE
         if straight or (length < SHORT_LINE and abs(off) < SHORT_ALIGNED):
             along = np.array([np.cos(turn - off), np.sin(turn - off)])
-            middle, _ = _least_squares(points, weights, along)
+            middle, _ = _fit_least_squares(points, weights, along)
             t = (points - middle) @ along
     near = np.abs((points - middle) @ (-along[1], along[0])) < 3 * FIT_SCALE
     t = t[near] if near.any() else t
     return Line(middle, along, float(t.min()), float(t.max()))
 
 
-def _least_squares(points: Array, weights: Array, along: Array | None = None) -> tuple[Array, Array]:
+def _fit_least_squares(points: Array, weights: Array, along: Array | None = None) -> tuple[Array, Array]:
     """A point and the direction of the line, points far off counting less (Cauchy); the direction may be given."""
     given, weight = along, weights
     for scale in (0.05, 0.03, *[FIT_SCALE] * 6):
@@ -131,6 +131,6 @@ def _least_squares(points: Array, weights: Array, along: Array | None = None) ->
     return middle, along
 
 
-def _near(points: Array, line: Line) -> Array:
+def _find_near_points(points: Array, line: Line) -> Array:
     t, off = (points - line.middle) @ line.along, (points - line.middle) @ line.across
     return np.flatnonzero((np.abs(off) < LINE_REACH) & (t > line.start - LINE_REACH) & (t < line.end + LINE_REACH))

@@ -9,11 +9,131 @@ from typing import Any
 import numpy as np
 import shapely
 
-from topomerge.structure.face_points import FacePoints
-from topomerge.structure.floors import is_flight, jambs
-from topomerge.structure.joints import joined
-from topomerge.structure.wall_heights import with_heights
+from topomerge.structure.floors import FacePoints, compute_jambs, is_flight, measure_room_levels
 from topomerge.types import Array, TopometricMap
+
+HEIGHT_REACH = 0.06  # m beside a wall, in which its cells are
+HEIGHT_BIN = 0.1  # m along it
+CEILING_REACH = 0.25  # m: what is no farther below a ceiling is of it
+PARTITION = 0.5  # m below the ceiling: what ends so far below is no wall up to it
+DOOR_NEAR = 0.4  # m
+LEAST_BINS = 4  # over which a ceiling was seen, to say that a wall ends below
+
+
+def add_wall_heights(map: TopometricMap, walls: Array, points: FacePoints) -> Array:
+    """Return the walls from the lower floor beside them to the higher ceiling.
+
+    Those over which the ceiling was seen, and nothing between it and their own top, end there; of which one side only was seen,
+    these are cupboards and left out, if no door is in them.
+
+    Args:
+        walls: WALL_DTYPE of one storey.
+        points: of the storey.
+    """
+    levels, seen = measure_room_levels(map)
+    tree = shapely.STRtree(shapely.points(points.at))
+    furniture = np.zeros(len(walls), bool)
+    for k, wall in enumerate(walls):
+        beside = wall["rooms"][wall["rooms"] >= 0]
+        wall["low"], wall["high"] = levels[beside, 0].min(), levels[beside, 1].max()
+        beside = beside[seen[beside]]
+        if len(beside):
+            top = _measure_own_top(wall, points, tree, float((levels[beside, 1] - levels[beside, 0]).min()))
+            if np.isfinite(top):
+                wall["high"], furniture[k] = wall["low"] + top, wall["faces"] == 1 and not _is_near_door(wall, map)
+    return walls[~furniture]
+
+
+def _is_near_door(wall: Array, map: TopometricMap) -> bool:
+    """Is a door of its rooms in a wall? Cupboards have none."""
+    line = shapely.LineString([wall["start"], wall["end"]])
+    own = np.isin(map.edges["rooms"], wall["rooms"][wall["rooms"] >= 0]).any(axis=1)
+    return bool((shapely.distance(line, shapely.points(map.edges["centre"][own, :2])) < DOOR_NEAR).any())
+
+
+def _measure_own_top(wall: Array, points: FacePoints, tree: shapely.STRtree, ceiling: float) -> float:
+    """m above the floor, where a wall ends below a ceiling that is so high; inf: it does not, or that was not seen."""
+    line = shapely.LineString([wall["start"], wall["end"]])
+    rows = tree.query(line, predicate="dwithin", distance=wall["thickness"] / 2 + HEIGHT_REACH)
+    along = (wall["end"] - wall["start"]) / max(line.length, 1e-9)
+    place = ((points.at[rows] - wall["start"]) @ along / HEIGHT_BIN).astype(np.int64)
+    place = np.clip(place, 0, int(line.length / HEIGHT_BIN))
+    roof = points.height[rows] > ceiling - CEILING_REACH
+    covered, top = np.zeros(int(line.length / HEIGHT_BIN) + 1, bool), np.zeros(int(line.length / HEIGHT_BIN) + 1)
+    covered[place[roof]] = True
+    np.maximum.at(top, place[~roof], points.height[rows][~roof])
+    if covered.sum() < max(LEAST_BINS, len(covered) / 2):
+        return np.inf
+    reached = float(np.quantile(top[covered], 0.8))
+    return reached if 0 < reached < ceiling - PARTITION else np.inf
+
+
+JOINT_REACH = 0.7  # m beyond the end of a wall
+IN_LINE = np.cos(np.radians(8.0))
+CROSSING = np.sin(np.radians(20.0))
+THROUGH = 0.1  # m that an end may lie beyond the middle of the wall that it meets
+INTO_ROOM = 0.03  # m by which a wall may reach into a room where it is lengthened
+
+
+def join_walls(walls: Array, rooms: shapely.Geometry) -> Array:
+    """Return the walls with each end at the middle of the wall that it meets; at a corner, both cover it.
+
+    Args:
+        walls: WALL_DTYPE of one storey.
+        rooms: the outlines of the rooms, m: no wall is lengthened into them.
+    """
+    out = walls.copy()
+    tree = shapely.STRtree([shapely.LineString([w["start"], w["end"]]) for w in walls])
+    inner = rooms.buffer(-INTO_ROOM)
+    for i, wall in enumerate(walls):
+        for name, other in (("start", "end"), ("end", "start")):
+            tip, way = wall[name], wall[name] - wall[other]
+            length = float(np.hypot(*way))
+            if length < 1e-6:
+                continue
+            way = way / length
+            near = tree.query(shapely.Point(tip), predicate="dwithin", distance=2 * JOINT_REACH)
+            more = _measure_extension(tip, way, float(wall["thickness"]), walls[near[near != i]])
+            if more is not None and more > -length / 2:
+                new = tip + way * more
+                if more < 0 or not _is_inside_rooms(inner, tip, new, way, float(wall["thickness"])):
+                    out[name][i] = new
+    return out
+
+
+def _is_inside_rooms(rooms: shapely.Geometry, tip: Array, new: Array, way: Array, thickness: float) -> bool:
+    """Would the longer part of a wall stand in a room?"""
+    part = shapely.LineString([tip, new]).buffer(max(thickness / 2 - 0.01, 0.01), cap_style="flat")
+    return bool(shapely.area(shapely.intersection(part, rooms)) > 0.1 * max(part.area, 1e-9))
+
+
+def _measure_extension(tip: Array, way: Array, thickness: float, others: Array) -> float | None:
+    """m by which a wall that ends at `tip`, going `way`, is lengthened; None: it meets nothing."""
+    best: float | None = None
+    for other in others:
+        line = other["end"] - other["start"]
+        length = float(np.hypot(*line))
+        if length < 1e-6:
+            continue
+        line = line / length
+        turn = way[0] * line[1] - way[1] * line[0]
+        if abs(way @ line) > IN_LINE:
+            starts = [other["start"], other["end"]]
+            ahead = [float((p - tip) @ way) for p in starts]
+            off = min(abs(float((p - tip) @ (-way[1], way[0]))) for p in starts)
+            if off < (thickness + other["thickness"]) / 2 and 0 <= min(ahead) <= JOINT_REACH:
+                return min(ahead) / 2
+        elif abs(turn) > CROSSING:
+            apart = other["start"] - tip
+            more = float(apart[0] * line[1] - apart[1] * line[0]) / turn
+            place = float((tip + way * more - other["start"]) @ line)
+            if not -THROUGH <= more <= JOINT_REACH or not -JOINT_REACH <= place <= length + JOINT_REACH:
+                continue
+            corner = place < thickness or place > length - thickness
+            more += other["thickness"] / 2 if corner else 0.0
+            best = more if best is None or abs(more) < abs(best) else best
+    return best
+
 
 WALL_DTYPE = np.dtype(
     [
@@ -42,7 +162,7 @@ BESIDE_DOOR = 3  # bins of a face that are seen beside a door: else it is no hol
 WIDEST = 3.5  # m: wider openings are no hole in a wall
 
 
-def wall_part(wall: Any, opening: Any = None, more: float = 0.0) -> shapely.Polygon:
+def build_wall_polygon(wall: Any, opening: Any = None, more: float = 0.0) -> shapely.Polygon:
     """A wall (a row of WALL_DTYPE) from above, or what an opening (a row of OPENING_DTYPE) takes of it; counter-clockwise, m.
 
     Args:
@@ -73,34 +193,34 @@ class _Face:
         """(2,) away from the room."""
         return np.array([self.along[1], -self.along[0]])
 
-    def share(self, start: float, end: float) -> float:
-        """Share of the bins of a stretch in which it was seen."""
+    def measure_share(self, start: float, end: float) -> float:
+        """Return share of the bins of a stretch in which it was seen."""
         bins = self.seen[int(start / BIN) : max(int(np.ceil(end / BIN - 1e-6)), int(start / BIN) + 1)]
         return float(bins.mean()) if len(bins) else 0.0
 
 
-def walls_between(map: TopometricMap, storey: int, rooms: list[shapely.MultiPolygon], points: FacePoints) -> Array:
-    """(W,) WALL_DTYPE of a storey.
+def detect_walls(map: TopometricMap, storey: int, rooms: list[shapely.MultiPolygon], points: FacePoints) -> Array:
+    """Return (W,) WALL_DTYPE of a storey.
 
     Args:
         rooms: outlines of all rooms of the map, m.
         points: of the storey.
     """
-    faces = _faces(map, storey, rooms, points)
-    pairs = _pairs(faces)
-    rows = [wall for i, j, start, end in pairs if (wall := _double(faces[i], faces[j], start, end)) is not None]
+    faces = _collect_faces(map, storey, rooms, points)
+    pairs = _pair_faces(faces)
+    rows = [wall for i, j, start, end in pairs if (wall := _build_double_wall(faces[i], faces[j], start, end)) is not None]
     thickness = float(np.median([row[2] for row in rows])) if rows else USUAL_THICKNESS
-    rows += _singles(faces, pairs, thickness)
+    rows += _build_single_walls(faces, pairs, thickness)
     walls = np.zeros(len(rows), WALL_DTYPE)
     walls["storey"] = storey
     for k, (start, end, thick, seen, sides) in enumerate(rows):
         walls["start"][k], walls["end"][k], walls["thickness"][k] = start, end, thick
         walls["faces"][k], walls["rooms"][k] = seen, sides
-    walls = with_heights(map, walls, points)
-    return joined(walls, shapely.union_all([rooms[r] for r in np.flatnonzero(map.rooms["storey"] == storey)]))
+    walls = add_wall_heights(map, walls, points)
+    return join_walls(walls, shapely.union_all([rooms[r] for r in np.flatnonzero(map.rooms["storey"] == storey)]))
 
 
-def _faces(map: TopometricMap, storey: int, rooms: list[shapely.MultiPolygon], points: FacePoints) -> list[_Face]:
+def _collect_faces(map: TopometricMap, storey: int, rooms: list[shapely.MultiPolygon], points: FacePoints) -> list[_Face]:
     """The edges of all outlines of a storey."""
     upright = points.upright
     tree = shapely.STRtree(shapely.points(points.at[upright]))
@@ -122,15 +242,15 @@ def _faces(map: TopometricMap, storey: int, rooms: list[shapely.MultiPolygon], p
                         minlength=int(np.ceil(length / BIN)),
                     )
                     face = _Face(r, a, b, along, length, count >= BIN_CELLS * scale)
-                    faces.append(_bridged(face, doors))
+                    faces.append(_bridge_gaps(face, doors))
     return faces
 
 
-def _bridged(face: _Face, doors: list[Array]) -> _Face:
+def _bridge_gaps(face: _Face, doors: list[Array]) -> _Face:
     """The face without short gaps, and with the doors that are in it."""
     seen = face.seen.copy()
     for door in doors:
-        ends = (jambs(door)[:, :2] - face.a) @ face.along
+        ends = (compute_jambs(door)[:, :2] - face.a) @ face.along
         off = abs(float((door["centre"][:2] - face.a) @ face.out))
         middle, half = float(ends.mean()), float(door["width"]) / 2
         if off < DOOR_REACH and -half < middle < face.length + half:
@@ -144,7 +264,7 @@ def _bridged(face: _Face, doors: list[Array]) -> _Face:
     return _Face(face.room, face.a, face.b, face.along, face.length, seen)
 
 
-def _pairs(faces: list[_Face]) -> list[tuple[int, int, float, float]]:
+def _pair_faces(faces: list[_Face]) -> list[tuple[int, int, float, float]]:
     """(i, j, start, end): faces i < j are two sides of a wall, between two places on i, m; the nearest other side each."""
     lines = [shapely.LineString([f.a, f.b]) for f in faces]
     if not lines:
@@ -159,45 +279,45 @@ def _pairs(faces: list[_Face]) -> list[tuple[int, int, float, float]]:
         low, high = max(low, 0.0), min(high, f.length)
         if high - low < BIN:
             continue
-        gap = float((_across(g, f.a + f.along * (low + high) / 2) - f.a) @ f.out)
+        gap = float((_project_onto_face(g, f.a + f.along * (low + high) / 2) - f.a) @ f.out)
         if -THINNEST < gap <= THICKEST:
             opposite.setdefault(i, []).append((gap, j, low, high))
     pairs = []
     for i, others in opposite.items():
         free = [(0.0, faces[i].length)]
         for _, j, low, high in sorted(others):
-            for start, end in _overlaps(free, low, high):
+            for start, end in _intersect_intervals(free, low, high):
                 pairs.append((i, j, start, end))
-            free = _without(free, low, high)
+            free = _subtract_interval(free, low, high)
     there = {(i, j) for i, j, _, _ in pairs}
     return [pair for pair in pairs if pair[0] < pair[1] or (pair[1], pair[0]) not in there]
 
 
-def _across(face: _Face, point: Array) -> Array:
+def _project_onto_face(face: _Face, point: Array) -> Array:
     """The point of a face's line that is nearest to another."""
     out: Array = face.a + face.along * float((point - face.a) @ face.along)
     return out
 
 
-def _overlaps(free: list[tuple[float, float]], low: float, high: float) -> list[tuple[float, float]]:
+def _intersect_intervals(free: list[tuple[float, float]], low: float, high: float) -> list[tuple[float, float]]:
     cut = [(max(a, low), min(b, high)) for a, b in free]
     return [(a, b) for a, b in cut if b - a > BIN]
 
 
-def _without(free: list[tuple[float, float]], low: float, high: float) -> list[tuple[float, float]]:
+def _subtract_interval(free: list[tuple[float, float]], low: float, high: float) -> list[tuple[float, float]]:
     return [(a, b) for x, y in free for a, b in ((x, min(y, low)), (max(x, high), y)) if b > a]
 
 
 Row = tuple[Array, Array, float, int, tuple[int, int]]
 
 
-def _double(f: _Face, g: _Face, start: float, end: float) -> Row | None:
+def _build_double_wall(f: _Face, g: _Face, start: float, end: float) -> Row | None:
     """The wall between two faces, from `start` to `end` on the first; None where neither was seen."""
     along = f.along - g.along
     along /= np.hypot(*along)
     ends = [f.a + f.along * t for t in (start, end)]
-    far = [_across(g, p) for p in ends]
-    shares = f.share(start, end), g.share(*sorted(float((p - g.a) @ g.along) for p in far))
+    far = [_project_onto_face(g, p) for p in ends]
+    shares = f.measure_share(start, end), g.measure_share(*sorted(float((p - g.a) @ g.along) for p in far))
     if max(shares) < 0.5:
         return None
     middle = (ends[0] + ends[1] + far[0] + far[1]) / 4
@@ -208,7 +328,7 @@ def _double(f: _Face, g: _Face, start: float, end: float) -> Row | None:
     return middle + along * t[0], middle + along * t[1], thickness, seen, (f.room, g.room)
 
 
-def _singles(faces: list[_Face], pairs: list[tuple[int, int, float, float]], thickness: float) -> list[Row]:
+def _build_single_walls(faces: list[_Face], pairs: list[tuple[int, int, float, float]], thickness: float) -> list[Row]:
     """Walls of which nobody saw the other side."""
     rows: list[Row] = []
     taken: dict[int, list[tuple[float, float]]] = {}
@@ -220,16 +340,16 @@ def _singles(faces: list[_Face], pairs: list[tuple[int, int, float, float]], thi
     for i, face in enumerate(faces):
         free = [(0.0, face.length)]
         for low, high in taken.get(i, []):
-            free = _without(free, low, high)
+            free = _subtract_interval(free, low, high)
         for low, high in free:
-            for start, end in _runs(face, low, high):
+            for start, end in _find_seen_runs(face, low, high):
                 if end - start >= (LEAST_FACE if i in taken else LEAST_WALL):
                     ends = [face.a + face.along * t + face.out * thickness / 2 for t in (start, end)]
                     rows.append((ends[0], ends[1], thickness, 1, (face.room, -1)))
     return rows
 
 
-def _runs(face: _Face, low: float, high: float) -> list[tuple[float, float]]:
+def _find_seen_runs(face: _Face, low: float, high: float) -> list[tuple[float, float]]:
     """Stretches of a part of a face that were seen."""
     first, last = int(low / BIN), int(np.ceil(high / BIN - 1e-6))
     change = np.flatnonzero(np.diff(np.pad(face.seen[first:last].astype(np.int8), 1)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 
-from topomerge.datasets.core.script import exit_status
+from topomerge.datasets.core.builder import run_script
 
 
 def main(words: list[str]) -> int:
@@ -14,19 +14,19 @@ def main(words: list[str]) -> int:
         print(__doc__)
         return 0 if words else 1
     from topomerge.training.embedding import fit
-    from topomerge.training.settings import from_dict, from_file, to_dict
+    from topomerge.training.settings import convert_to_dict, load_settings, parse_settings
 
     def work() -> None:
-        values = to_dict(from_file(words[0]))
+        values = convert_to_dict(load_settings(words[0]))
         for word in words[1:]:
             key, _, value = word.partition("=")
-            values[key.lstrip("-")] = _value(value) if "=" in word else True
-        fit(from_dict(values))
+            values[key.lstrip("-")] = _parse_value(value) if "=" in word else True
+        fit(parse_settings(values))
 
-    return exit_status("train", work, "go on with resume=true")
+    return run_script("train", work, "go on with resume=true")
 
 
-def _value(text: str) -> object:
+def _parse_value(text: str) -> object:
     try:
         return json.loads(text)
     except ValueError:

@@ -11,11 +11,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from topomerge.io.atomic import replacing
-from topomerge.training.log import Log
-from topomerge.training.loop import Say
-from topomerge.training.run_folder import begin_run, export_files, write_card
-from topomerge.training.shared_settings import TaskSettings
+from topomerge.io.archive import replace_on_success
+from topomerge.training.loop import LogFn
+from topomerge.training.run_folder import MetricsLog, begin_run, export_files, write_card
+from topomerge.training.settings import TaskSettings
 from topomerge.training.tasks import TASKS
 from topomerge.types import Array
 
@@ -24,7 +23,7 @@ Settings = TypeVar("Settings", bound=TaskSettings)
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FitResult:
     """What a fit gives: weights as the package reads them, scores on what was left out, and what was learned from."""
 
     weights: dict[str, Any]
@@ -32,7 +31,7 @@ class Fitted:
     origin: dict[str, Any]
 
 
-def run_fit(settings: Settings, make: Callable[[Settings, Say], Fitted], say: Say) -> dict[str, float]:
+def run_fit(settings: Settings, make: Callable[[Settings, LogFn], FitResult], log_line: LogFn) -> dict[str, float]:
     """Fit, and leave a run's folder. With `resume` a run that has ended is left as it is: its data is cached either way.
 
     Returns:
@@ -41,28 +40,28 @@ def run_fit(settings: Settings, make: Callable[[Settings, Say], Fitted], say: Sa
     best = settings.folder / "best" / TASKS[settings.task].file
     metrics = settings.folder / "metrics.jsonl"
     if settings.resume and best.exists() and metrics.exists():
-        say(f"{best}: is there")
+        log_line(f"{best}: is there")
         row = json.loads(metrics.read_text(encoding="utf-8").splitlines()[-1])
     else:
         began = time.perf_counter()
-        fitted = make(settings, say)
+        fitted = make(settings, log_line)
         begin_run(replace(settings, resume=False), threads=settings.jobs)
-        log = Log(settings.folder, settings.tensorboard)
+        log = MetricsLog(settings.folder, settings.tensorboard)
         scores = {f"val/{name}": float(value) for name, value in fitted.metrics.items()}
         row = {"epoch": 0, "seconds": time.perf_counter() - began, **scores}
-        log.row(row)
+        log.append_row(row)
         log.close()
         best.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(best) as beside:
+        with replace_on_success(best) as beside:
             beside.write_text(json.dumps(fitted.weights, indent=1) + "\n", encoding="utf-8")
         write_card(best, asdict(settings), fitted.origin, scores)
-        say(", ".join(f"{name} {value:.3f}" for name, value in fitted.metrics.items()))
+        log_line(", ".join(f"{name} {value:.3f}" for name, value in fitted.metrics.items()))
     if settings.export:
         export_files(best.parent, settings.export, TASKS[settings.task].package)
     return {name: value for name, value in row.items() if isinstance(value, float)}
 
 
-def calibration_error(p: Array, y: Array) -> float:
+def compute_calibration_error(p: Array, y: Array) -> float:
     """Expected calibration error: how far probabilities (n,) are from how often it was so (n,), over `PROBABILITY_BANDS`."""
     error = 0.0
     for low, high in pairwise(PROBABILITY_BANDS):

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from topomerge.embedding.graph import find_column, find_columns_of_power
 from topomerge.embedding.network import Network
-from topomerge.embedding.schema import column, columns_of_power
 from topomerge.embedding.surroundings import (
     CROP_PART,
     CROP_SHAPES,
@@ -28,11 +28,23 @@ from topomerge.embedding.surroundings import (
     WIDE_PART,
     WIDE_STEP,
 )
-from topomerge.training.batches import ALIKE_AREAS, MapPair
-from topomerge.training.other_sensors import BEND_STEP, PATCH, PATCHES, SEEN_AS
-from topomerge.training.packed import GraphPair
+from topomerge.training.batches import (
+    ALIKE_AREAS,
+    BEND_STEP,
+    DOOR_SHIFT,
+    MIRRORED_COLUMNS,
+    PATCH,
+    PATCHES,
+    SEEN_AS,
+    WILD,
+    WILD_SHARE,
+    MapPair,
+    compute_quarter_turns,
+    compute_relative_positions,
+)
+from topomerge.training.hashed_random import draw_normal, draw_uniform, draw_uniforms, hash_numbers
+from topomerge.training.packed_pairs import GraphPair
 from topomerge.training.settings import Augment
-from topomerge.training.turned_views import DOOR_SHIFT, MIRRORED_COLUMNS, WILD, WILD_SHARE, quarters_between, ways_of
 from topomerge.types import Array
 
 SUPPORTED = {"x", "edge_index", "edge_attr", "edge_way", *CROP_SHAPES}  # tensors that are made on the device
@@ -47,50 +59,6 @@ def supports_device_batches(network: Network, names: Sequence[str], augment: Aug
     """Tell whether batches of these tensors, changed in this way, can be made on a device."""
     changes = () if augment is None else (augment.walks, augment.slices, augment.rough)
     return network.turns > 1 and set(names) <= SUPPORTED and not any(changes)
-
-
-def hash_numbers(seed: Array, stream: int, index: Array) -> Array:
-    """Return (n,) uint64, well mixed numbers of seeds (n,), a stream and indices (n,) (the finaliser of SplitMix64)."""
-    with np.errstate(over="ignore"):
-        x = seed.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15) + index.astype(np.uint64) * np.uint64(0xD1B54A32D192ED03)
-        x += np.uint64(stream) * np.uint64(0x8CB92BA72F3D8DD7)
-        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        return x ^ (x >> np.uint64(31))
-
-
-def draw_uniform(seed: Array, stream: int, index: Array) -> Array:
-    """Return (n,) float64 uniform numbers between 0 and 1."""
-    return (hash_numbers(seed, stream, index) >> np.uint64(11)).astype(np.float64) * 2.0**-53
-
-
-def hash_tensors(seed: Tensor, stream: int, index: Tensor) -> Tensor:
-    """Return int64 tensors with the bits of `hash_numbers`, of int64 seeds and indices that broadcast."""
-
-    def shifted(x: Tensor, bits: int) -> Tensor:
-        return (x >> bits) & ((1 << (64 - bits)) - 1)
-
-    x = seed * _signed(0x9E3779B97F4A7C15) + index * _signed(0xD1B54A32D192ED03) + _signed(stream * 0x8CB92BA72F3D8DD7)
-    x = (x ^ shifted(x, 30)) * _signed(0xBF58476D1CE4E5B9)
-    x = (x ^ shifted(x, 27)) * _signed(0x94D049BB133111EB)
-    return x ^ shifted(x, 31)
-
-
-def draw_uniforms(seed: Tensor, stream: int, index: Tensor) -> Tensor:
-    """Return float32 uniform numbers between 0 and 1 of int64 seeds and indices that broadcast."""
-    return ((hash_tensors(seed, stream, index) >> 11) & ((1 << 53) - 1)).double().mul(2.0**-53).float()
-
-
-def draw_normal(seed: Tensor, stream: int, index: Tensor) -> Tensor:
-    """Return float32 normal numbers (Box and Muller) of int64 seeds and indices that broadcast."""
-    first, second = (hash_tensors(seed, stream, 2 * index + k) for k in (0, 1))
-    u, v = (((x >> 11) & ((1 << 53) - 1)).double() * 2.0**-53 for x in (first, second))
-    return ((-2 * (1 - u).log()).sqrt() * (2 * math.pi * v).cos()).float()
-
-
-def _signed(number: int) -> int:
-    number &= (1 << 64) - 1
-    return number - (1 << 64) if number >> 63 else number
 
 
 def concatenate_ranges(first: Array, count: Array) -> Array:
@@ -152,21 +120,21 @@ class DevicePairs:
         self.matches = np.concatenate([pair.matches.numpy().reshape(-1, 2) for pair in pairs])
         self.first_match = np.concatenate([[0], np.cumsum([len(pair.matches) for pair in pairs])])
         self.building = torch.tensor([pair.building_numbers for pair in pairs]).flatten().to(device)  # of each map
-        self.quarters = np.array([-1 if (k := quarters_between(pair)) is None else k for pair in pairs])
+        self.quarters = np.array([-1 if (k := compute_quarter_turns(pair)) is None else k for pair in pairs])
         x = torch.cat([graph["x"] for graph in graphs])
-        self.glimpsed = x[:, column("x", "glimpsed")].numpy() != 0
-        self.log_area = np.log(np.maximum(x[:, column("x", "area")].numpy(), 0.1))
+        self.glimpsed = x[:, find_column("x", "glimpsed")].numpy() != 0
+        self.log_area = np.log(np.maximum(x[:, find_column("x", "area")].numpy(), 0.1))
         self.tables = {"x": x, "edge_attr": torch.cat([graph["edge_attr"] for graph in graphs])}
         if "edge_way" in names:
-            self.tables["edge_way"] = torch.cat([ways_of(graph, names)["edge_way"] for graph in graphs])
+            self.tables["edge_way"] = torch.cat([compute_relative_positions(graph, names)["edge_way"] for graph in graphs])
         self.tables["anchor"] = torch.cat([graph["anchor"] for graph in graphs])
         self.tables["doors"] = torch.cat([_pad_doors(graph["door_anchor"]) for graph in graphs])
         self.tables = {name: table.to(device) for name, table in self.tables.items()}
         self.has_door = np.isfinite(self.tables["doors"][..., 0].cpu().numpy())
-        self.powers = _mark_columns(x.shape[1], {power: columns_of_power("x", power) for power in (1, 2, 3)}).to(device)
+        self.powers = _mark_columns(x.shape[1], {power: find_columns_of_power("x", power) for power in (1, 2, 3)}).to(device)
         edge_columns = self.tables["edge_attr"].shape[1]
-        self.lengths = _mark_columns(edge_columns, {1: columns_of_power("edge_attr", 1)}).to(device)
-        mirrored = [column("edge_attr", MIRRORED_COLUMNS["edge_attr"])]
+        self.lengths = _mark_columns(edge_columns, {1: find_columns_of_power("edge_attr", 1)}).to(device)
+        mirrored = [find_column("edge_attr", MIRRORED_COLUMNS["edge_attr"])]
         self.sign = (1 - _mark_columns(edge_columns, {2: mirrored})).to(device)
         self._load_sheets([(graph["sheet"], graph["sheet_room"]) for graph in graphs])
 
@@ -199,7 +167,7 @@ class DevicePairs:
         """Return what a batch holds: the rooms and edges that are left, and how each part is turned."""
         maps = (2 * numbers[:, None] + [0, 1]).ravel()
         map_seed = hash_numbers(np.repeat(seeds, 2), RATES, np.tile([0, 1], len(numbers))) >> np.uint64(1)
-        keep, edge_keep, rows, edge_rows = self._lose(maps, map_seed)
+        keep, edge_keep, rows, edge_rows = self._drop_rooms(maps, map_seed)
         of_map = np.repeat(np.arange(len(maps)), self.rooms[maps])
         kept = np.bincount(of_map[keep], minlength=len(maps))
         edge_of_map = np.repeat(np.arange(len(maps)), self.edges[maps])
@@ -231,14 +199,14 @@ class DevicePairs:
         match_index = number[ends] - start[np.stack([2 * match_pair, 2 * match_pair + 1])] + part_start[parts]
 
         true = np.where(wrong[room_part], -1, self.true[room])
-        clear = self._see_well(room, match_index) & ~wrong[room_part]
-        rotation = self._turn(numbers, seeds, side, wrong)
+        clear = self._find_well_seen_rooms(room, match_index) & ~wrong[room_part]
+        rotation = self._draw_rotations(numbers, seeds, side, wrong)
         return Structure(
             room, edge, room_part, edge_part, maps[part], side, pair, rotation, map_seed[part], edge_index, match_index, true,
             clear, kept.reshape(-1, 2),
         )  # fmt: skip
 
-    def _lose(self, maps: Array, seed: Array) -> tuple[Array, Array, Array, Array]:
+    def _drop_rooms(self, maps: Array, seed: Array) -> tuple[Array, Array, Array, Array]:
         """Return which rooms and edges of maps are kept (bool), and their rows: at least two rooms of each, doors both ways."""
         count, edges = self.rooms[maps], self.edges[maps]
         rows, edge_rows = concatenate_ranges(self.first_room[maps], count), concatenate_ranges(self.first_edge[maps], edges)
@@ -255,8 +223,9 @@ class DevicePairs:
         first = (np.cumsum(count) - count)[edge_of_map]
         return keep, edge_keep & keep[self.edge_index[:, edge_rows] + first].all(axis=0), rows, edge_rows
 
-    def _see_well(self, room: Array, match_index: Array) -> Array:
-        """Return (R,) bool as `batches.seen_well`: entered in both maps, areas alike, or entered and without a partner."""
+    def _find_well_seen_rooms(self, room: Array, match_index: Array) -> Array:
+        """Return (R,) bool as `batches.find_well_seen_rooms`: entered in both maps, areas alike, or entered and without a
+        partner."""
         a, b = room[match_index]
         alike = np.abs(self.log_area[a] - self.log_area[b]) <= math.log(ALIKE_AREAS)
         well, linked = np.zeros(len(room), bool), np.zeros(len(room), bool)
@@ -265,7 +234,7 @@ class DevicePairs:
         well[match_index[:, good].ravel()] = True
         return well | (~linked & ~self.glimpsed[room])
 
-    def _turn(self, numbers: Array, seeds: Array, side: Array, wrong: Array) -> Array:
+    def _draw_rotations(self, numbers: Array, seeds: Array, side: Array, wrong: Array) -> Array:
         """Return (P, 2, 2) int64: a place of a part, seen from its middle -> that of its map."""
         copies = len(side) // len(numbers)
         draws = np.stack([draw_uniform(seeds, TURNS, np.full(len(seeds), k)) for k in range(4)])

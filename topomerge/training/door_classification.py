@@ -18,32 +18,30 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from topomerge.datasets.core.derived import derive, read_derived, read_sources
+from topomerge.datasets.core.builder import derive, read_derived, read_sources
 from topomerge.datasets.pairs.plan_examples import PlanRecipe, build_plans, load_examples
 from topomerge.errors import InputError
 from topomerge.extraction.plans.passages import (
     DOOR_FEATURES,
-    clearance_of,
-    door_features,
+    compute_clearance,
+    compute_door_features,
     find_passages,
     read_classifier,
-    regions_of,
+    segment_regions,
 )
 from topomerge.extraction.plans.plan_network import (
     GRID_NETWORK_FILE,
     PLAN_NETWORK_FILE,
-    column_probabilities,
-    weights,
-    without_furniture,
+    compute_column_probabilities,
+    load_weights,
+    remove_furniture,
 )
 from topomerge.extraction.plans.storey_plan import StoreyPlan
-from topomerge.io.atomic import replacing
-from topomerge.io.weight_files import weights_file
-from topomerge.numpy_nn import perceptron, sigmoid
-from topomerge.training.loop import Say, State, descend_gradient, mixed
-from topomerge.training.networks import NetworkJob, run_network
+from topomerge.io.archive import find_weights_file, replace_on_success
+from topomerge.numpy_nn import apply_mlp, sigmoid
+from topomerge.training.loop import LogFn, NetworkJob, State, derive_seed, descend_gradient, run_network
+from topomerge.training.packed_pairs import number_buildings, read_scan_building
 from topomerge.training.scan_settings import DoorClassification
-from topomerge.training.splits import number_buildings, read_scan_building
 from topomerge.types import Array
 
 PURE = 0.7  # share of a region in its true room; regions between rooms are no example
@@ -52,28 +50,30 @@ RANGE = (0.005, 0.995)  # quantiles that features are clipped to
 Doors = tuple[Array, Array, Array]  # (n, 17) features, (n,) is it a door, (n,) number of the building
 
 
-def fit(settings: DoorClassification, say: Say) -> dict[str, float]:
+def fit(settings: DoorClassification, log_line: LogFn) -> dict[str, float]:
     """Train; the scores of the best epoch.
 
     Raises:
         InputError: no scan to train on or to watch.
     """
-    x, y, building = door_examples(settings.data, settings, say)
+    x, y, building = build_door_examples(settings.data, settings, log_line)
     watched = building % settings.hold_out == 0
     if len(np.unique(y[~watched])) < 2 or len(np.unique(y[watched])) < 2:
         raise InputError(f"data.scans={settings.data.scans}: too few scans to learn doors from some and watch others")
-    torch.manual_seed(mixed(settings.seed))
+    torch.manual_seed(derive_seed(settings.seed))
     job = DoorJob(settings, (x[~watched], y[~watched], building[~watched]), (x[watched], y[watched], building[watched]))
-    say(f"{len(y)} examples of {len(np.unique(building))} buildings, {y.mean():.3f} of them doors")
-    return run_network(job, settings, job.steps, say)
+    log_line(f"{len(y)} examples of {len(np.unique(building))} buildings, {y.mean():.3f} of them doors")
+    return run_network(job, settings, job.steps, log_line)
 
 
-def door_examples(recipe: PlanRecipe, settings: DoorClassification, say: Say) -> Doors:
-    """Examples of a set of scans, cached."""
-    paths, _ = build_plans(recipe, settings, say)
-    networks = (weights_file("topomerge.networks", name) for name in (PLAN_NETWORK_FILE, GRID_NETWORK_FILE))
+def build_door_examples(recipe: PlanRecipe, settings: DoorClassification, log_line: LogFn) -> Doors:
+    """Build examples of a set of scans, cached."""
+    paths, _ = build_plans(recipe, settings, log_line)
+    networks = (find_weights_file("topomerge.networks", name) for name in (PLAN_NETWORK_FILE, GRID_NETWORK_FILE))
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in networks)).hexdigest()[:16]
-    files, _ = derive(f"{recipe.name}_doors", scan_doors, [[path] for path in paths], settings, {"plan_networks": digest}, say)
+    files, _ = derive(
+        f"{recipe.name}_doors", compute_scan_doors, [[path] for path in paths], settings, {"plan_networks": digest}, log_line
+    )
     scans = [read_derived(file) for file in files]
     if not scans:
         raise InputError(f"{recipe.name}: no scan could be made; see the reasons above")
@@ -83,26 +83,26 @@ def door_examples(recipe: PlanRecipe, settings: DoorClassification, say: Say) ->
     return np.concatenate([s["x"] for s in scans]), np.concatenate([s["y"] for s in scans]), numbers
 
 
-def scan_doors(path: Path, plan_networks: str) -> dict[str, Array]:
-    """Features and answers for the neighbouring regions of the plans of a scan.
+def compute_scan_doors(path: Path, plan_networks: str) -> dict[str, Array]:
+    """Compute features and answers for the neighbouring regions of the plans of a scan.
 
     Args:
         plan_networks: digest of the weights that cut the plans; they only name the cached file.
     """
     parts = []
     for e in load_examples(path):
-        chance = column_probabilities(e.plan, weights(raised=e.source.startswith("drawn/")))
-        parts.append(region_pairs(e.plan, chance, e.room, set(e.visited.tolist())))
+        chance = compute_column_probabilities(e.plan, load_weights(raised=e.source.startswith("drawn/")))
+        parts.append(compute_region_pairs(e.plan, chance, e.room, set(e.visited.tolist())))
     x = np.array([row for rows, _ in parts for row in rows], float).reshape(-1, len(DOOR_FEATURES))
     return {"x": x, "y": np.array([answer for _, answers in parts for answer in answers], bool)}
 
 
-def region_pairs(plan: StoreyPlan, chance: Array, truth: Array, visited: set[int]) -> tuple[list[Array], list[bool]]:
-    """Features and answers for the neighbouring regions of one plan, before and while those of one room are merged."""
-    plan = without_furniture(plan, chance)
-    clearance = clearance_of(plan)
-    region = regions_of(plan, chance)
-    room, area = _rooms_of_regions(region, truth, plan.edge)
+def compute_region_pairs(plan: StoreyPlan, chance: Array, truth: Array, visited: set[int]) -> tuple[list[Array], list[bool]]:
+    """Compute features and answers for the neighbouring regions of one plan, before and while those of one room are merged."""
+    plan = remove_furniture(plan, chance)
+    clearance = compute_clearance(plan)
+    region = segment_regions(plan, chance)
+    room, area = _assign_regions_to_rooms(region, truth, plan.edge)
     peak = np.zeros(len(room))
     inside = region >= 0
     np.maximum.at(peak, region[inside], clearance[inside])
@@ -113,7 +113,7 @@ def region_pairs(plan: StoreyPlan, chance: Array, truth: Array, visited: set[int
     def add(pairs: list[tuple[int, int]]) -> None:
         for a, b in pairs:
             if room[a] >= 0 and room[b] >= 0 and (room[a] in visited or room[b] in visited):
-                x.append(door_features(links[a, b], (peak[a], peak[b]), (area[a], area[b])))
+                x.append(compute_door_features(links[a, b], (peak[a], peak[b]), (area[a], area[b])))
                 y.append(bool(room[a] != room[b]))
 
     add(list(links))
@@ -130,7 +130,7 @@ def region_pairs(plan: StoreyPlan, chance: Array, truth: Array, visited: set[int
     return x, y
 
 
-def _rooms_of_regions(region: Array, truth: Array, edge: float) -> tuple[Array, Array]:
+def _assign_regions_to_rooms(region: Array, truth: Array, edge: float) -> tuple[Array, Array]:
     """True room of each region, -1 where it lies between rooms, and the regions' areas, m2."""
     count, rooms = int(region.max(initial=-1)) + 1, int(truth.max(initial=-1)) + 1
     votes = np.zeros((count, rooms + 1))
@@ -152,8 +152,8 @@ class Perceptrons(nn.Module):
             nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, 1)) for _ in range(networks)
         )
 
-    def layers(self) -> list[tuple[Array, Array]]:
-        """The mean of their scores as one network with as many times the hidden units: weights (in, out) and biases."""
+    def merge_layers(self) -> list[tuple[Array, Array]]:
+        """Return the mean of their scores as one network with as many times the hidden units: weights (in, out) and biases."""
         first = [member[0] for member in self.members]  # type: ignore[index]
         last = [member[2] for member in self.members]  # type: ignore[index]
         numbers = [[(m.weight.detach().numpy().T, m.bias.detach().numpy()) for m in layer] for layer in (first, last)]
@@ -179,23 +179,23 @@ class DoorJob(NetworkJob):
         self.tensors = [torch.tensor(v, dtype=torch.float32) for v in (inputs, y, weight / weight.mean())]
         self.steps = math.ceil(len(y) / settings.batch)
 
-    def batches(self, state: State) -> Generator[list[tuple[Tensor, ...]], None, None]:
-        """Of each network its rows: jittered inputs, answers, weights."""
+    def iter_batches(self, state: State) -> Generator[list[tuple[Tensor, ...]], None, None]:
+        """Yield batches of the rows of each network: jittered inputs, answers, weights."""
         options, count = self.options, len(self.tensors[0])
-        of_epoch = [torch.Generator().manual_seed(mixed(options.seed, k, state.epoch)) for k in range(options.networks)]
+        of_epoch = [torch.Generator().manual_seed(derive_seed(options.seed, k, state.epoch)) for k in range(options.networks)]
         orders = [torch.randperm(count, generator=generator) for generator in of_epoch]
         for step in range(state.step, self.steps):
             batch: list[tuple[Tensor, ...]] = []
             for k, order in enumerate(orders):
                 rows = order[step * options.batch :][: options.batch]
-                generator = torch.Generator().manual_seed(mixed(options.seed, k, state.epoch, step, 1))
+                generator = torch.Generator().manual_seed(derive_seed(options.seed, k, state.epoch, step, 1))
                 inputs, answers, weight = (tensor[rows] for tensor in self.tensors)
                 noise = torch.randn(inputs.shape, generator=generator)
                 batch.append((inputs + options.noise * noise, answers, weight))
             yield batch
 
-    def step(self, batch: list[tuple[Tensor, ...]], state: State) -> dict[str, float]:
-        """One step of the optimizer, of all networks."""
+    def train_step(self, batch: list[tuple[Tensor, ...]], state: State) -> dict[str, float]:
+        """Take one step of the optimizer, of all networks."""
         options = self.options
         for group in self.optimizer.param_groups:
             group["lr"] = options.rate * 0.5 * (1 + math.cos(math.pi * state.epoch / options.epochs))
@@ -207,37 +207,37 @@ class DoorJob(NetworkJob):
         taken = descend_gradient(self.optimizer, torch.stack(losses).sum(), state)
         return {**taken, "loss": taken["loss"] / len(losses)}
 
-    def size(self, batch: list[tuple[Tensor, ...]]) -> int:
-        """Examples."""
+    def count_items(self, batch: list[tuple[Tensor, ...]]) -> int:
+        """Count the examples of a batch."""
         return len(batch[0][0])
 
-    def weights(self) -> dict[str, Any]:
-        """As the package reads them."""
+    def export_weights(self) -> dict[str, Any]:
+        """Return the weights as the package reads them."""
         assert isinstance(self.network, Perceptrons)
         values: dict[str, Any] = {name: numbers.round(4).tolist() for name, numbers in self.scaling.items()}
-        layers = [[w.round(4).tolist(), b.round(4).tolist()] for w, b in self.network.layers()]
+        layers = [[w.round(4).tolist(), b.round(4).tolist()] for w, b in self.network.merge_layers()]
         return {"features": list(DOOR_FEATURES), **values, "layers": layers}
 
-    def scores(self) -> dict[str, float]:
-        """Of the scans that are watched."""
-        weights = self.weights()
+    def compute_scores(self) -> dict[str, float]:
+        """Compute the scores of the validation scans."""
+        weights = self.export_weights()
         arrays: dict[str, Any] = {name: np.array(weights[name]) for name in self.scaling}
         layers = [(np.array(w), np.array(b)) for w, b in weights["layers"]]
-        return door_scores(probabilities(self.watched[0], {**arrays, "layers": layers}), self.watched[1])
+        return score_doors(predict_probabilities(self.watched[0], {**arrays, "layers": layers}), self.watched[1])
 
     def write_weights(self, path: Path) -> None:
-        """A table as JSON."""
-        with replacing(path) as beside:
-            beside.write_text(json.dumps(self.weights()), encoding="utf-8")
+        """Write a table as JSON."""
+        with replace_on_success(path) as beside:
+            beside.write_text(json.dumps(self.export_weights()), encoding="utf-8")
 
 
-def probabilities(x: Array, weights: dict[str, Any]) -> Array:
-    """(n,) probability of a door, as `door_classifier.door_probability` with these weights."""
+def predict_probabilities(x: Array, weights: dict[str, Any]) -> Array:
+    """Predict (n,) probability of a door, as `door_classifier.door_probability` with these weights."""
     z = (np.clip(x, weights["low"], weights["high"]) - weights["mean"]) / weights["scale"]
-    return sigmoid(perceptron(z, weights["layers"])[:, 0])
+    return sigmoid(apply_mlp(z, weights["layers"])[:, 0])
 
 
-def door_scores(p: Array, y: Array, threshold: float = 0.5) -> dict[str, float]:
+def score_doors(p: Array, y: Array, threshold: float = 0.5) -> dict[str, float]:
     """Precision and recall of doors from a probability on, area under the ROC curve, log loss and the share that is right."""
     said, y = p > threshold, np.asarray(y, bool)
     order = np.unique(p, return_inverse=True)[1]
@@ -254,7 +254,11 @@ def door_scores(p: Array, y: Array, threshold: float = 0.5) -> dict[str, float]:
     }
 
 
-def judge(settings: DoorClassification, file: Path, say: Say) -> dict[str, Any]:
-    """Scores of weights on scans of buildings that trained nothing."""
-    x, y, building = door_examples(settings.heldout, settings, say)
-    return {**door_scores(probabilities(x, read_classifier(file)), y), "examples": len(y), "buildings": len(np.unique(building))}
+def judge(settings: DoorClassification, file: Path, log_line: LogFn) -> dict[str, Any]:
+    """Return scores of weights on scans of buildings that trained nothing."""
+    x, y, building = build_door_examples(settings.heldout, settings, log_line)
+    return {
+        **score_doors(predict_probabilities(x, read_classifier(file)), y),
+        "examples": len(y),
+        "buildings": len(np.unique(building)),
+    }

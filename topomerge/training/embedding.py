@@ -1,7 +1,4 @@
-"""Task `embedding`: the network that gives each room of a map a row of numbers, so that two views of one room get close ones.
-
-The loop is `training.loop`; several processes share its steps by fabric.
-"""
+"""Task `embedding`: the network that gives each room of a map a descriptor."""
 
 from __future__ import annotations
 
@@ -14,33 +11,89 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from matplotlib.figure import Figure
 
 from topomerge.checkpoint import load_state
-from topomerge.embedding.weights import STATE_FILE, STATE_SETTINGS
+from topomerge.embedding.learned import STATE_FILE, STATE_SETTINGS
 from topomerge.errors import InputError
-from topomerge.models.embedder import Embedder
+from topomerge.matching.assignment import assign_certain, compute_certainty
+from topomerge.models.embedder import Embedder, match_scores
 from topomerge.models.export import check_exporter, export_embedder
 from topomerge.models.losses import Objective
 from topomerge.models.weights import read_embedder, read_state, save_state
 from topomerge.networks.network import WEIGHTS_PACKAGE
-from topomerge.training.batches import ChangedPairs, MapPair
+from topomerge.training.batches import AugmentedPairs, MapPair
 from topomerge.training.device_batches import DevicePairs, supports_device_batches
-from topomerge.training.embedding_pictures import show_embedder
-from topomerge.training.log import Log
-from topomerge.training.loop import Loop, Schedule, State, build_diverged, group_parameters, made_by_threads, mixed, pace
-from topomerge.training.packed import EXTRAS, GraphPair, load_pairs
+from topomerge.training.loop import (
+    Loop,
+    Schedule,
+    State,
+    build_diverged,
+    derive_seed,
+    group_parameters,
+    prefetch_by_threads,
+    warmup_cosine,
+)
+from topomerge.training.packed_pairs import EXTRAS, GraphPair, hold_out, load_pairs
 from topomerge.training.provenance import describe_provenance
-from topomerge.training.run_folder import begin_run, export_files
-from topomerge.training.settings import VALIDATION, Augment, Training, check, to_dict
-from topomerge.training.splits import hold_out
+from topomerge.training.run_folder import MetricsLog, begin_run, export_files
+from topomerge.training.settings import VALIDATION, Augment, Training, check, convert_to_dict
 from topomerge.training.tasks import check_start
-from topomerge.training.validate import validate
+from topomerge.training.validate import embed, validate
 
-Say = Callable[[str], None]
+PROJECTED_PAIRS = 12  # in the embedding projector
 
 
-def fit(settings: Training, say: Say = lambda text: print(text, file=sys.stderr, flush=True)) -> dict[str, float]:
+def show_embedder(board: Any, network: Embedder, pairs: Sequence[GraphPair], epoch: int, least: float, device: Any) -> None:
+    """Show the embedding projector and a figure of matched rooms.
+
+    Args:
+        board: TensorBoard's writer; None: nothing is shown.
+        least: certainty of a match that is drawn.
+    """
+    matched_pairs = [pair for pair in pairs if len(pair.matches)][:PROJECTED_PAIRS]
+    if board is None or not matched_pairs:
+        return
+    sides = embed(network, matched_pairs, device)
+    labels = [f"{k // 2}{'ab'[k % 2]} {int(t)}" for k, rooms in enumerate(_list_true_rooms(matched_pairs)) for t in rooms]
+    board.add_embedding(np.concatenate([e.numpy() for e, _ in sides]), labels, global_step=epoch, tag="rooms")
+    board.add_figure("matched rooms", plot_matches(network, matched_pairs[0], sides[0], sides[1], least), epoch)
+
+
+def _list_true_rooms(pairs: Sequence[GraphPair]) -> list[Any]:
+    return [true.tolist() for pair in pairs for true in pair.true]
+
+
+def plot_matches(network: Embedder, pair: GraphPair, a: tuple[Any, Any], b: tuple[Any, Any], least: float) -> Any:
+    """Plot two maps beside each other with the matches that were made: right ones green, wrong ones red, missing ones grey."""
+    rows, columns = match_scores(a[0], b[0], a[1], b[1], float(network.temperature.detach()))
+    matches = {(i, j) for i, j in assign_certain(compute_certainty(rows.exp().numpy(), columns.exp().numpy()), least).tolist()}
+    true = {(i, j) for i, j in pair.matches.tolist()}
+    places = [graph["pos"][:, :2].numpy() for graph in (pair.a, pair.b)]
+    places = [p - p.min(axis=0) for p in places]
+    places[1] = places[1] + [places[0][:, 0].max() + 8, 0]
+    out = Figure(figsize=(9, 4), layout="constrained")
+    axes = out.add_subplot()
+    for graph, place in zip((pair.a, pair.b), places, strict=True):
+        for i, j in graph["edge_index"].T.tolist():
+            axes.plot(*place[[i, j]].T, color="0.8", lw=1, zorder=0)
+        axes.scatter(place[:, 0], place[:, 1], s=4 * graph["x"][:, 0].numpy(), color="0.6", zorder=1)
+    for i, j in matches | true:
+        color = "tab:green" if (i, j) in matches & true else "tab:red" if (i, j) in matches else "0.6"
+        axes.plot(*np.stack([places[0][i], places[1][j]]).T, color=color, lw=1.2, ls="-" if (i, j) in matches else ":", zorder=2)
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+    counts = f"{len(matches & true)} right, {len(matches - true)} wrong, {len(true - matches)} missing"
+    axes.set_title(f"{pair.about.get('building', '')}: {counts}")
+    return out
+
+
+LogFn = Callable[[str], None]
+
+
+def fit(settings: Training, log_line: LogFn = lambda text: print(text, file=sys.stderr, flush=True)) -> dict[str, float]:
     """Train, and leave a run's folder: config.json, config.yaml, metrics.jsonl, best/, last/, tb/.
 
     Returns:
@@ -57,10 +110,10 @@ def fit(settings: Training, say: Say = lambda text: print(text, file=sys.stderr,
     check_start(settings)  # before other processes, if any, have come so far
     fabric = start_fabric(settings)
     chief = fabric.is_global_zero
-    say = say if chief else lambda text: None
-    settings = with_own_pairs(settings, say, fabric)
-    train, watched = _data(settings, say, fabric)
-    network = _network(settings, train)
+    log_line = log_line if chief else lambda text: None
+    settings = with_own_pairs(settings, log_line, fabric)
+    train, watched = _load_data(settings, log_line, fabric)
+    network = _build_network(settings, train)
     fused = fabric.device.type == "cuda"  # one launch for all weights
     optimizer = torch.optim.AdamW(group_parameters(network, settings.decay), settings.rate, fused=fused)
     state = State()
@@ -72,10 +125,10 @@ def fit(settings: Training, say: Say = lambda text: print(text, file=sys.stderr,
         begin_run(settings, f"{fabric.world_size} x {name}, {find_precision(settings)}", torch.get_num_threads())
     fabric.barrier()
     job = EmbeddingJob(settings, fabric, network, optimizer, (train, watched))
-    log = Log(settings.folder, settings.tensorboard, state.epoch) if chief else None
+    log = MetricsLog(settings.folder, settings.tensorboard, state.epoch) if chief else None
     perfect = 1.0 if settings.overfit else float("inf")
     schedule = Schedule(settings.folder, settings.epochs, job.steps, settings.watch, settings.patience, perfect)
-    best = Loop(job, schedule, state, log, say).run()
+    best = Loop(job, schedule, state, log, log_line).run()
     if settings.export and chief:
         export_files(settings.folder / "best", settings.export, WEIGHTS_PACKAGE)
     return best
@@ -99,25 +152,25 @@ class EmbeddingJob:
         self.augment: Augment | None = None if settings.overfit else settings.augment
         self.pairs = self._load_pairs()
 
-    def _load_pairs(self) -> ChangedPairs | DevicePairs:
+    def _load_pairs(self) -> AugmentedPairs | DevicePairs:
         """Return the pairs that batches are made of, on the device or on the host, as `batches` says.
 
         Raises:
             InputError: batches cannot be made on the device.
         """
-        wanted, names = self.settings.batches, self.network.tensors
-        if wanted == "device" or (wanted == "auto" and self.fabric.device.type != "cpu"):
+        requested, names = self.settings.batches, self.network.tensors
+        if requested == "device" or (requested == "auto" and self.fabric.device.type != "cpu"):
             if supports_device_batches(self.settings.network, names, self.augment):
                 return DevicePairs(self.train, names, self.augment, self.fabric.device)
-            if wanted == "device":
+            if requested == "device":
                 raise InputError("batches=device: this network or augmentation needs batches=host")
-        return ChangedPairs(self.train, names, self.augment, lambda pair: pair)
+        return AugmentedPairs(self.train, names, self.augment, lambda pair: pair)
 
-    def batches(self, state: State) -> Generator[MapPair, None, None]:
-        """Those of the state's epoch from its step on, made by threads while the ones before are worked on."""
+    def iter_batches(self, state: State) -> Generator[MapPair, None, None]:
+        """Yield the batches of the state's epoch from its step on, prefetched by threads."""
         self.objective.train()
         settings = self.settings
-        shuffle = torch.Generator().manual_seed(mixed(settings.seed, state.epoch))
+        shuffle = torch.Generator().manual_seed(derive_seed(settings.seed, state.epoch))
         order = torch.randperm(len(self.train), generator=shuffle).tolist()
         if settings.overfit:
             order = list(range(len(self.train)))
@@ -125,16 +178,16 @@ class EmbeddingJob:
         steps = [order[k * size * world :][: size * world][rank::world] for k in range(state.step, self.steps)]
 
         def seed_of(pair: int) -> int:
-            return mixed(settings.seed, state.epoch, pair)
+            return derive_seed(settings.seed, state.epoch, pair)
 
         if isinstance(self.pairs, DevicePairs):
             for numbers in steps:
                 yield self.pairs.make_batch(numbers, seed_of)
             return
-        pairs = ChangedPairs(self.train, self.network.tensors, self.augment, seed_of)
-        yield from made_by_threads(pairs.batch, steps, settings.threads)
+        pairs = AugmentedPairs(self.train, self.network.tensors, self.augment, seed_of)
+        yield from prefetch_by_threads(pairs.build_batch, steps, settings.threads)
 
-    def step(self, batch: MapPair, state: State) -> dict[str, torch.Tensor]:
+    def train_step(self, batch: MapPair, state: State) -> dict[str, torch.Tensor]:
         """Take one step of the optimizer; return the losses and the gradient's length, which may be under way on the device.
 
         A gradient that is no finite number does not reach the weights. Under a scaler of half precision the step is skipped and
@@ -145,8 +198,8 @@ class EmbeddingJob:
         """
         settings, done = self.settings, state.epoch * self.steps + state.step
         for group in self.optimizer.param_groups:
-            group["lr"] = settings.rate * pace(done / (settings.epochs * self.steps), settings.warmup)
-        torch.manual_seed(mixed(settings.seed, state.epoch, state.step, self.fabric.global_rank, 1))  # of the dropout
+            group["lr"] = settings.rate * warmup_cosine(done / (settings.epochs * self.steps), settings.warmup)
+        torch.manual_seed(derive_seed(settings.seed, state.epoch, state.step, self.fabric.global_rank, 1))  # of the dropout
         batch = batch.to(self.fabric.device)
         losses = self.objective(batch.tensors, batch.truth)
         self.optimizer.zero_grad()
@@ -156,8 +209,8 @@ class EmbeddingJob:
         out = {name: value.detach() for name, value in losses.items()}
         if getattr(self.fabric.strategy.precision, "scaler", None) is not None:
             out |= {"norm": norm.masked_fill(lost, 0.0), "skipped": lost.float()}
-        elif self.optimizer_state().defaults["fused"]:
-            self.optimizer_state().found_inf, out["norm"] = lost.float(), norm  # type: ignore[attr-defined]
+        elif self.get_optimizer().defaults["fused"]:
+            self.get_optimizer().found_inf, out["norm"] = lost.float(), norm  # type: ignore[attr-defined]
         elif lost:
             raise build_diverged(state)
         else:
@@ -165,26 +218,26 @@ class EmbeddingJob:
         self.optimizer.step()
         return out
 
-    def size(self, batch: MapPair) -> int:
-        """Rooms."""
+    def count_items(self, batch: MapPair) -> int:
+        """Count the rooms of a batch."""
         return sum(batch.rooms)
 
-    def total(self, sizes: int) -> float:
-        """Rooms of all processes."""
+    def sum_over_processes(self, sizes: int) -> float:
+        """Sum the rooms of all processes."""
         return float(self.fabric.all_reduce(torch.tensor(float(sizes)), reduce_op="sum"))
 
-    def scores(self) -> dict[str, float]:
-        """Of the pairs watched (`validate`)."""
+    def compute_scores(self) -> dict[str, float]:
+        """Compute the scores of the validation pairs (`validate`)."""
         return validate(self.network, self.watched, self.fabric.device)
 
-    def optimizer_state(self) -> torch.optim.Optimizer:
-        """The optimizer within fabric's."""
+    def get_optimizer(self) -> torch.optim.Optimizer:
+        """Return the optimizer within fabric's."""
         optimizer: torch.optim.Optimizer = self.optimizer.optimizer
         return optimizer
 
     def write_network(self, folder: Path) -> None:
         """The embedder's state."""
-        save_state(self.network, folder, about(self.settings, {}))
+        save_state(self.network, folder, describe_training(self.settings, {}))
 
     def export_best(self, folder: Path) -> None:
         """Export the best embedder, in the place of its state."""
@@ -194,14 +247,14 @@ class EmbeddingJob:
             for name in (STATE_FILE, STATE_SETTINGS):
                 (folder / name).unlink()
 
-    def write_best(self, folder: Path, row: Mapping[str, Any], log: Log) -> None:
+    def write_best(self, folder: Path, row: Mapping[str, Any], log: MetricsLog) -> None:
         """The embedder's state, and pictures of what it does; what was exported of an earlier one goes."""
         shutil.rmtree(folder, ignore_errors=True)
-        save_state(self.network, folder, about(self.settings, row))
+        save_state(self.network, folder, describe_training(self.settings, row))
         show_embedder(log.board, self.network, self.watched, row["epoch"], row["val/least"], self.fabric.device)
 
-    def line(self, row: Mapping[str, Any]) -> str:
-        """The scores that tell most."""
+    def format_scores(self, row: Mapping[str, Any]) -> str:
+        """Format the scores that tell most."""
         scores = [row[f"val/{name}"] for name in ("recall@1", "recall@5", "f1", "merged")]
         return "recall@1 {:.3f} @5 {:.3f} F1 {:.3f} merged {:.2f}".format(*scores)
 
@@ -225,10 +278,10 @@ class FabricProcesses:
         return mean
 
 
-def about(settings: Training, row: Mapping[str, Any]) -> dict[str, Any]:
-    """What an embedder's file says about its training."""
+def describe_training(settings: Training, row: Mapping[str, Any]) -> dict[str, Any]:
+    """Describe the training as in an embedder's file."""
     origin = {"data": settings.data, "validation": settings.validation, "seed": settings.seed, "loss": settings.loss.kind}
-    origin |= {"settings": to_dict(settings), "provenance": describe_provenance(settings.folder)}
+    origin |= {"settings": convert_to_dict(settings), "provenance": describe_provenance(settings.folder)}
     return {"run": settings.name, **origin, **{k: round(v, 5) if isinstance(v, float) else v for k, v in row.items()}}
 
 
@@ -252,7 +305,7 @@ def find_precision(settings: Training) -> str:
     return ("bf16-mixed" if on_cuda else "32-true") if settings.precision == "auto" else settings.precision
 
 
-def with_own_pairs(settings: Training, say: Say, fabric: Any) -> Training:
+def with_own_pairs(settings: Training, log_line: LogFn, fabric: Any) -> Training:
     """Name the sets of a folder of one's own captures, made by one process while the others wait.
 
     Raises:
@@ -263,20 +316,24 @@ def with_own_pairs(settings: Training, say: Say, fabric: Any) -> Training:
     from topomerge.datasets.pairs.own_pairs import build_own_sets
 
     with fabric.rank_zero_first():
-        manifests = build_own_sets(settings.path, settings.cache, say=say).manifests
+        manifests = build_own_sets(settings.path, settings.cache, log_line=log_line).manifests
     watched = str(manifests["val"]) if settings.validation == VALIDATION else settings.validation
     return replace(settings, data=str(manifests["train"]), validation=watched)
 
 
-def _data(settings: Training, say: Say, fabric: Any) -> tuple[list[GraphPair], list[GraphPair]]:
+def _load_data(settings: Training, log_line: LogFn, fabric: Any) -> tuple[list[GraphPair], list[GraphPair]]:
     """Pairs to train on, and to watch; a set is packed by one process while the others wait."""
     extras = [part for part in settings.network.geometry.parts if part in EXTRAS]
     extras += ["near"] if settings.network.node.near else []
     extras += ["sheet"] if settings.network.turns > 1 else []
     with fabric.rank_zero_first():
         around = settings.network.node.around
-        train = load_pairs(_manifest(settings, settings.data), extras, say, settings.limit, around)
-        watched = load_pairs(_manifest(settings, settings.validation), extras, say, around=around) if settings.validation else []
+        train = load_pairs(_get_manifest_path(settings, settings.data), extras, log_line, settings.limit, around)
+        watched = (
+            load_pairs(_get_manifest_path(settings, settings.validation), extras, log_line, around=around)
+            if settings.validation
+            else []
+        )
     if settings.overfit:
         matched = [pair for pair in train if len(pair.matches)][: settings.batch]
         return matched, matched
@@ -287,15 +344,15 @@ def _data(settings: Training, say: Say, fabric: Any) -> tuple[list[GraphPair], l
     return train, watched
 
 
-def _manifest(settings: Training, name: str) -> Path:
+def _get_manifest_path(settings: Training, name: str) -> Path:
     path = Path(name)
     return path if path.suffix in (".jsonl", ".npz") else Path(settings.cache) / f"{name}.jsonl"
 
 
-def _network(settings: Training, train: Sequence[GraphPair]) -> Embedder:
-    torch.manual_seed(mixed(settings.seed))
-    wanted = replace(settings.network, dropout=0.0) if settings.overfit else settings.network
-    network = Embedder(wanted)
+def _build_network(settings: Training, train: Sequence[GraphPair]) -> Embedder:
+    torch.manual_seed(derive_seed(settings.seed))
+    requested = replace(settings.network, dropout=0.0) if settings.overfit else settings.network
+    network = Embedder(requested)
     network.fit_scales([graph for pair in train for graph in (pair.a, pair.b)])
     if settings.geometry_from:
         other, _ = read_embedder(settings.geometry_from)

@@ -13,18 +13,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from topomerge.datasets.core.derived import derive, read_derived
+from topomerge.datasets.core.builder import derive, read_derived
 from topomerge.datasets.pairs.evaluation_pair import load_evaluation_pair
-from topomerge.datasets.pairs.recipe import Recipe
-from topomerge.embedding.engineered import FEATURES, raw_features
+from topomerge.datasets.pairs.items import Recipe
+from topomerge.embedding.engineered import FEATURES, compute_raw_features
 from topomerge.errors import InputError
-from topomerge.matching.scores import partner_ranks
-from topomerge.training.closed_form import Fitted, run_fit
-from topomerge.training.loop import Say
-from topomerge.training.match_odds import map_pairs
-from topomerge.training.splits import name_building
+from topomerge.matching.assignment import rank_partners
+from topomerge.training.closed_form import FitResult, run_fit
+from topomerge.training.loop import LogFn
+from topomerge.training.match_odds import build_map_pairs
+from topomerge.training.packed_pairs import name_building
 from topomerge.training.task_settings import FeatureScale
-from topomerge.types import Array, mostly_unseen
+from topomerge.types import Array, is_mostly_unseen
 
 CLIPPED = 4.0  # standard deviations that a difference counts for at most
 FOLDS = 5  # of buildings, for the scores
@@ -43,14 +43,14 @@ class PairFeatures(NamedTuple):
     clear: Array
 
 
-def fit(settings: FeatureScale, say: Say) -> dict[str, float]:
+def fit(settings: FeatureScale, log_line: LogFn) -> dict[str, float]:
     """Measure; recall@1 of rooms of left-out buildings."""
-    return run_fit(settings, fit_scale, say)
+    return run_fit(settings, fit_scale, log_line)
 
 
-def fit_scale(settings: FeatureScale, say: Say) -> Fitted:
+def fit_scale(settings: FeatureScale, log_line: LogFn) -> FitResult:
     """The scale from all pairs, and how well rooms of buildings are found by the scale of the others."""
-    pairs = pair_features(settings.data, settings, say)
+    pairs = build_pair_features(settings.data, settings, log_line)
     names = sorted({p.building for p in pairs})
     parts = np.array_split(np.random.default_rng(0).permutation(len(names)), min(FOLDS, len(names)))
     ranks = []
@@ -58,16 +58,16 @@ def fit_scale(settings: FeatureScale, say: Say) -> Fitted:
         test = {names[k] for k in part}
         rest = [p for p in pairs if p.building not in test]
         if rest:
-            ranks.append(scaled_ranks([p for p in pairs if p.building in test], statistics(rest, settings.shrink)))
-    weights = statistics(pairs, settings.shrink)
+            ranks.append(rank_scaled([p for p in pairs if p.building in test], compute_statistics(rest, settings.shrink)))
+    weights = compute_statistics(pairs, settings.shrink)
     origin = {"set": settings.data.name, "split": settings.data.split, "pairs": len(pairs)}
-    return Fitted(weights, rank_scores(np.concatenate([*ranks, np.zeros(0, int)])), origin)
+    return FitResult(weights, rank_scores(np.concatenate([*ranks, np.zeros(0, int)])), origin)
 
 
-def pair_features(recipe: Recipe, settings: FeatureScale, say: Say) -> list[PairFeatures]:
-    """Of each pair of a set, cached."""
-    paths = map_pairs(recipe, settings, say)
-    files, _ = derive(f"{recipe.name}_features", features_of, [[path] for path in paths], settings, say=say)
+def build_pair_features(recipe: Recipe, settings: FeatureScale, log_line: LogFn) -> list[PairFeatures]:
+    """Build the features of each pair of a set, cached."""
+    paths = build_map_pairs(recipe, settings, log_line)
+    files, _ = derive(f"{recipe.name}_features", compute_features, [[path] for path in paths], settings, log_line=log_line)
     pairs = []
     for file in files:
         arrays = read_derived(file)
@@ -75,12 +75,12 @@ def pair_features(recipe: Recipe, settings: FeatureScale, say: Say) -> list[Pair
     return pairs
 
 
-def features_of(path: Path) -> dict[str, Array]:
+def compute_features(path: Path) -> dict[str, Array]:
     """`PairFeatures` of a pair's file."""
     pair = load_evaluation_pair(path)
-    maps = pair.maps()
-    a, b = (raw_features(m) for m in maps)
-    glimpsed = [mostly_unseen(m.rooms) for m in maps]
+    maps = pair.load_maps()
+    a, b = (compute_raw_features(m) for m in maps)
+    glimpsed = [is_mostly_unseen(m.rooms) for m in maps]
     i, j = pair.matches.T
     clear = pair.one[0][i] & pair.one[1][j] & ~glimpsed[0][i] & ~glimpsed[1][j]
     building = np.array(name_building(pair.about))
@@ -88,8 +88,8 @@ def features_of(path: Path) -> dict[str, Array]:
     return {"building": building, "a": a, "b": b, **both, "matches": pair.matches, "clear": clear}
 
 
-def statistics(pairs: Sequence[PairFeatures], shrink: float) -> dict[str, Any]:
-    """What `engineered.json` holds.
+def compute_statistics(pairs: Sequence[PairFeatures], shrink: float) -> dict[str, Any]:
+    """Compute the statistics in `engineered.json`.
 
     Raises:
         InputError: no room is seen by two maps.
@@ -112,27 +112,27 @@ def statistics(pairs: Sequence[PairFeatures], shrink: float) -> dict[str, Any]:
     }
 
 
-def scaled_ranks(pairs: Sequence[PairFeatures], weights: dict[str, Any]) -> Array:
-    """(n,) rank of the partner of each room that has one, by the distance of features scaled as ``"matched"``."""
+def rank_scaled(pairs: Sequence[PairFeatures], weights: dict[str, Any]) -> Array:
+    """Return (n,) rank of the partner of each room that has one, by the distance of features scaled as ``"matched"``."""
     root = np.linalg.cholesky(np.linalg.inv(np.array(weights["differences"])))
     ranks = [np.zeros(0, int)]
     for p in pairs:
         if len(p.matches):
             a, b = ((values - weights["mean"]) @ root for values in (p.a, p.b))
             alike = -np.linalg.norm(a[:, None] - b[None], axis=2)
-            ranks += [partner_ranks(alike, p.matches)[1], partner_ranks(alike.T, p.matches[:, ::-1])[1]]
+            ranks += [rank_partners(alike, p.matches)[1], rank_partners(alike.T, p.matches[:, ::-1])[1]]
     return np.concatenate(ranks)
 
 
 def rank_scores(ranks: Array) -> dict[str, float]:
-    """Shares of partners that are first or among the first five, and their mean reciprocal rank."""
+    """Return shares of partners that are first or among the first five, and their mean reciprocal rank."""
     if not len(ranks):
         return {"recall@1": 0.0, "recall@5": 0.0, "mrr": 0.0, "rooms": 0.0}
     scores = {f"recall@{k}": float((ranks <= k).mean()) for k in (1, 5)}
     return {**scores, "mrr": float((1 / ranks).mean()), "rooms": float(len(ranks))}
 
 
-def judge(settings: FeatureScale, file: Path, say: Say) -> dict[str, Any]:
-    """recall@1 of engineered features with these weights on pairs of buildings that trained nothing."""
+def judge(settings: FeatureScale, file: Path, log_line: LogFn) -> dict[str, Any]:
+    """Return recall@1 of engineered features with these weights on pairs of buildings that trained nothing."""
     weights = json.loads(file.read_text(encoding="utf-8"))
-    return rank_scores(scaled_ranks(pair_features(settings.heldout, settings, say), weights))
+    return rank_scores(rank_scaled(build_pair_features(settings.heldout, settings, log_line), weights))

@@ -15,18 +15,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
-from topomerge.datasets.core.derived import derive, read_derived
+from topomerge.datasets.core.builder import derive, read_derived
 from topomerge.datasets.pairs.evaluation_pair import load_evaluation_pair
-from topomerge.datasets.pairs.recipe import Recipe
+from topomerge.datasets.pairs.items import Recipe
 from topomerge.errors import InputError
-from topomerge.fusion.match_belief import BELIEF_NAMES, BELIEVED_METHODS, belief_features, places_of
+from topomerge.fusion.match_belief import BELIEF_NAMES, BELIEVED_METHODS, compute_belief_features, find_places
 from topomerge.matching.match import match
 from topomerge.numpy_nn import sigmoid
-from topomerge.statistics import calibration
-from topomerge.training.closed_form import Fitted, run_fit
-from topomerge.training.loop import Say
-from topomerge.training.match_odds import STRANGER, map_pairs
-from topomerge.training.splits import name_building
+from topomerge.statistics import measure_calibration
+from topomerge.training.closed_form import FitResult, run_fit
+from topomerge.training.loop import LogFn
+from topomerge.training.match_odds import STRANGER, build_map_pairs
+from topomerge.training.packed_pairs import name_building
 from topomerge.training.task_settings import MatchBelief
 from topomerge.types import Array
 
@@ -45,33 +45,33 @@ class MatchRows(NamedTuple):
     right: dict[str, Array]
 
 
-def fit(settings: MatchBelief, say: Say) -> dict[str, float]:
+def fit(settings: MatchBelief, log_line: LogFn) -> dict[str, float]:
     """Fit the model of each method; the scores of left-out buildings."""
-    return run_fit(settings, fit_belief, say)
+    return run_fit(settings, fit_belief, log_line)
 
 
-def fit_belief(settings: MatchBelief, say: Say) -> Fitted:
-    """Weights from all pairs, and scores of those that were fitted without each building."""
-    rows = match_rows(settings.data, settings, say)
-    weights = {method: np.round(fitted_weights(rows, method, settings.pull), 3).tolist() for method in BELIEVED_METHODS}
-    guesses = {method: left_out(rows, method, settings) for method in BELIEVED_METHODS}
+def fit_belief(settings: MatchBelief, log_line: LogFn) -> FitResult:
+    """Fit weights from all pairs, and scores of those that were fitted without each building."""
+    rows = build_match_rows(settings.data, settings, log_line)
+    weights = {method: np.round(fit_match_weights(rows, method, settings.pull), 3).tolist() for method in BELIEVED_METHODS}
+    guesses = {method: predict_left_out(rows, method, settings) for method in BELIEVED_METHODS}
     origin = {"set": settings.data.name, "split": settings.data.split, "pairs": len(rows)}
-    return Fitted({"names": list(BELIEF_NAMES), **weights}, belief_scores(rows, guesses), origin)
+    return FitResult({"names": list(BELIEF_NAMES), **weights}, score_beliefs(rows, guesses), origin)
 
 
-def match_rows(recipe: Recipe, settings: MatchBelief, say: Say) -> list[MatchRows]:
-    """Of each pair, and of each map with one of another building, cached.
+def build_match_rows(recipe: Recipe, settings: MatchBelief, log_line: LogFn) -> list[MatchRows]:
+    """Build the matches of each pair, and of each map with one of another building, cached.
 
     Raises:
         InputError: no rooms match.
     """
-    pairs = [(path, load_evaluation_pair(path)) for path in map_pairs(recipe, settings, say)]
+    pairs = [(path, load_evaluation_pair(path)) for path in build_map_pairs(recipe, settings, log_line)]
     shared = [(path, name_building(pair.about)) for path, pair in pairs if pair.transform is not None and len(pair.matches)]
     sources = [[path] for path, _ in shared]
     for n, (path, building) in enumerate(shared):
         others = [other for other, name in shared[n:] + shared[:n] if name != building]
         sources += [[path, others[STRANGER % len(others)]]] if others else []
-    files, _ = derive(f"{recipe.name}_belief", rows_of, sources, settings, say=say)
+    files, _ = derive(f"{recipe.name}_belief", compute_match_rows, sources, settings, log_line=log_line)
     if not files:
         raise InputError(f"{recipe.name}: no pair has rooms that match")
     rows = []
@@ -81,24 +81,24 @@ def match_rows(recipe: Recipe, settings: MatchBelief, say: Say) -> list[MatchRow
     return rows
 
 
-def rows_of(path: Path, other: Path | None = None) -> dict[str, Array]:
-    """The matches of a pair by each method; with `other` those of its first map and of the second one of another pair."""
+def compute_match_rows(path: Path, other: Path | None = None) -> dict[str, Array]:
+    """Compute the matches of a pair by each method; with `other` those of its first map and of the second one of another pair."""
     pair = load_evaluation_pair(path)
-    a, b = pair.maps()
+    a, b = pair.load_maps()
     if other is not None:
-        b = load_evaluation_pair(other).maps()[1]
+        b = load_evaluation_pair(other).load_maps()[1]
     out = {"building": np.array(name_building(pair.about)), "sharing": np.array(other is None)}
     for method in BELIEVED_METHODS:
         matching = match(a, b, method=method)
         i, j = matching.rooms.T
         right = (pair.true[0][i] == pair.true[1][j]) & (pair.true[0][i] >= 0) if other is None else np.zeros(len(i), bool)
         posed = matching.transform is not None and len(i) > 0
-        x = belief_features(matching, a, b, places_of(matching, a, b)) if posed else np.zeros((0, len(BELIEF_NAMES)))
+        x = compute_belief_features(matching, a, b, find_places(matching, a, b)) if posed else np.zeros((0, len(BELIEF_NAMES)))
         out |= {f"{method}.x": x, f"{method}.p": matching.probability[: len(x)], f"{method}.y": right[: len(x)]}
     return out
 
 
-def fitted_weights(rows: Sequence[MatchRows], method: str, pull: float) -> Array:
+def fit_match_weights(rows: Sequence[MatchRows], method: str, pull: float) -> Array:
     """(6,) weights of the most likely logistic model, pulled to what matching says. None but the constant is below 0: what speaks
     for a match never lowers it.
 
@@ -119,8 +119,8 @@ def fitted_weights(rows: Sequence[MatchRows], method: str, pull: float) -> Array
     return weights
 
 
-def left_out(rows: Sequence[MatchRows], method: str, settings: MatchBelief) -> list[Array]:
-    """Of each pair (M,) probabilities by a model that was fitted without its building.
+def predict_left_out(rows: Sequence[MatchRows], method: str, settings: MatchBelief) -> list[Array]:
+    """Predict the (M,) probabilities of each pair by a model that was fitted without its building.
 
     Raises:
         InputError: all pairs are of one building.
@@ -129,16 +129,18 @@ def left_out(rows: Sequence[MatchRows], method: str, settings: MatchBelief) -> l
     if len(names) < 2:
         raise InputError("data.pairs: pairs of two buildings are needed")
     fold = dict(zip(names, (np.random.default_rng(0).permutation(len(names)) % settings.folds).tolist(), strict=True))
-    weights = {k: fitted_weights([r for r in rows if fold[r.building] != k], method, settings.pull) for k in set(fold.values())}
-    return [_probability(r.features[method], weights[fold[r.building]]) for r in rows]
+    weights = {
+        k: fit_match_weights([r for r in rows if fold[r.building] != k], method, settings.pull) for k in set(fold.values())
+    }
+    return [_predict_probability(r.features[method], weights[fold[r.building]]) for r in rows]
 
 
-def _probability(x: Array, weights: Array) -> Array:
+def _predict_probability(x: Array, weights: Array) -> Array:
     return np.asarray(sigmoid(np.clip(x @ weights, -50, 50)), float)
 
 
-def belief_scores(rows: Sequence[MatchRows], guesses: dict[str, list[Array]]) -> dict[str, float]:
-    """Of each method, of all pairs and of those that share a building, before and after: calibration error (bins of equal mass),
+def score_beliefs(rows: Sequence[MatchRows], guesses: dict[str, list[Array]]) -> dict[str, float]:
+    """Score each method on all pairs and those that share a building, before and after: calibration error (equal mass),
     the same from 0.1 on, log loss, and precision, recall and number from each probability of `SURE` on."""
     scores: dict[str, float] = {}
     for method, each in guesses.items():
@@ -149,12 +151,12 @@ def belief_scores(rows: Sequence[MatchRows], guesses: dict[str, list[Array]]) ->
             y = np.concatenate([rows[k].right[method] for k in chosen])
             for when in (BEFORE, AFTER):
                 p = np.concatenate([each[k] if when == AFTER else rows[k].matching[method] for k in chosen])
-                scores |= {f"{method}_{which}_{when}_{name}": v for name, v in _scores(p, y).items()}
+                scores |= {f"{method}_{which}_{when}_{name}": v for name, v in _compute_scores(p, y).items()}
     return scores
 
 
-def _scores(p: Array, y: Array) -> dict[str, float]:
-    reliability, sure = calibration(p, y), np.clip(p, 1e-4, 1 - 1e-4)
+def _compute_scores(p: Array, y: Array) -> dict[str, float]:
+    reliability, sure = measure_calibration(p, y), np.clip(p, 1e-4, 1 - 1e-4)
     accuracy = float(((p > 0.5) == y).mean())
     scores = {"error": reliability.error, "by_chance": reliability.by_chance, "count": float(len(p)), "accuracy": accuracy}
     if reliability.above is not None:
@@ -167,9 +169,9 @@ def _scores(p: Array, y: Array) -> dict[str, float]:
     return scores
 
 
-def judge(settings: MatchBelief, file: Path, say: Say) -> dict[str, Any]:
-    """Scores of weights on pairs of buildings that trained nothing."""
+def judge(settings: MatchBelief, file: Path, log_line: LogFn) -> dict[str, Any]:
+    """Return scores of weights on pairs of buildings that trained nothing."""
     weights = json.loads(file.read_text(encoding="utf-8"))
-    rows = match_rows(settings.heldout, settings, say)
-    guesses = {m: [_probability(r.features[m], np.array(weights[m])) for r in rows] for m in BELIEVED_METHODS}
-    return belief_scores(rows, guesses)
+    rows = build_match_rows(settings.heldout, settings, log_line)
+    guesses = {m: [_predict_probability(r.features[m], np.array(weights[m])) for r in rows] for m in BELIEVED_METHODS}
+    return score_beliefs(rows, guesses)

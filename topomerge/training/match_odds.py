@@ -14,18 +14,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
-from topomerge.datasets.core.derived import derive, read_derived
+from topomerge.datasets.core.builder import derive, read_derived
 from topomerge.datasets.pairs.build import Build, build
 from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, load_evaluation_pair
-from topomerge.datasets.pairs.recipe import Recipe
+from topomerge.datasets.pairs.items import Recipe
 from topomerge.errors import InputError
-from topomerge.fusion.fuse import rooms_in_common
+from topomerge.fusion.fuse import match_common_rooms
+from topomerge.matching.consistency import HYPOTHESIS, MATCH, ODDS_LENGTHS, compute_hypothesis_features, compute_match_features
 from topomerge.matching.match import match
-from topomerge.matching.odds import HYPOTHESIS, MATCH, ODDS_LENGTHS, hypothesis_features, match_features
-from topomerge.training.closed_form import Fitted, calibration_error, run_fit
-from topomerge.training.loop import Say
-from topomerge.training.shared_settings import TaskSettings
-from topomerge.training.splits import name_building
+from topomerge.training.closed_form import FitResult, compute_calibration_error, run_fit
+from topomerge.training.loop import LogFn
+from topomerge.training.packed_pairs import name_building
+from topomerge.training.settings import TaskSettings
 from topomerge.training.task_settings import MatchOdds
 from topomerge.types import Array, Sim3
 
@@ -33,7 +33,7 @@ RIGHT_POSE = (0.5, np.radians(5))  # m in the middle of what both maps saw, rad
 STRANGER = 7  # pairs further on is a map of another building, mostly
 
 
-class Evidence(NamedTuple):
+class MatchEvidence(NamedTuple):
     """Of a pair of maps: its building, features of its hypotheses (H, 4) and which are right; of the pairs of rooms that meet
     (M, 5) which are one."""
 
@@ -44,49 +44,49 @@ class Evidence(NamedTuple):
     one: Array
 
 
-def map_pairs(recipe: Recipe, settings: TaskSettings, say: Say) -> list[Path]:
-    """Files of the pairs of a set, made where they are missing, their maps beside them.
+def build_map_pairs(recipe: Recipe, settings: TaskSettings, log_line: LogFn) -> list[Path]:
+    """Build files of the pairs of a set, made where they are missing, their maps beside them.
 
     Raises:
         InputError: their maps are not kept, or no pair could be made.
     """
     if not recipe.maps:
         raise InputError(f"{recipe.name}: its maps are not kept; set data.maps=true")
-    manifest = build(Build(recipe, settings.cache, settings.jobs, settings.cluster, list(settings.part)), say).manifest
+    manifest = build(Build(recipe, settings.cache, settings.jobs, settings.cluster, list(settings.part)), log_line).manifest
     rows = [json.loads(line) for line in manifest.read_text(encoding="utf-8").splitlines()]
     if not rows:
         raise InputError(f"{recipe.name}: no pair could be made; see the reasons above")
     return [manifest.parent / "pairs" / row["file"] for row in rows]
 
 
-def fit(settings: MatchOdds, say: Say) -> dict[str, float]:
+def fit(settings: MatchOdds, log_line: LogFn) -> dict[str, float]:
     """Fit both models; the scores of left-out buildings."""
-    return run_fit(settings, fit_odds, say)
+    return run_fit(settings, fit_odds, log_line)
 
 
-def fit_odds(settings: MatchOdds, say: Say) -> Fitted:
-    """Weights of both models from all pairs, and scores of those that were fitted without each building."""
-    evidence = pair_evidence(settings.data, settings, say)
+def fit_odds(settings: MatchOdds, log_line: LogFn) -> FitResult:
+    """Fit weights of both models from all pairs, and scores of those that were fitted without each building."""
+    evidence = build_pair_evidence(settings.data, settings, log_line)
     weights = {
         HYPOTHESIS: np.round(fit_hypotheses(evidence, settings.pull), 2).tolist(),
         MATCH: np.round(fit_rooms(evidence, settings.pull), 2).tolist(),
     }
     origin = {"set": settings.data.name, "split": settings.data.split, "pairs": len(evidence)}
-    return Fitted(weights, odds_scores(*left_out(evidence, settings)), origin)
+    return FitResult(weights, score_odds(*predict_left_out(evidence, settings)), origin)
 
 
-def pair_evidence(recipe: Recipe, settings: MatchOdds, say: Say) -> list[Evidence]:
-    """Of each pair, and of each map with one of another building, cached."""
-    paths = [path for path in map_pairs(recipe, settings, say) if _has_matches(load_evaluation_pair(path))]
+def build_pair_evidence(recipe: Recipe, settings: MatchOdds, log_line: LogFn) -> list[MatchEvidence]:
+    """Build the evidence of each pair, and of each map with one of another building, cached."""
+    paths = [path for path in build_map_pairs(recipe, settings, log_line) if _has_matches(load_evaluation_pair(path))]
     sources = [[path] for path in paths]
     sources += [[path, paths[(n + STRANGER) % len(paths)]] for n, path in enumerate(paths)]
-    files, _ = derive(f"{recipe.name}_odds", evidence_of, sources, settings, say=say)
+    files, _ = derive(f"{recipe.name}_odds", compute_evidence, sources, settings, log_line=log_line)
     if not files:
         raise InputError(f"{recipe.name}: no pair has rooms that match")
     evidence = []
     for file in files:
         a = read_derived(file)
-        evidence.append(Evidence(str(a["building"]), a["hypotheses"], a["right"], a["rooms"], a["one"]))
+        evidence.append(MatchEvidence(str(a["building"]), a["hypotheses"], a["right"], a["rooms"], a["one"]))
     return evidence
 
 
@@ -94,27 +94,27 @@ def _has_matches(pair: EvaluationPair) -> bool:
     return pair.transform is not None and len(pair.matches) > 0
 
 
-def evidence_of(path: Path, other: Path | None = None) -> dict[str, Array]:
-    """What hypotheses and rooms of a pair show; with `other` those of its first map and of the second one of another pair."""
+def compute_evidence(path: Path, other: Path | None = None) -> dict[str, Array]:
+    """Compute the evidence of a pair's hypotheses and rooms; with `other`, of its first and another pair's second map."""
     pair = load_evaluation_pair(path)
-    a, b = pair.maps()
+    a, b = pair.load_maps()
     if other is not None:
-        b = load_evaluation_pair(other).maps()[1]
+        b = load_evaluation_pair(other).load_maps()[1]
     hypotheses = match(a, b).alternatives
     right = [other is None and is_right(pair, h.transform) for h in hypotheses]
     evidence = np.array([list(h.features.values()) for h in hypotheses]).reshape(-1, 3)
     rooms, one = np.zeros((0, ODDS_LENGTHS[MATCH])), np.zeros(0, bool)
     if other is None and pair.transform is not None:
-        meet, overlap = rooms_in_common(a, b, pair.transform)
-        rooms = match_features(a, b, meet, overlap)
+        meet, overlap = match_common_rooms(a, b, pair.transform)
+        rooms = compute_match_features(a, b, meet, overlap)
         one = (pair.true[0][meet[:, 0]] == pair.true[1][meet[:, 1]]) & (pair.true[0][meet[:, 0]] >= 0)
-    features = hypothesis_features(evidence)
+    features = compute_hypothesis_features(evidence)
     building = np.array(name_building(pair.about))
     return {"building": building, "hypotheses": features, "right": np.array(right, bool), "rooms": rooms, "one": one}
 
 
 def is_right(pair: EvaluationPair, pose: Sim3) -> bool:
-    """As merges are judged."""
+    """Return whether a hypothesis is right, as for merges."""
     truth = pair.transform
     assert truth is not None
     off = np.linalg.norm((pose.apply(pair.anchor[None]) - truth.apply(pair.anchor[None]))[0])
@@ -122,8 +122,8 @@ def is_right(pair: EvaluationPair, pose: Sim3) -> bool:
     return bool(off < RIGHT_POSE[0] and abs(turn) < RIGHT_POSE[1])
 
 
-def fit_hypotheses(evidence: Sequence[Evidence], pull: float) -> Array:
-    """(4,) weights of the most likely softmax."""
+def fit_hypotheses(evidence: Sequence[MatchEvidence], pull: float) -> Array:
+    """Fit (4,) weights of the most likely softmax."""
 
     def loss(w: Array) -> float:
         total = pull * float(w[1:] @ w[1:])
@@ -137,8 +137,8 @@ def fit_hypotheses(evidence: Sequence[Evidence], pull: float) -> Array:
     return weights
 
 
-def fit_rooms(evidence: Sequence[Evidence], pull: float) -> Array:
-    """(5,) weights of the logistic model."""
+def fit_rooms(evidence: Sequence[MatchEvidence], pull: float) -> Array:
+    """Fit (5,) weights of the logistic model."""
     x, y = np.concatenate([e.rooms for e in evidence]), np.concatenate([e.one for e in evidence])
 
     def loss(w: Array) -> float:
@@ -148,7 +148,7 @@ def fit_rooms(evidence: Sequence[Evidence], pull: float) -> Array:
     return weights
 
 
-def left_out(evidence: Sequence[Evidence], settings: MatchOdds) -> tuple[Array, Array]:
+def predict_left_out(evidence: Sequence[MatchEvidence], settings: MatchOdds) -> tuple[Array, Array]:
     """`probabilities` of each building by models that were fitted without it."""
     names = sorted({e.building for e in evidence})
     fold = np.random.default_rng(0).permutation(len(names)) % settings.folds
@@ -158,14 +158,14 @@ def left_out(evidence: Sequence[Evidence], settings: MatchOdds) -> tuple[Array, 
         rest = [e for e in evidence if e.building not in test]
         if test and rest:
             weights = fit_hypotheses(rest, settings.pull), fit_rooms(rest, settings.pull)
-            parts.append(probabilities([e for e in evidence if e.building in test], *weights))
+            parts.append(predict_probabilities([e for e in evidence if e.building in test], *weights))
     if not parts:
         raise InputError("data.pairs: pairs of two buildings are needed")
     return np.concatenate([first for first, _ in parts]), np.concatenate([rooms for _, rooms in parts])
 
 
-def probabilities(evidence: Sequence[Evidence], hypothesis: Array, match: Array) -> tuple[Array, Array]:
-    """(n, 2) probability and whether it is so: of the likeliest hypothesis of each pair, and of rooms that meet."""
+def predict_probabilities(evidence: Sequence[MatchEvidence], hypothesis: Array, match: Array) -> tuple[Array, Array]:
+    """Predict (n, 2) probability and whether it is so: of the likeliest hypothesis of each pair, and of rooms that meet."""
     first: list[tuple[float, bool]] = []
     rooms: list[tuple[float, bool]] = []
     for e in evidence:
@@ -176,21 +176,21 @@ def probabilities(evidence: Sequence[Evidence], hypothesis: Array, match: Array)
     return np.array(first, float).reshape(-1, 2), np.array(rooms, float).reshape(-1, 2)
 
 
-def odds_scores(hypotheses: Array, rooms: Array) -> dict[str, float]:
-    """Calibration error, log loss and share that is right of both models' probabilities."""
+def score_odds(hypotheses: Array, rooms: Array) -> dict[str, float]:
+    """Compute calibration error, log loss and share that is right of both models' probabilities."""
     scores: dict[str, float] = {}
     for name, pairs in ((HYPOTHESIS, hypotheses), (MATCH, rooms)):
         if len(pairs):
             p, y = np.clip(pairs[:, 0], 1e-6, 1 - 1e-6), pairs[:, 1] > 0
-            scores[f"{name}_calibration_error"] = calibration_error(p, y)
+            scores[f"{name}_calibration_error"] = compute_calibration_error(p, y)
             scores[f"{name}_log_loss"] = float(-np.mean(np.log(np.where(y, p, 1 - p))))
             scores[f"{name}_accuracy"] = float(((p > 0.5) == y).mean())
             scores[f"{name}_count"] = float(len(pairs))
     return scores
 
 
-def judge(settings: MatchOdds, file: Path, say: Say) -> dict[str, Any]:
-    """Scores of weights on pairs of buildings that trained nothing."""
+def judge(settings: MatchOdds, file: Path, log_line: LogFn) -> dict[str, Any]:
+    """Return scores of weights on pairs of buildings that trained nothing."""
     weights = json.loads(file.read_text(encoding="utf-8"))
-    evidence = pair_evidence(settings.heldout, settings, say)
-    return odds_scores(*probabilities(evidence, np.array(weights[HYPOTHESIS]), np.array(weights[MATCH])))
+    evidence = build_pair_evidence(settings.heldout, settings, log_line)
+    return score_odds(*predict_probabilities(evidence, np.array(weights[HYPOTHESIS]), np.array(weights[MATCH])))

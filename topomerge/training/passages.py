@@ -18,12 +18,12 @@ from scipy.optimize import minimize
 from topomerge.datasets.pairs.passage_examples import PassageExamples, build_passages, load_passages
 from topomerge.datasets.pairs.plan_examples import PlanRecipe
 from topomerge.errors import InputError
-from topomerge.extraction.passages import KINDS, SCORE_INPUTS, compute_inputs
+from topomerge.extraction.extract import KINDS, SCORE_INPUTS, compute_inputs
 from topomerge.numpy_nn import sigmoid
-from topomerge.training.closed_form import Fitted, calibration_error, run_fit
-from topomerge.training.loop import Say
+from topomerge.training.closed_form import FitResult, compute_calibration_error, run_fit
+from topomerge.training.loop import LogFn
+from topomerge.training.packed_pairs import number_buildings, read_scan_building
 from topomerge.training.scan_settings import Passages
-from topomerge.training.splits import number_buildings, read_scan_building
 from topomerge.types import Array
 
 # Weights are pulled to the plan alone, but for doorways that split a segment, of which scans show few (docs/adr/0018).
@@ -31,14 +31,14 @@ PRIOR = np.array([{"plan": 1.0, "within": 6.0}.get(name, 0.0) for name in SCORE_
 STIFF = np.array([1.0 if name == "constant" else 4.0 for name in SCORE_INPUTS])  # of each pull
 
 
-def fit(settings: Passages, say: Say) -> dict[str, float]:
+def fit(settings: Passages, log_line: LogFn) -> dict[str, float]:
     """Fit the models; the scores of left-out scans."""
-    return run_fit(settings, fit_passages, say)
+    return run_fit(settings, fit_passages, log_line)
 
 
-def fit_passages(settings: Passages, say: Say) -> Fitted:
+def fit_passages(settings: Passages, log_line: LogFn) -> FitResult:
     """Weights of the models from all scans, and scores of those that were fitted without each building."""
-    scans = read_scans(settings.data, settings, say)
+    scans = read_scans(settings.data, settings, log_line)
     fold = number_buildings([scan.building for scan in scans]) % settings.folds
     parts = [[scan for scan, at in zip(scans, fold, strict=True) if at == k] for k in range(settings.folds)]
     left_out = []
@@ -46,16 +46,16 @@ def fit_passages(settings: Passages, say: Say) -> Fitted:
         weights = fit_models([scan for j, other in enumerate(parts) if j != k for scan in other], settings.pull)
         left_out += [score(scan, weights) for scan in part]
     origin = {"set": settings.data.name, "split": settings.data.split, "scans": len(scans)}
-    return Fitted(fit_models(scans, settings.pull), compute_figures(left_out), origin)
+    return FitResult(fit_models(scans, settings.pull), compute_figures(left_out), origin)
 
 
-def read_scans(recipe: PlanRecipe, settings: Passages, say: Say) -> list[PassageExamples]:
+def read_scans(recipe: PlanRecipe, settings: Passages, log_line: LogFn) -> list[PassageExamples]:
     """The passages of each scan of a set that shows any.
 
     Raises:
         InputError: too few scans.
     """
-    paths = build_passages(recipe, settings, say)
+    paths = build_passages(recipe, settings, log_line)
     scans = [replace(load_passages(path), building=read_scan_building(path)) for path in paths]
     scans = [scan for scan in scans if scan.kind and len(scan.parted)]
     if len(scans) < settings.folds:
@@ -98,14 +98,14 @@ def compute_figures(scans: Sequence[tuple[Array, Array, Array]]) -> dict[str, fl
     return {
         "log_loss": float(loss["all"]),
         "log_loss_of_plan": float(loss["plan"]),
-        "calibration_error": calibration_error(p, y),
+        "calibration_error": compute_calibration_error(p, y),
         "accuracy": float(((p > 0.5) == y).mean()),
         "accuracy_of_plan": float(((plan > 0.5) == y).mean()),
         "passages": float(len(y)),
     }
 
 
-def judge(settings: Passages, file: Path, say: Say) -> dict[str, Any]:
+def judge(settings: Passages, file: Path, log_line: LogFn) -> dict[str, Any]:
     """Scores of weights on scans of buildings that trained nothing."""
     weights = json.loads(file.read_text(encoding="utf-8"))
-    return compute_figures([score(scan, weights) for scan in read_scans(settings.heldout, settings, say)])
+    return compute_figures([score(scan, weights) for scan in read_scans(settings.heldout, settings, log_line)])

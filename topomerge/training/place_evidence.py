@@ -17,16 +17,21 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from topomerge.datasets.core.derived import read_derived
+from topomerge.datasets.core.builder import read_derived
 from topomerge.datasets.pairs.lookalikes import build_lookalikes
 from topomerge.errors import InputError
+from topomerge.models.convolutional import PlaceLogOdds, PlaceNetwork
 from topomerge.models.export import build_sample
-from topomerge.models.place_network import PlaceLogOdds, PlaceNetwork
-from topomerge.registration.evidence.network import PLACE_SIGNATURE, UPPER_PLANES, network_log_odds, planes, read_weights
-from topomerge.training.belief_hypotheses import fair, half_of, hypothesis_files, judged_files
-from topomerge.training.loop import Say, State, mixed
-from topomerge.training.networks import Exported, ExportedJob, run_network
-from topomerge.training.splits import name_building
+from topomerge.registration.evidence.places import (
+    PLACE_SIGNATURE,
+    UPPER_PLANES,
+    compute_network_log_odds,
+    compute_planes,
+    read_weights,
+)
+from topomerge.training.belief_hypotheses import assign_half, build_hypothesis_files, derive_hypothesis_files, is_distinguishable
+from topomerge.training.loop import Exported, ExportedJob, LogFn, State, derive_seed, run_network
+from topomerge.training.packed_pairs import name_building
 from topomerge.training.task_settings import PlaceAugment, PlaceEvidence
 from topomerge.types import Array
 
@@ -52,7 +57,7 @@ class Places:
     buildings: Sequence[str]
 
 
-def gathered(paths: Sequence[Path], half: int = 0) -> Places:
+def collect_places(paths: Sequence[Path], half: int = 0) -> Places:
     """The squares of the hypotheses of pairs (`belief_hypotheses`) that are right or wrong; none of those that are neither, and
     none of pairs that nobody can tell apart.
 
@@ -63,7 +68,11 @@ def gathered(paths: Sequence[Path], half: int = 0) -> Places:
     for path in paths:
         data = read_derived(path)
         row = json.loads(data["row"].tobytes())
-        if row.get("tellable") is False or ("lookalike" not in row and not fair(row)) or half == 2 - half_of(row):
+        if (
+            row.get("tellable") is False
+            or ("lookalike" not in row and not is_distinguishable(row))
+            or half == 2 - assign_half(row)
+        ):
             continue
         name = name_building(row)
         names.append(name)
@@ -72,7 +81,7 @@ def gathered(paths: Sequence[Path], half: int = 0) -> Places:
         if not len(pick):
             continue
         owner = data["owner"][pick]
-        seen.append(planes(data["parts"][pick], data["ceiling"][pick], data["looked"][pick]).astype(np.float16))
+        seen.append(compute_planes(data["parts"][pick], data["ceiling"][pick], data["looked"][pick]).astype(np.float16))
         right.append(label[pick] == 1)
         weight.append(np.bincount(owner)[owner] ** -0.5)
         building.append(np.full(len(pick), names.index(name)))
@@ -80,11 +89,11 @@ def gathered(paths: Sequence[Path], half: int = 0) -> Places:
     if not right:
         raise InputError("data.sets: no pair has a hypothesis that shows a place in both maps")
     is_right = np.concatenate(right)
-    weights = balanced(np.concatenate(weight), is_right, np.concatenate(sensors))
+    weights = balance_weights(np.concatenate(weight), is_right, np.concatenate(sensors))
     return Places(np.concatenate(seen), is_right, weights, np.concatenate(building), names)
 
 
-def balanced(weight: Array, right: Array, group: Array) -> Array:
+def balance_weights(weight: Array, right: Array, group: Array) -> Array:
     """(n,) weights with which right and wrong ones of each group weigh alike; a group of one side only weighs nothing, and others
     as much as the root of the weight of their smaller side."""
     _, owner = np.unique(group, return_inverse=True)
@@ -95,8 +104,8 @@ def balanced(weight: Array, right: Array, group: Array) -> Array:
     return out
 
 
-def some(places: Places, pick: Array) -> Places:
-    """Those of an index."""
+def select_places(places: Places, pick: Array) -> Places:
+    """Select places by index."""
     return Places(places.planes[pick], places.right[pick], places.weight[pick], places.building[pick], places.buildings)
 
 
@@ -110,25 +119,25 @@ class PlaceJob(ExportedJob):
         self.options, self.learned, self.watched = settings, learned, watched
         self.chance = learned.weight / learned.weight.sum()
 
-    def batches(self, state: State) -> Generator[tuple[torch.Tensor, ...], None, None]:
-        """Squares, from a generator of each step."""
+    def iter_batches(self, state: State) -> Generator[tuple[torch.Tensor, ...], None, None]:
+        """Yield squares, from a generator of each step."""
         self.network.train()
         options, learned = self.options, self.learned
         for step in range(state.step, options.steps):
             rng = np.random.default_rng([options.seed, 1, state.epoch, step])
             rows = rng.choice(len(self.chance), options.batch, p=self.chance)
-            x = augmented(learned.planes[rows].astype(np.float32), options.augment, rng)
+            x = augment_planes(learned.planes[rows].astype(np.float32), options.augment, rng)
             right = torch.from_numpy(learned.right[rows].astype(np.float32))
             yield torch.from_numpy(x).permute(0, 3, 1, 2), right
 
-    def step(self, batch: tuple[torch.Tensor, ...], state: State) -> dict[str, float]:
-        """One step of the optimizer."""
-        options, (x, right) = self.options, self.there(batch)
+    def train_step(self, batch: tuple[torch.Tensor, ...], state: State) -> dict[str, float]:
+        """Take one step of the optimizer."""
+        options, (x, right) = self.options, self.move_to_device(batch)
         loss = functional.binary_cross_entropy_with_logits(self.network(x), right)
-        return self.descend(loss, options, state)
+        return self.optimize(loss, options, state)
 
-    def size(self, batch: tuple[torch.Tensor, ...]) -> int:
-        """Squares."""
+    def count_items(self, batch: tuple[torch.Tensor, ...]) -> int:
+        """Count the squares of a batch."""
         return len(batch[0])
 
     def exported(self) -> Exported:
@@ -136,13 +145,13 @@ class PlaceJob(ExportedJob):
         assert isinstance(self.network, PlaceNetwork)
         return Exported(PlaceLogOdds(self.network), PLACE_SIGNATURE, build_sample(PLACE_SIGNATURE))
 
-    def scores(self) -> dict[str, float]:
-        """Of the buildings that are watched."""
-        return place_scores(network_log_odds(self.watched.planes, self.run()), self.watched.right, self.watched.weight)
+    def compute_scores(self) -> dict[str, float]:
+        """Compute the scores of the validation buildings."""
+        return score_places(compute_network_log_odds(self.watched.planes, self.run()), self.watched.right, self.watched.weight)
 
 
-def augmented(x: Array, augment: PlaceAugment, rng: np.random.Generator) -> Array:
-    """Planes (n, side, side, PLANES) turned by quarters and mirrored, and some without what is above a body."""
+def augment_planes(x: Array, augment: PlaceAugment, rng: np.random.Generator) -> Array:
+    """Return planes (n, side, side, PLANES) turned by quarters and mirrored, and some without what is above a body."""
     x = np.rot90(x, int(rng.integers(4)), axes=(1, 2))
     x = np.array(x[:, ::-1] if rng.random() < 0.5 else x)
     blind = rng.random(len(x)) < augment.upper
@@ -152,8 +161,8 @@ def augmented(x: Array, augment: PlaceAugment, rng: np.random.Generator) -> Arra
     return np.asarray(x * noise, np.float32)
 
 
-def place_scores(odds: Array, right: Array, weight: Array) -> dict[str, float]:
-    """Area under the ROC curve and log loss of both sides alike, of weighted places."""
+def score_places(odds: Array, right: Array, weight: Array) -> dict[str, float]:
+    """Compute the area under the ROC curve and log loss of both sides alike, of weighted places."""
     w = weight.astype(float)
     for side in (True, False):
         w[right == side] /= max(2 * w[right == side].sum(), 1e-9)
@@ -163,20 +172,20 @@ def place_scores(odds: Array, right: Array, weight: Array) -> dict[str, float]:
     return {"auc": auc, "log_loss": float((w * np.logaddexp(0, np.where(right, -odds, odds))).sum())}
 
 
-def fit(settings: PlaceEvidence, say: Say) -> dict[str, float]:
+def fit(settings: PlaceEvidence, log_line: LogFn) -> dict[str, float]:
     """Train; the scores of the best epoch.
 
     Raises:
         InputError: too few buildings to train on some and watch others.
     """
-    paths = hypothesis_files(settings.data, settings, say)
+    paths = build_hypothesis_files(settings.data, settings, log_line)
     if settings.lookalikes:
-        alike, _ = build_lookalikes(settings.alike, settings, say)
-        paths += judged_files(settings.alike.name, [[path] for path in alike], settings, say)
-    return train(settings, gathered(paths, settings.half), say)
+        alike, _ = build_lookalikes(settings.alike, settings, log_line)
+        paths += derive_hypothesis_files(settings.alike.name, [[path] for path in alike], settings, log_line)
+    return train(settings, collect_places(paths, settings.half), log_line)
 
 
-def train(settings: PlaceEvidence, places: Places, say: Say) -> dict[str, float]:
+def train(settings: PlaceEvidence, places: Places, log_line: LogFn) -> dict[str, float]:
     """Train on places; the scores of the best epoch.
 
     Raises:
@@ -186,15 +195,15 @@ def train(settings: PlaceEvidence, places: Places, say: Say) -> dict[str, float]
     watches = order[places.building] % settings.hold_out == 0
     if not watches.any() or watches.all():
         raise InputError("data.sets: too few pairs: buildings to train on and others to watch are needed")
-    torch.manual_seed(mixed(settings.seed))
-    learned, watched = some(places, np.flatnonzero(~watches)), some(places, np.flatnonzero(watches))
+    torch.manual_seed(derive_seed(settings.seed))
+    learned, watched = select_places(places, np.flatnonzero(~watches)), select_places(places, np.flatnonzero(watches))
     job = PlaceJob(settings, learned, watched)
-    say(f"{len(learned.right)} places, {sum(p.numel() for p in job.network.parameters())} weights")
-    return run_network(job, settings, settings.steps, say)
+    log_line(f"{len(learned.right)} places, {sum(p.numel() for p in job.network.parameters())} weights")
+    return run_network(job, settings, settings.steps, log_line)
 
 
-def judge(settings: PlaceEvidence, file: Path, say: Say) -> dict[str, Any]:
-    """Scores of weights on places of buildings that trained nothing."""
-    places = gathered(hypothesis_files(settings.heldout, settings, say))
-    scores = place_scores(network_log_odds(places.planes, read_weights(file)), places.right, places.weight)
+def judge(settings: PlaceEvidence, file: Path, log_line: LogFn) -> dict[str, Any]:
+    """Return scores of weights on places of buildings that trained nothing."""
+    places = collect_places(build_hypothesis_files(settings.heldout, settings, log_line))
+    scores = score_places(compute_network_log_odds(places.planes, read_weights(file)), places.right, places.weight)
     return {**scores, "places": len(places.right)}

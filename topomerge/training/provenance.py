@@ -23,8 +23,8 @@ from typing import Any
 from topomerge.code_digest import read_commit
 from topomerge.config import read_command
 from topomerge.errors import InputError
-from topomerge.io.atomic import replacing
-from topomerge.io.listing import plain
+from topomerge.io.archive import replace_on_success
+from topomerge.io.listing import convert_to_plain
 
 RUN_FILE, CONFIG_FILE, RUN_FORMAT = "run.json", "config.json", 1
 PACKAGES = ("torch", "torch-geometric", "numpy", "topomerge")
@@ -38,7 +38,7 @@ MISSING = object()
 def compare_settings(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, list[Any]]:
     """Return the keys that differ, such as ``loss.kind``, with both values. A key that one of both lacks counts for nothing: it
     is of another version."""
-    first, second = _flatten(before), _flatten(json.loads(json.dumps(plain(dict(now)))))
+    first, second = _flatten(before), _flatten(json.loads(json.dumps(convert_to_plain(dict(now)))))
     return {key: [first[key], second[key]] for key in first if second.get(key, first[key]) != first[key]}
 
 
@@ -110,8 +110,8 @@ def record_start(folder: Path, settings: Mapping[str, Any], data: Mapping[str, A
         "changed": {key: values for key, values in changes.items() if key not in UNTOLD},
     }
     record = {"format": RUN_FORMAT, "data": earlier.get("data") or dict(data), "starts": [*earlier.get("starts", []), start]}
-    with replacing(folder / RUN_FILE) as beside:
-        beside.write_text(json.dumps(plain(record), indent=1) + "\n", encoding="utf-8")
+    with replace_on_success(folder / RUN_FILE) as beside:
+        beside.write_text(json.dumps(convert_to_plain(record), indent=1) + "\n", encoding="utf-8")
 
 
 def _version(package: str) -> str:

@@ -18,24 +18,22 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from topomerge.embedding.turns import QUARTERS, TurnedRows, along_walls, room_facts
-from topomerge.embedding.weights import read_embedder_card
+from topomerge.embedding.learned import read_embedder_card
+from topomerge.embedding.quarter_turns import QUARTERS, TurnedRows, compute_room_features, rotate_to_walls
 from topomerge.errors import InputError
-from topomerge.matching.room_matcher import Matcher, RoomsSeen, build_signature, every_turn, read_matcher, rooms_seen
-from topomerge.matching.scores import assign_certain, has_twin, pair_counts, partner_ranks
+from topomerge.matching.assignment import assign_certain, count_pairs, has_twin, rank_partners
+from topomerge.matching.room_matcher import Matcher, RoomsSeen, build_rooms_seen, build_signature, match_every_turn, read_matcher
 from topomerge.models.embedder import Embedder
 from topomerge.models.export import build_sample
 from topomerge.models.losses import NEVER_LOGIT
 from topomerge.models.room_matcher import Partners, RoomMatcher, build_stages
 from topomerge.models.weights import read_embedder
-from topomerge.training.batches import changed
-from topomerge.training.loop import Say, State, mixed
-from topomerge.training.networks import Exported, ExportedJob, run_network
-from topomerge.training.packed import Graph, GraphPair, load_pairs
+from topomerge.training.batches import add_views, augment_graph, augment_sheet, compute_quarter_turns, mirror_graph
+from topomerge.training.loop import Exported, ExportedJob, LogFn, State, derive_seed, run_network
+from topomerge.training.packed_pairs import Graph, GraphPair, load_pairs
 from topomerge.training.settings import Augment
 from topomerge.training.task_settings import RoomMatching
-from topomerge.training.turned_views import changed_sheet, mirrored, quarters_between, with_views
-from topomerge.training.validate import LEAST_CERTAINTIES, SIZE_COLUMNS, scores
+from topomerge.training.validate import LEAST_CERTAINTIES, SIZE_COLUMNS, score_matches
 from topomerge.types import Array
 
 WRONG_TURNS = (1, 2, 2, 3)  # quarter turns off the true one: half a turn is the one that is mistaken most
@@ -43,7 +41,7 @@ MIRROR = np.array([1.0, -1.0])
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class MatcherView:
     """A map as the network sees it.
 
     Args:
@@ -54,13 +52,13 @@ class View:
     rows: TurnedRows
     present: Array
 
-    def seen(self, quarters: int) -> RoomsSeen:
-        """Turned by so many quarter turns."""
-        return rooms_seen(self.rows, quarters)
+    def compute_rooms_seen(self, quarters: int) -> RoomsSeen:
+        """Compute the rooms turned by so many quarter turns."""
+        return build_rooms_seen(self.rows, quarters)
 
 
 @dataclass(frozen=True, eq=False)
-class Example:
+class MatcherExample:
     """Two maps of a building, each in several views: the odd ones are mirrored, the first one is as it is.
 
     Args:
@@ -68,49 +66,51 @@ class Example:
         quarters: by which b is to be turned to stand as a; None where no transform is true.
     """
 
-    a: Sequence[View]
-    b: Sequence[View]
+    a: Sequence[MatcherView]
+    b: Sequence[MatcherView]
     pair: GraphPair
     quarters: int | None
 
-    def links(self, view_a: View, view_b: View) -> Tensor:
-        """(R_a, R_b) bool, which rooms of two views are one."""
+    def compute_links(self, view_a: MatcherView, view_b: MatcherView) -> Tensor:
+        """Compute (R_a, R_b) bool, whether rooms of two views are one."""
         out = torch.zeros((len(self.pair.true[0]), len(self.pair.true[1])), dtype=torch.bool)
         if self.quarters is not None:
             out[self.pair.matches[:, 0], self.pair.matches[:, 1]] = True
         return out[view_a.present][:, view_b.present]
 
 
-def examples(pairs: Sequence[GraphPair], network: Embedder, number: int, say: Say = lambda text: None) -> list[Example]:
-    """Pairs with so many changed views of each of their maps beside the first one; a map of several pairs is seen once."""
-    made: dict[tuple[str, str], list[View]] = {}
+def build_examples(
+    pairs: Sequence[GraphPair], network: Embedder, number: int, log_line: LogFn = lambda text: None
+) -> list[MatcherExample]:
+    """Build pairs with so many changed views of each of their maps beside the first one; a map of several pairs is seen once."""
+    made: dict[tuple[str, str], list[MatcherView]] = {}
     out = []
     for pair in pairs:
         sides = [(str(pair.about["file"]), side) for side in pair.about["sides"]]
         for key, graph in zip(sides, (pair.a, pair.b), strict=True):
             if key not in made:
-                made[key] = [view(graph, network, k, mixed(len(made), k)) for k in range(number + 1)]
+                made[key] = [build_view(graph, network, k, derive_seed(len(made), k)) for k in range(number + 1)]
                 if not len(made) % 100:
-                    say(f"{len(made)} maps seen")
-        out.append(Example(made[sides[0]], made[sides[1]], pair, quarters_between(pair)))
+                    log_line(f"{len(made)} maps seen")
+        out.append(MatcherExample(made[sides[0]], made[sides[1]], pair, compute_quarter_turns(pair)))
     return out
 
 
 @torch.no_grad()
-def view(graph: Graph, network: Embedder, number: int, seed: int) -> View:
-    """A map as it is (0), or changed; mirrored where the number is odd."""
+def build_view(graph: Graph, network: Embedder, number: int, seed: int) -> MatcherView:
+    """Build a map as it is (0), or changed; mirrored where the number is odd."""
     generator, augment = torch.Generator().manual_seed(seed), Augment()
-    places = along_walls({name: graph[name].numpy() for name in ("pos", "turn")})
-    seen = with_views(changed_sheet(graph, augment, generator) if number else graph, network.tensors)
+    places = rotate_to_walls({name: graph[name].numpy() for name in ("pos", "turn")})
+    seen = add_views(augment_sheet(graph, augment, generator) if number else graph, network.tensors)
     if number % 2:
-        seen, places = mirrored(seen), places * MIRROR
+        seen, places = mirror_graph(seen), places * MIRROR
     tensors, present = {name: seen[name] for name in {*network.tensors, "edge_index"}}, torch.arange(len(places))
     if number:
-        tensors, present = changed(tensors, len(places), augment, generator)
-    rows, dustbin = (part.numpy() for part in network.turned(tensors))
+        tensors, present = augment_graph(tensors, len(places), augment, generator)
+    rows, dustbin = (part.numpy() for part in network.embed_rotations(tensors))
     chosen = present.numpy()
-    facts = room_facts(graph["x"].numpy()[chosen], dustbin, graph["pos"].numpy()[chosen, 2])
-    return View(TurnedRows(rows.astype(np.float32), places[chosen], "", facts), chosen)
+    facts = compute_room_features(graph["x"].numpy()[chosen], dustbin, graph["pos"].numpy()[chosen, 2])
+    return MatcherView(TurnedRows(rows.astype(np.float32), places[chosen], "", facts), chosen)
 
 
 class MatcherJob(ExportedJob):
@@ -120,7 +120,9 @@ class MatcherJob(ExportedJob):
         embedder: hash of the embedder.
     """
 
-    def __init__(self, settings: RoomMatching, learned: Sequence[Example], watched: Sequence[Example], embedder: str) -> None:
+    def __init__(
+        self, settings: RoomMatching, learned: Sequence[MatcherExample], watched: Sequence[MatcherExample], embedder: str
+    ) -> None:
         origin = {
             "set": settings.data.name,
             "split": settings.data.split,
@@ -131,42 +133,42 @@ class MatcherJob(ExportedJob):
         rows = int(np.prod(learned[0].a[0].rows.shape[1:]))
         network = RoomMatcher(rows, settings.width, settings.layers, settings.dropout)
         network.leave_out(settings.without)
-        network.fit_facts(np.concatenate([side[0].rows.facts for example in learned for side in (example.a, example.b)]))
+        network.fit_features(np.concatenate([side[0].rows.facts for example in learned for side in (example.a, example.b)]))
         super().__init__(settings, network, origin)
         self.options, self.learned, self.watched, self.embedder = settings, learned, watched, embedder
 
-    def batches(self, state: State) -> Generator[list[tuple[Example, Array]], None, None]:
-        """Pairs in the order of an epoch, each with random numbers of its own."""
+    def iter_batches(self, state: State) -> Generator[list[tuple[MatcherExample, Array]], None, None]:
+        """Yield pairs in the order of an epoch, each with random numbers of its own."""
         self.network.train()
         options = self.options
         order = np.random.default_rng([options.seed, 1, state.epoch]).permutation(len(self.learned))
         order = np.resize(order, (options.steps, options.batch))
         for step, rows in enumerate(order[state.step :], state.step):
-            torch.manual_seed(mixed(options.seed, state.epoch, step))  # of the dropout
+            torch.manual_seed(derive_seed(options.seed, state.epoch, step))  # of the dropout
             draws = np.random.default_rng([options.seed, 2, state.epoch, step]).integers(0, 1 << 16, (len(rows), 4))
             yield [(self.learned[k], draw) for k, draw in zip(rows.tolist(), draws, strict=True)]
 
-    def step(self, batch: list[tuple[Example, Array]], state: State) -> dict[str, float]:
-        """One step of the optimizer."""
-        loss = torch.stack([self._loss(example, draw) for example, draw in batch]).mean()
-        return self.descend(loss, self.options, state)
+    def train_step(self, batch: list[tuple[MatcherExample, Array]], state: State) -> dict[str, float]:
+        """Take one step of the optimizer."""
+        loss = torch.stack([self._compute_loss(example, draw) for example, draw in batch]).mean()
+        return self.optimize(loss, self.options, state)
 
-    def _loss(self, example: Example, draw: Array) -> Tensor:
+    def _compute_loss(self, example: MatcherExample, draw: Array) -> Tensor:
         views = list(range(int(draw[0]) % 2, len(example.a), 2))  # all mirrored, or none
         of_a, of_b = example.a[views[draw[1] % len(views)]], example.b[views[draw[2] % len(views)]]
         true = 0 if example.quarters is None else -example.quarters if views[0] % 2 else example.quarters
         turn, wrong = int(draw[3]) % QUARTERS, WRONG_TURNS[int(draw[3]) // QUARTERS % len(WRONG_TURNS)]
-        a, links = of_a.seen(turn), example.links(of_a, of_b)
-        right = self.network(a, of_b.seen((turn + true) % QUARTERS))
-        other = self.network(a, of_b.seen((turn + true + wrong) % QUARTERS))
-        loss = deep_loss(right, links) + self.options.wrong_turn * deep_loss(other, torch.zeros_like(links))
+        a, links = of_a.compute_rooms_seen(turn), example.compute_links(of_a, of_b)
+        right = self.network(a, of_b.compute_rooms_seen((turn + true) % QUARTERS))
+        other = self.network(a, of_b.compute_rooms_seen((turn + true + wrong) % QUARTERS))
+        loss = compute_deep_loss(right, links) + self.options.wrong_turn * compute_deep_loss(other, torch.zeros_like(links))
         if links.any():
-            lead = sureness(right[-1]) - sureness(other[-1])
+            lead = compute_confidence(right[-1]) - compute_confidence(other[-1])
             loss = loss + self.options.turn * functional.softplus(-lead)
         return loss
 
-    def size(self, batch: list[tuple[Example, Array]]) -> int:
-        """Rooms."""
+    def count_items(self, batch: list[tuple[MatcherExample, Array]]) -> int:
+        """Count the rooms of a batch."""
         return sum(len(example.a[0].present) + len(example.b[0].present) for example, _ in batch)
 
     def exported(self) -> Exported:
@@ -175,13 +177,13 @@ class MatcherJob(ExportedJob):
         signature = build_signature(self.network.rows.in_features, self.options.width, self.options.layers + 1)
         return Exported(build_stages(self.network), signature, build_sample(signature))
 
-    def scores(self) -> dict[str, float]:
-        """Of the pairs that are watched."""
+    def compute_scores(self) -> dict[str, float]:
+        """Compute the scores of the validation pairs."""
         matcher = Matcher(self.run(), self.options.width, self.options.layers + 1, self.embedder)
-        return matcher_scores(self.watched, matcher)
+        return score_matcher(self.watched, matcher)
 
 
-def deep_loss(layers: Sequence[Partners], links: Tensor) -> Tensor:
+def compute_deep_loss(layers: Sequence[Partners], links: Tensor) -> Tensor:
     """-log(probability of a room's partners, or of having none), mean over the rooms of both maps; after the last layer and,
     with less weight, after each one before."""
     total = torch.zeros(())
@@ -193,54 +195,57 @@ def deep_loss(layers: Sequence[Partners], links: Tensor) -> Tensor:
     return total
 
 
-def sureness(partners: Partners) -> Tensor:
-    """How sure of itself a matching is: what the turn is chosen by (`RoomOdds.sureness`)."""
+def compute_confidence(partners: Partners) -> Tensor:
+    """Compute the confidence of a matching, by which the turn is chosen (`RoomOdds.confidence`)."""
     return (partners.rows[:, :-1] + partners.columns[:, :-1].T).exp().sum()
 
 
-def matcher_scores(watched: Sequence[Example], matcher: Matcher) -> dict[str, float]:
+def score_matcher(watched: Sequence[MatcherExample], matcher: Matcher) -> dict[str, float]:
     """Scores as of `training.validate`, and the share of pairs with rooms in common whose turn is right (`turn`)."""
     ranks, twins, turns, counts = [], [], [], np.zeros((len(LEAST_CERTAINTIES), 4), int)
     for example in watched:
         a, b, matches = example.a[0], example.b[0], example.pair.matches.numpy()
-        odds = max(every_turn(a.seen(0), [b.seen(k) for k in range(QUARTERS)], matcher), key=lambda turned: turned.sureness)
-        counts += [pair_counts(assign_certain(odds.certainty, least), matches) for least in LEAST_CERTAINTIES]
+        odds = max(
+            match_every_turn(a.compute_rooms_seen(0), [b.compute_rooms_seen(k) for k in range(QUARTERS)], matcher),
+            key=lambda turned: turned.confidence,
+        )
+        counts += [count_pairs(assign_certain(odds.certainty, least), matches) for least in LEAST_CERTAINTIES]
         if len(matches) and example.quarters is not None:
             turns.append(odds.quarters == example.quarters)
         for chance, truth, other in ((odds.rows, matches, example.pair.b), (odds.columns, matches[:, ::-1], example.pair.a)):
-            rooms, rank = partner_ranks(chance[:, :-1], truth)
+            rooms, rank = rank_partners(chance[:, :-1], truth)
             ranks.append(rank)
             twins.append(has_twin(other["x"][:, SIZE_COLUMNS].numpy(), truth, rooms))
     every = np.concatenate(ranks)
-    out = scores(every, np.concatenate(twins), np.ones(len(every), bool), counts)
+    out = score_matches(every, np.concatenate(twins), np.ones(len(every), bool), counts)
     return {k: v for k, v in out.items() if "clear" not in k} | {"turn": float(np.mean(turns)) if turns else 0.0}
 
 
-def fit(settings: RoomMatching, say: Say) -> dict[str, float]:
+def fit(settings: RoomMatching, log_line: LogFn) -> dict[str, float]:
     """Train, and leave a run's folder; the scores of the best epoch.
 
     Raises:
         InputError: no pairs, or the embedder that ships has no rows for turns.
     """
-    settings = with_own_sets(settings, say)
-    network, embedder = shipped_embedder()
-    learned = read_examples(settings, settings.data.name, network, settings.views, say)
-    watched = read_examples(settings, settings.validation, network, 0, say)
-    torch.manual_seed(mixed(settings.seed))
+    settings = with_own_sets(settings, log_line)
+    network, embedder = load_shipped_embedder()
+    learned = read_examples(settings, settings.data.name, network, settings.views, log_line)
+    watched = read_examples(settings, settings.validation, network, 0, log_line)
+    torch.manual_seed(derive_seed(settings.seed))
     job = MatcherJob(settings, learned, watched, embedder)
-    say(f"{len(learned)} pairs, {sum(p.numel() for p in job.network.parameters())} weights")
-    return run_network(job, settings, settings.steps, say)
+    log_line(f"{len(learned)} pairs, {sum(p.numel() for p in job.network.parameters())} weights")
+    return run_network(job, settings, settings.steps, log_line)
 
 
-def judge(settings: RoomMatching, file: Path, say: Say) -> dict[str, Any]:
-    """Scores of weights on pairs of buildings that trained nothing."""
-    settings = with_own_sets(settings, say)
-    network, _ = shipped_embedder()
-    watched = read_examples(settings, settings.heldout.name, network, 0, say)
-    return {**matcher_scores(watched, read_matcher(file)), "pairs": len(watched)}
+def judge(settings: RoomMatching, file: Path, log_line: LogFn) -> dict[str, Any]:
+    """Return scores of weights on pairs of buildings that trained nothing."""
+    settings = with_own_sets(settings, log_line)
+    network, _ = load_shipped_embedder()
+    watched = read_examples(settings, settings.heldout.name, network, 0, log_line)
+    return {**score_matcher(watched, read_matcher(file)), "pairs": len(watched)}
 
 
-def with_own_sets(settings: RoomMatching, say: Say) -> RoomMatching:
+def with_own_sets(settings: RoomMatching, log_line: LogFn) -> RoomMatching:
     """Name the sets of a folder of one's own captures, made where they are missing.
 
     Raises:
@@ -251,14 +256,14 @@ def with_own_sets(settings: RoomMatching, say: Say) -> RoomMatching:
     from topomerge.datasets.pairs.own_pairs import build_own_sets
     from topomerge.datasets.pairs.pairs_file import PARTS
 
-    manifests = build_own_sets(settings.path, settings.cache, settings.jobs, say).manifests
+    manifests = build_own_sets(settings.path, settings.cache, settings.jobs, log_line).manifests
     train, val, test = (str(manifests[part]) for part in PARTS)
     data, heldout = replace(settings.data, name=train), replace(settings.heldout, name=test)
     return replace(settings, data=data, heldout=heldout, validation=val)
 
 
-def shipped_embedder() -> tuple[Embedder, str]:
-    """The embedder that ships, and its hash.
+def load_shipped_embedder() -> tuple[Embedder, str]:
+    """Load the embedder that ships, and its hash.
 
     Raises:
         InputError: it has no rows for turns.
@@ -269,11 +274,13 @@ def shipped_embedder() -> tuple[Embedder, str]:
     return network, read_embedder_card().digest
 
 
-def read_examples(settings: RoomMatching, name: str, network: Embedder, number: int, say: Say) -> list[Example]:
-    """The pairs of a manifest, each map with so many changed views.
+def read_examples(settings: RoomMatching, name: str, network: Embedder, number: int, log_line: LogFn) -> list[MatcherExample]:
+    """Read the pairs of a manifest, each map with so many changed views.
 
     Raises:
         InputError: no such manifest, or a file is damaged.
     """
     manifest = Path(name) if name.endswith(".jsonl") else Path(settings.cache) / f"{name}.jsonl"
-    return examples(load_pairs(manifest, ["sheet"], say, around=network.network.node.around), network, number, say)
+    return build_examples(
+        load_pairs(manifest, ["sheet"], log_line, around=network.network.node.around), network, number, log_line
+    )

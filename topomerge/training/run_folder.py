@@ -1,25 +1,21 @@
-"""A run is a folder: its settings, what it reports, the best weights, the state to go on from; and what it exports.
-
-config.json, config.yaml     what was asked for
-run.json                     where it comes from: `training.provenance`
-metrics.jsonl, tb/           `training.log`
-best/                        files as the package has them, and their card
-last/                        `topomerge.checkpoint`, of networks
-"""
+"""A run is a folder: settings, metrics, best weights, state; and what a run logs."""
 
 from __future__ import annotations
 
 import json
 import shutil
+import time
 from collections.abc import Mapping
 from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import topomerge
 from topomerge.errors import InputError
-from topomerge.io.atomic import replacing
+from topomerge.io.archive import replace_on_success
 from topomerge.networks import network as networks
 from topomerge.training.provenance import RUN_FILE, describe_data, describe_provenance, record_start
 
@@ -51,7 +47,7 @@ def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
 
     texts = {"config.json": json.dumps(settings, indent=1) + "\n", "config.yaml": yaml.safe_dump(dict(settings), sort_keys=False)}
     for name, text in texts.items():
-        with replacing(folder / name) as beside:
+        with replace_on_success(folder / name) as beside:
             beside.write_text(text, encoding="utf-8")
 
 
@@ -103,8 +99,61 @@ def export_files(best: Path, target: str, package: str) -> list[Path]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for path in files:
-            with replacing(folder / path.name) as beside:
+            with replace_on_success(folder / path.name) as beside:
                 shutil.copyfile(path, beside)
     except OSError as error:
         raise InputError(f"export={target}: can't be written ({error.strerror or error})") from error
     return [folder / path.name for path in files]
+
+
+class MetricsLog:
+    """Metrics of a run.
+
+    Args:
+        folder: of the run.
+        tensorboard: write events, too.
+        epoch: rows of this and later epochs, of a run that goes on, are dropped.
+    """
+
+    def __init__(self, folder: Path, tensorboard: bool, epoch: int = 0) -> None:
+        self.path, self.rows = folder / "metrics.jsonl", list[dict[str, Any]]()
+        if epoch and self.path.exists():
+            rows = [json.loads(line) for line in self.path.read_text(encoding="utf-8").splitlines()]
+            self.rows = [row for row in rows if row["epoch"] < epoch]
+        self._write()
+        self.board: Any = None
+        if tensorboard:
+            from torch.utils.tensorboard import SummaryWriter
+
+            self.board = SummaryWriter(folder / "tb", purge_step=epoch)  # type: ignore[no-untyped-call]
+
+    def append_row(self, values: Mapping[str, Any]) -> None:
+        """Keep the metrics of an epoch."""
+        self.rows.append(dict(values))
+        self._write()
+        if self.board is not None:
+            for name, value in values.items():
+                if isinstance(value, float) and np.isfinite(value):
+                    self.board.add_scalar(name, value, values["epoch"])
+            self.board.flush()
+
+    def _write(self) -> None:
+        with replace_on_success(self.path) as beside:
+            beside.write_text("".join(json.dumps(row) + "\n" for row in self.rows), encoding="utf-8")
+
+    def close(self) -> None:
+        """Write what is left."""
+        if self.board is not None:
+            self.board.close()
+
+
+class EtaClock:
+    """Seconds since it was made, and how many are left at the pace so far."""
+
+    def __init__(self, done: int, total: int) -> None:
+        self.began, self.first, self.total = time.monotonic(), done, total
+
+    def format_time_left(self, done: int) -> str:
+        """Return hh:mm:ss that remain when `done` of the total are done."""
+        pace = (time.monotonic() - self.began) / max(done - self.first, 1)
+        return time.strftime("%H:%M:%S", time.gmtime(pace * (self.total - done)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from topomerge.datasets.pairs.plan_examples import PlanRecipe
-from topomerge.training.shared_settings import NetworkTask, RasterTask, TaskSettings
+from topomerge.training.settings import NetworkTask, RasterTask, TaskSettings
 
 
 @dataclass

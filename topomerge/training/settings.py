@@ -1,19 +1,96 @@
-"""Settings of a training, as one dataclass: from Hydra's words, or from a JSON or YAML file that a run wrote."""
+"""Settings of a training as one dataclass, and what they may be."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, make_dataclass
 from pathlib import Path
 from typing import Any
 
-from topomerge.embedding.network import Network, network_from
+from topomerge.embedding.network import Network, build_network
 from topomerge.embedding.network import check as check_network
 from topomerge.errors import InputError
 from topomerge.models.losses import LossSettings
 from topomerge.models.losses import check as check_loss
-from topomerge.training.shared_settings import check_numbers
+
+
+def check_numbers(settings: Mapping[str, Any], above: str = "") -> None:
+    """Refuse numbers that are not finite.
+
+    Raises:
+        InputError: names the key.
+    """
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            check_numbers(value, f"{above}{key}.")
+        elif isinstance(value, float) and not math.isfinite(value):
+            raise InputError(f"{above}{key} must be a finite number, not {value}")
+
+
+@dataclass
+class TaskSettings:
+    """What every task has.
+
+    Args:
+        task: which of the learned parts.
+        name: of the run; its folder is `runs`/`name`.
+        cache: folder of the data, which is made where it is missing, by so many processes (`jobs`), or those of a Dask cluster.
+        part: [k, n]: make every n-th item of the data from the k-th on, for machines that share nothing.
+        resume: go on where the run of this name stopped, with the same settings; overwrite: replace that run.
+        export: where the best weights go at the end: `package`, or a folder; empty: they stay in the run's.
+    """
+
+    task: str = ""
+    name: str = "run"
+    runs: str = "runs"
+    cache: str = "cache"
+    seed: int = 0
+    jobs: int = 1
+    cluster: str | None = None
+    part: list[int] = field(default_factory=lambda: [1, 1])
+    resume: bool = False
+    overwrite: bool = False
+    tensorboard: bool = True
+    export: str = ""
+
+    @property
+    def folder(self) -> Path:
+        """Where the run is written."""
+        return Path(self.runs) / self.name
+
+
+@dataclass
+class NetworkTask(TaskSettings):
+    """What tasks that train a network have besides.
+
+    Args:
+        epochs: at most; rate: of learning; decay: of weights; batch: examples a step.
+        patience: epochs without a better validation after which it ends; 0: never.
+        hold_out: the scans of every n-th physical building are watched and train nothing.
+        watch: what is best: a score of validation.
+    """
+
+    epochs: int = 10
+    batch: int = 8
+    rate: float = 2e-3
+    decay: float = 1e-3
+    patience: int = 0
+    hold_out: int = 8
+    watch: str = ""
+
+
+@dataclass
+class RasterTask(NetworkTask):
+    """What tasks whose networks look at rasters have besides.
+
+    Args:
+        accelerator: cpu or cuda. Only cpu gives the same bytes again for the same seed.
+    """
+
+    accelerator: str = "cpu"
+
 
 FREEZE = ("", "geometry")
 ACCELERATORS, PRECISIONS = ("cpu", "cuda", "gpu", "auto"), ("auto", "32-true", "bf16-mixed", "16-mixed")
@@ -33,7 +110,7 @@ class Augment:
         points: of each room that are taken; 0: all.
         noise: m, standard deviation of points.
         shift: pixels, standard deviation of the middles of rooms on their storeys.
-        walks: share of maps of which only what another walk would have seen is left (`other_sensors.looked_at`).
+        walks: share of maps of which only what another walk would have seen is left (`other_sensors.simulate_partial_walk`).
         slices: share of those that look like slices; rough: of those whose walls have gaps or are thicker.
         tilt: degrees, standard deviation of how far the direction of walls is taken wrong; of some maps four times as much.
         zoom: of a storey's size, likewise, as a logarithm; bend: pixels, of how far places 8 m apart drift.
@@ -153,15 +230,15 @@ def check(settings: Training) -> None:
         raise InputError(f"name must name a folder inside {settings.runs}, not {settings.name!r}")
 
 
-def with_recipe() -> type[Training]:
+def build_recipe_schema() -> type[Training]:
     """`Training` with all of `configs/data/<name>.yaml` in the place of its name, as Hydra composes it."""
-    from topomerge.datasets.pairs.recipe import Recipe
+    from topomerge.datasets.pairs.items import Recipe
 
     return make_dataclass("Training", [("data", Recipe, field(default_factory=Recipe))], bases=(Training,))
 
 
-def composed(given: Any) -> Training:
-    """`Training` out of what `with_recipe` says: of the data only the name is needed."""
+def convert_composed(given: Any) -> Training:
+    """`Training` out of what `build_recipe_schema` says: of the data only the name is needed."""
     from topomerge.datasets.pairs.own_pairs import check_own_path
 
     check_own_path(given.data.name, given.path)
@@ -169,8 +246,8 @@ def composed(given: Any) -> Training:
     return Training(**{**values, "data": given.data.name})
 
 
-def from_file(path: str | Path) -> Training:
-    """From a run's `config.json` or `config.yaml`, or one written by hand; what is not in it has its default.
+def load_settings(path: str | Path) -> Training:
+    """Load settings from a run's `config.json` or `config.yaml`, or one written by hand; missing keys have their defaults.
 
     Raises:
         InputError: no such file, damaged, or an unknown key.
@@ -190,13 +267,13 @@ def from_file(path: str | Path) -> Training:
     except Exception as error:  # of json or of yaml, which need not be installed for the other
         raise InputError(f"{path}: damaged ({' '.join(str(error).split())[:120]})") from error
     try:
-        return from_dict(values)
+        return parse_settings(values)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
 
-def from_dict(values: Any) -> Training:
-    """From what `to_dict` gave.
+def parse_settings(values: Any) -> Training:
+    """Parse settings from the output of `convert_to_dict`.
 
     Raises:
         InputError: an unknown key, or a value of another type.
@@ -204,27 +281,27 @@ def from_dict(values: Any) -> Training:
     if not isinstance(values, Mapping):
         raise InputError(f"settings must be a table of keys, not {type(values).__name__}")
     values = dict(values)
-    parts: dict[str, Any] = {"network": network_from(values.pop("network", {}))}
+    parts: dict[str, Any] = {"network": build_network(values.pop("network", {}))}
     for key, kind in (("loss", LossSettings), ("augment", Augment)):
-        parts[key] = _filled(kind, values.pop(key, {}), f"{key}.")
-    settings: Training = _filled(Training, values, "", **parts)
+        parts[key] = _parse_dataclass(kind, values.pop(key, {}), f"{key}.")
+    settings: Training = _parse_dataclass(Training, values, "", **parts)
     check(settings)
     return settings
 
 
-def _filled(kind: Any, values: Any, where: str, **given: Any) -> Any:
+def _parse_dataclass(kind: Any, values: Any, where: str, **given: Any) -> Any:
     if not isinstance(values, Mapping):
         raise InputError(f"{where.rstrip('.')} must be a table of keys, not {values!r}")
     defaults = {f.name: getattr(kind(), f.name) for f in fields(kind)}
     for key, value in values.items():
         if key not in defaults or is_dataclass(defaults[key]):
             raise InputError(f"unknown key {where}{key}; {', '.join(sorted(defaults))} are possible")
-        wanted = type(defaults[key])
-        if not (type(value) is wanted or (wanted is float and type(value) is int)):
-            raise InputError(f"{where}{key} must be {wanted.__name__}, not {value!r}")
+        requested = type(defaults[key])
+        if not (type(value) is requested or (requested is float and type(value) is int)):
+            raise InputError(f"{where}{key} must be {requested.__name__}, not {value!r}")
     return kind(**values, **given)
 
 
-def to_dict(settings: Training) -> dict[str, Any]:
-    """Plain values."""
+def convert_to_dict(settings: Training) -> dict[str, Any]:
+    """Convert settings to plain values."""
     return asdict(settings)

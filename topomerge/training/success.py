@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from topomerge.matching.growing import align
-from topomerge.matching.scores import assign_certain
+from topomerge.matching.assignment import align, assign_certain
 from topomerge.types import Array, Sim3
 
 LEAST_CERTAINTY = 0.05  # certainty of a match that is looked at
@@ -25,7 +24,7 @@ REFINEMENT_ROUNDS = 3
 RIGHT_WITHIN = (0.5, 5.0)  # m, degrees
 
 
-class Places(NamedTuple):
+class MatchedPlaces(NamedTuple):
     """Places (P,) of both maps that are one if a match is right: middles of its rooms, and their doors with each other."""
 
     to: Array  # (P, 3) in a
@@ -34,17 +33,17 @@ class Places(NamedTuple):
     off: Array  # (P,) m by which they may differ
 
 
-def pose_of_matches(a: Mapping[str, Array], b: Mapping[str, Array], certain: Array) -> Sim3 | None:
+def estimate_pose(a: Mapping[str, Array], b: Mapping[str, Array], certain: Array) -> Sim3 | None:
     """T_ab under which the most matches, by their certainty, agree; None where no two places tell one.
 
     Args:
         a, b: `pos`, `edge_pos` and `edge_index` of both graphs (`embedding.graph`).
-        certain: (R_a, R_b) `matching.scores.certainty`.
+        certain: (R_a, R_b) `matching.scores.compute_certainty`.
     """
     pairs = assign_certain(certain, LEAST_CERTAINTY)
     pairs = pairs[np.argsort(-certain[tuple(pairs.T)], kind="stable")]
-    places = _places(a, b, pairs)
-    turn, move, rise = _candidates(places)
+    places = _collect_places(a, b, pairs)
+    turn, move, rise = _compute_candidates(places)
     if not len(turn):
         return None
     flat = [x[:, 0] + 1j * x[:, 1] for x in (places.to, places.of)]
@@ -63,7 +62,7 @@ def pose_of_matches(a: Mapping[str, Array], b: Mapping[str, Array], certain: Arr
     return pose
 
 
-def _places(a: Mapping[str, Array], b: Mapping[str, Array], pairs: Array) -> Places:
+def _collect_places(a: Mapping[str, Array], b: Mapping[str, Array], pairs: Array) -> MatchedPlaces:
     to: list[Array] = []
     of: list[Array] = []
     match: list[int] = []
@@ -77,10 +76,10 @@ def _places(a: Mapping[str, Array], b: Mapping[str, Array], pairs: Array) -> Pla
         of += [b["pos"][j], *doors[1][doors_b]]
         match += [k] * (len(doors_a) + 1)
         off += [MIDDLE_OFF, *[DOOR_OFF] * len(doors_a)]
-    return Places(np.array(to).reshape(-1, 3), np.array(of).reshape(-1, 3), np.array(match, int), np.array(off))
+    return MatchedPlaces(np.array(to).reshape(-1, 3), np.array(of).reshape(-1, 3), np.array(match, int), np.array(off))
 
 
-def _candidates(places: Places) -> tuple[Array, Array, Array]:
+def _compute_candidates(places: MatchedPlaces) -> tuple[Array, Array, Array]:
     """(C,) turn and move as complex numbers, and rise, m, of every two places that are as far apart in both maps."""
     far = [np.linalg.norm(x[:, None, :2] - x[None, :, :2], axis=2) for x in (places.to, places.of)]
     alike = (np.minimum(*far) >= PLACES_APART) & (abs(far[0] - far[1]) <= LARGEST_STRETCH)
@@ -92,8 +91,8 @@ def _candidates(places: Places) -> tuple[Array, Array, Array]:
     return turn, (to[p] + to[q] - turn * (of[p] + of[q])) / 2, rise
 
 
-def merged_right(pose: Sim3 | None, truth: Array, at: Array) -> bool:
-    """Is a pose right within 0.5 m and 5 degrees?
+def is_pose_right(pose: Sim3 | None, truth: Array, at: Array) -> bool:
+    """Return whether a pose is right within 0.5 m and 5 degrees.
 
     Args:
         truth: (4, 4) T_ab.

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.atomic import replacing
+from topomerge.io.archive import replace_on_success
 from topomerge.statistics import estimate_mean
 from topomerge.training.provenance import MAY_CHANGE
 
@@ -25,13 +25,13 @@ SHOWN = ("recall@1", "recall@1_single", "recall@1_twin", "recall@5", "mrr", "pre
 class SweepTable:
     """Hydra's callback that writes table.md when all runs of a sweep have ended."""
 
-    def _nothing(self, **_: Any) -> None:
+    def _ignore_event(self, **_: Any) -> None:
         """What else Hydra reports."""
 
-    on_run_start = on_run_end = on_multirun_start = on_job_start = on_job_end = on_compose_config = _nothing
+    on_run_start = on_run_end = on_multirun_start = on_job_start = on_job_end = on_compose_config = _ignore_event
 
     def on_multirun_end(self, config: Any, **_: Any) -> None:
-        """Called by Hydra."""
+        """Write the table when Hydra's sweep has ended."""
         folder = Path(str(config.hydra.sweep.dir))
         if folder.is_dir():
             print(f"{write_table(folder)}")
@@ -44,7 +44,7 @@ def write_table(folder: str | Path) -> Path:
         InputError: no runs in it.
     """
     folder = Path(folder)
-    rows = [row for path in sorted(folder.rglob("metrics.jsonl")) if (row := _best(path.parent)) is not None]
+    rows = [row for path in sorted(folder.rglob("metrics.jsonl")) if (row := _read_best_epoch(path.parent)) is not None]
     if not rows:
         raise InputError(f"{folder}: no runs in it")
     rows.sort(key=lambda row: -row["best"])
@@ -59,7 +59,7 @@ def write_table(folder: str | Path) -> Path:
             "",
             *_table(gathered, ["seeds" if n == "seed" else n for n in columns]),
         ]
-    with replacing(folder / "table.md") as beside:
+    with replace_on_success(folder / "table.md") as beside:
         beside.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return folder / "table.md"
 
@@ -86,14 +86,14 @@ def gather_seeds(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 def _table(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> list[str]:
     head = [name for name in columns if any(name in row for row in rows)]
     lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
-    return lines + [f"| {' | '.join(_cell(row.get(name, '–')) for name in head)} |" for row in rows]
+    return lines + [f"| {' | '.join(_format_cell(row.get(name, '–')) for name in head)} |" for row in rows]
 
 
-def _cell(value: Any) -> str:
+def _format_cell(value: Any) -> str:
     return f"{value:.3f}" if isinstance(value, float) else str(value)
 
 
-def _best(run: Path) -> dict[str, Any] | None:
+def _read_best_epoch(run: Path) -> dict[str, Any] | None:
     """The best epoch of a run; None where there is none yet."""
     config = json.loads((run / "config.json").read_text(encoding="utf-8"))
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]

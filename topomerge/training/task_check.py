@@ -9,7 +9,7 @@ from topomerge.datasets.pairs.own_pairs import OWN_DATA, check_own_path
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.elevation import WALL_CLASSES
 from topomerge.training.scan_settings import PlanSegmentation, WallSegmentation
-from topomerge.training.shared_settings import TaskSettings, check_numbers
+from topomerge.training.settings import TaskSettings, check_numbers
 from topomerge.training.task_settings import LOOKALIKES_TAKEN, MergeBelief, RoomMatching
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from topomerge.datasets.pairs.grid_pairs import GridRecipe
+from topomerge.datasets.pairs.items import Recipe
 from topomerge.datasets.pairs.lookalikes import LookalikeRecipe
-from topomerge.datasets.pairs.recipe import Recipe
-from topomerge.training.shared_settings import NetworkTask, RasterTask, TaskSettings
+from topomerge.training.settings import NetworkTask, RasterTask, TaskSettings
 
 LOOKALIKES_TAKEN = ("none", "judged", "fitted")
 
@@ -31,7 +31,7 @@ class PlaceEvidence(RasterTask):
     steps: of an epoch; warmup: steps in which the rate rises.
     hypotheses, inspected: of a pair, as of `MergeBelief`: the places are those of its hypotheses.
     lookalikes: do those of `alike` that somebody can tell apart train, too?
-    half: 1 or 2: train on one half of the buildings only (`belief_hypotheses.half_of`); 0: on all.
+    half: 1 or 2: train on one half of the buildings only (`belief_hypotheses.assign_half`); 0: on all.
     widths: channels of the convolutions; dropout: of what they give.
     """
 

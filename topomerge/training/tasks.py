@@ -1,7 +1,9 @@
-"""The tasks of `train.py` and `evaluate.py`: every learned part that ships, in the order in which they depend on each other."""
+"""The tasks of `train.py` and `evaluate.py`: every learned part that ships."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import import_module
@@ -9,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from topomerge.errors import InputError
-from topomerge.io.weight_files import weights_file
+from topomerge.io.archive import find_weights_file, replace_on_success
 
-Say = Callable[[str], None]
+LogFn = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -84,11 +86,11 @@ def register_tasks() -> None:
     from topomerge.config import register
 
     for name in TASKS:
-        register(name, schema_of(name), group="task")
+        register(name, get_schema(name), group="task")
 
 
-def schema_of(task: str) -> type[Any]:
-    """The dataclass of a task's settings.
+def get_schema(task: str) -> type[Any]:
+    """Return the dataclass of a task's settings.
 
     Raises:
         InputError: there is no such task.
@@ -96,26 +98,26 @@ def schema_of(task: str) -> type[Any]:
     if task not in TASKS:
         raise InputError(f"task={task}: {', '.join(TASKS)} are possible")
     if task == "embedding":
-        from topomerge.training.settings import with_recipe
+        from topomerge.training.settings import build_recipe_schema
 
-        return with_recipe()
+        return build_recipe_schema()
     schema: type[Any] = getattr(import_module(f"topomerge.training.{TASKS[task].settings}"), TASKS[task].schema)
     return schema
 
 
-def task_of(words: Sequence[str]) -> str:
-    """The task that the words of a command line name; `embedding` where they name none.
+def parse_task(words: Sequence[str]) -> str:
+    """Parse the task that the words of a command line name; `embedding` where they name none.
 
     Raises:
         InputError: there is no such task.
     """
     task = next((word[len("task=") :] for word in reversed(words) if word.startswith("task=")), "embedding")
-    schema_of(task)
+    get_schema(task)
     return task
 
 
-def settings_of(words: Sequence[str] = ()) -> Any:
-    """Settings of a task from `configs/train.yaml` and words like ``task=plan_segmentation data.scans=20``, by Hydra.
+def compose_settings(words: Sequence[str] = ()) -> Any:
+    """Return settings of a task from `configs/train.yaml` and words like ``task=plan_segmentation data.scans=20``, by Hydra.
 
     Raises:
         InputError: one line with the key's name.
@@ -123,32 +125,32 @@ def settings_of(words: Sequence[str] = ()) -> Any:
     from topomerge.config import compose
 
     register_tasks()
-    return _checked(compose("train", schema_of(task_of(words)), words))
+    return _check_settings(compose("train", get_schema(parse_task(words)), words))
 
 
-def settings_from(config: Any) -> Any:
-    """Settings of a task from what Hydra composed.
+def convert_settings(config: Any) -> Any:
+    """Return settings of a task from what Hydra composed.
 
     Raises:
         InputError: one line with the key's name.
     """
-    from topomerge.config import typed
+    from topomerge.config import convert_to_dataclass
 
-    return _checked(typed(config, schema_of(str(config.task))))
+    return _check_settings(convert_to_dataclass(config, get_schema(str(config.task))))
 
 
-def _checked(settings: Any) -> Any:
+def _check_settings(settings: Any) -> Any:
     if settings.task == "embedding":
-        from topomerge.training.settings import composed
+        from topomerge.training.settings import convert_composed
 
-        return composed(settings)
+        return convert_composed(settings)
     from topomerge.training.task_check import check_task
 
     check_task(settings)
     return settings
 
 
-def train(settings: Any, say: Say) -> Mapping[str, float]:
+def train(settings: Any, log_line: LogFn) -> Mapping[str, float]:
     """Train a task, and leave a run's folder (`training.run_folder`).
 
     Returns:
@@ -161,7 +163,7 @@ def train(settings: Any, say: Say) -> Mapping[str, float]:
     if settings.task != "embedding":  # which does so itself, with and without Hydra
         check_start(settings)
     module = import_module(f"topomerge.training.{TASKS[settings.task].module}")
-    scores: Mapping[str, float] = module.fit(settings, say)
+    scores: Mapping[str, float] = module.fit(settings, log_line)
     return scores
 
 
@@ -186,7 +188,7 @@ def check_accelerator(settings: Any) -> None:
     Raises:
         InputError: names the key.
     """
-    name, wanted = getattr(settings, "accelerator", "cpu"), getattr(settings, "devices", 1)
+    name, requested = getattr(settings, "accelerator", "cpu"), getattr(settings, "devices", 1)
     scaled = name == "auto" and getattr(settings, "precision", "") == "16-mixed"  # which no processor has
     if name not in ("cuda", "gpu") and not scaled:
         return
@@ -194,21 +196,63 @@ def check_accelerator(settings: Any) -> None:
 
     if not torch.cuda.is_available():
         raise InputError(f"accelerator={name}: torch finds no such device here; leave it out to train on the processor")
-    if torch.cuda.device_count() < wanted:
-        raise InputError(f"devices={wanted}: torch finds {torch.cuda.device_count()} here")
+    if torch.cuda.device_count() < requested:
+        raise InputError(f"devices={requested}: torch finds {torch.cuda.device_count()} here")
 
 
-def weights_of(task: str, run: str) -> Path:
-    """The file of weights of a run, a folder or a file; of the package where `run` is empty.
+def find_weights(task: str, run: str) -> Path:
+    """Find the file of weights of a run, a folder or a file; of the package where `run` is empty.
 
     Raises:
         InputError: there is none.
     """
     name = TASKS[task].file
     if not run:
-        return weights_file(TASKS[task].package, name)
+        return find_weights_file(TASKS[task].package, name)
     places = (Path(run), Path(run) / "best" / name, Path(run) / name)
     path = next((path for path in places if path.is_file()), None)
     if path is None:
         raise InputError(f"run={run}: holds no {name}; name a run of task={task}, or what it exported")
     return path
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """Scores, as numbers and as a Markdown table, and the folder that they are written to."""
+
+    scores: dict[str, Any]
+    summary: str
+    folder: Path
+
+
+def evaluate_task(task: str, words: Sequence[str], log_line: LogFn) -> EvaluationResult:
+    """Judge the weights that ship, or those of a run (``run=runs/x``), on the task's `heldout` data.
+
+    Args:
+        words: overrides like those of `train.py`; besides ``run=`` and ``folder=`` (runs/eval).
+
+    Raises:
+        InputError: a wrong word, no such weights, or no data.
+    """
+    if task not in TASKS or task == "embedding":
+        raise InputError(f"task={task}: {', '.join(TASKS)} are possible")
+    named = {key: word[len(key) + 1 :] for key in ("run", "folder") for word in words if word.startswith(f"{key}=")}
+    rest = [word for word in words if not word.startswith(("run=", "folder="))]
+    settings = compose_settings(rest)
+    file = find_weights(task, named.get("run", ""))
+    module = import_module(f"topomerge.training.{TASKS[task].module}")
+    scores = dict(module.judge(settings, file, log_line))
+    own = getattr(settings, "path", "")
+    heldout = Path(own).resolve().name if own else settings.heldout.name
+    folder = Path(named.get("folder", "runs/eval")) / f"{task}-{heldout}"
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    record = {"task": task, "weights": str(file), "sha256": digest, "heldout": heldout, "scores": scores}
+    texts = {name: f"{value:.3f}" if isinstance(value, float) else str(value) for name, value in scores.items()}
+    rows = [f"| {name} | {text} |" for name, text in texts.items()]
+    head = f"{task}: {file.name} of {named.get('run') or 'the package'} on {heldout}"
+    summary = "\n".join([f"{head}\n", "| score | value |", "|---|---|", *rows])
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in (("scores.json", json.dumps(record, indent=1)), ("report.md", f"# {summary}")):
+        with replace_on_success(folder / name) as beside:
+            beside.write_text(text + "\n", encoding="utf-8")
+    return EvaluationResult(scores, summary, folder)

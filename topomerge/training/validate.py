@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from topomerge.embedding.rooms_around import through_doors
-from topomerge.embedding.turns import Rows, TurnedRows, aligned, along_walls
-from topomerge.matching.scores import assign_certain, certainty, has_twin, pair_counts, partner_ranks
+from topomerge.embedding.learned import is_door_edge
+from topomerge.embedding.quarter_turns import Rows, TurnedRows, align_rows, rotate_to_walls
+from topomerge.matching.assignment import assign_certain, compute_certainty, count_pairs, has_twin, rank_partners
 from topomerge.models.embedder import Embedder, match_scores
-from topomerge.training.batches import make_batch, seen_well
-from topomerge.training.packed import GraphPair
-from topomerge.training.success import merged_right, pose_of_matches
+from topomerge.training.batches import find_well_seen_rooms, make_batch
+from topomerge.training.packed_pairs import GraphPair
+from topomerge.training.success import estimate_pose, is_pose_right
 from topomerge.types import Array
 
 SIZE_COLUMNS = (0, 3, 4)  # area, length, width: columns of x
@@ -25,26 +25,28 @@ LEAST_CERTAINTIES = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)  # certainty of 
 
 @torch.no_grad()
 def embed(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu") -> list[tuple[Tensor, Tensor]]:
-    """(embedding, dustbin) of each map, a0 b0 a1 b1 ..., on the CPU; where turns matter, b is turned as its rooms tell."""
+    """Return (embedding, dustbin) of each map, a0 b0 a1 b1 ..., on the CPU; where turns matter, b is turned as its rooms tell."""
     training = network.training
     network.eval()
     out: list[tuple[Tensor, Tensor]] = []
     for start in range(0, len(pairs), PAIRS_AT_ONCE):
         batch = make_batch(pairs[start : start + PAIRS_AT_ONCE], network.tensors).to(device)
-        embedding, dustbin = network.turned(batch.tensors)
+        embedding, dustbin = network.embed_rotations(batch.tensors)
         rows, bins = (part.float().cpu().split(batch.rooms) for part in (embedding, dustbin))
         for k, pair in zip(range(0, len(rows), 2), pairs[start : start + PAIRS_AT_ONCE], strict=True):
-            sides = aligned(*(_rows(of.numpy(), graph) for of, graph in zip(rows[k : k + 2], (pair.a, pair.b), strict=True)))
+            sides = align_rows(
+                *(_build_rows(of.numpy(), graph) for of, graph in zip(rows[k : k + 2], (pair.a, pair.b), strict=True))
+            )
             out += [(torch.from_numpy(of), bins[k + i]) for i, of in enumerate(sides)]
     network.train(training)
     return out
 
 
-def _rows(rows: Array, graph: Mapping[str, Tensor]) -> Rows:
+def _build_rows(rows: Array, graph: Mapping[str, Tensor]) -> Rows:
     """Of a map, with where its rooms are if they tell turns apart."""
     if rows.ndim == 2:
         return rows
-    return TurnedRows(rows, along_walls({name: graph[name].numpy() for name in ("pos", "turn")}))
+    return TurnedRows(rows, rotate_to_walls({name: graph[name].numpy() for name in ("pos", "turn")}))
 
 
 def validate(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu") -> dict[str, float]:
@@ -59,43 +61,43 @@ def validate(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu")
         similarity, matches = (a @ b.T).numpy(), pair.matches.numpy()
         links = torch.zeros(similarity.shape, dtype=torch.bool)
         links[pair.matches[:, 0], pair.matches[:, 1]] = True
-        good = [which.numpy() for which in seen_well(links, pair.a["x"], pair.b["x"])]
+        good = [which.numpy() for which in find_well_seen_rooms(links, pair.a["x"], pair.b["x"])]
         sides = ((similarity, matches, pair.b), (similarity.T, matches[:, ::-1], pair.a))
         for (one, truth, other), well in zip(sides, good, strict=True):
-            rooms, rank = partner_ranks(one, truth)
+            rooms, rank = rank_partners(one, truth)
             ranks.append(rank)
             clear.append(well[rooms])
             twins.append(has_twin(other["x"][:, SIZE_COLUMNS].numpy(), truth, rooms))
         rows, columns = match_scores(a, b, bin_a, bin_b, temperature)
-        certain = certainty(rows.exp().numpy(), columns.exp().numpy())
-        right += _merged(pair, certain)
-        counts += [pair_counts(assign_certain(certain, least), matches) for least in LEAST_CERTAINTIES]
+        certain = compute_certainty(rows.exp().numpy(), columns.exp().numpy())
+        right += _evaluate_merge(pair, certain)
+        counts += [count_pairs(assign_certain(certain, least), matches) for least in LEAST_CERTAINTIES]
     merged = {"merged": float(np.mean(right)) if right else 0.0, "mergeable": float(len(right))}
-    return scores(np.concatenate(ranks), np.concatenate(twins), np.concatenate(clear), counts) | merged
+    return score_matches(np.concatenate(ranks), np.concatenate(twins), np.concatenate(clear), counts) | merged
 
 
-def _merged(pair: GraphPair, certain: Array) -> list[bool]:
+def _evaluate_merge(pair: GraphPair, certain: Array) -> list[bool]:
     """Whether the matches of a pair give its true transform; empty where it has none or rooms in common, or scales differ."""
     truth = pair.transform.numpy()
     if not len(pair.matches) or not abs(truth[2, 2] - 1) < 1e-6:
         return []
-    a, b = (_places(graph) for graph in (pair.a, pair.b))
-    pose = pose_of_matches(a, b, certain)
-    return [merged_right(pose, truth, b["pos"][pair.matches[:, 1].numpy()].mean(axis=0))]
+    a, b = (_collect_places(graph) for graph in (pair.a, pair.b))
+    pose = estimate_pose(a, b, certain)
+    return [is_pose_right(pose, truth, b["pos"][pair.matches[:, 1].numpy()].mean(axis=0))]
 
 
-def _places(graph: Mapping[str, Tensor]) -> dict[str, Array]:
+def _collect_places(graph: Mapping[str, Tensor]) -> dict[str, Array]:
     """Where rooms and doors are; rooms that are neighbours by distance only have none."""
     arrays = {name: graph[name].numpy() for name in ("pos", "edge_pos", "edge_index", "edge_attr")}
-    doors = through_doors(arrays)
+    doors = is_door_edge(arrays)
     return {"pos": arrays["pos"], "edge_pos": arrays["edge_pos"][doors], "edge_index": arrays["edge_index"][:, doors]}
 
 
-def scores(ranks: Array, twins: Array, clear: Array, counts: Array) -> dict[str, float]:
-    """Ranks (n,), whether each room has a twin (n,), and whether both maps saw it well (n,); the sums of `pair_counts`
+def score_matches(ranks: Array, twins: Array, clear: Array, counts: Array) -> dict[str, float]:
+    """Ranks (n,), whether each room has a twin (n,), and whether both maps saw it well (n,); the sums of `count_pairs`
     for each of `LEAST_CERTAINTIES`."""
-    matched, right, wanted, got = counts.T
-    precision, recall = right / np.maximum(matched, 1), got / np.maximum(wanted, 1)
+    matched, right, requested, got = counts.T
+    precision, recall = right / np.maximum(matched, 1), got / np.maximum(requested, 1)
     f1 = 2 * precision * recall / np.maximum(precision + recall, 1e-9)
     best = int(f1.argmax())
 

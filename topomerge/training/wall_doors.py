@@ -18,25 +18,25 @@ from sklearn.linear_model import LogisticRegression
 from topomerge.datasets.pairs.plan_examples import PlanRecipe
 from topomerge.datasets.pairs.wall_examples import build_walls, load_walls
 from topomerge.errors import InputError
-from topomerge.extraction.attributes import LEVEL_KINDS, rooms_at
-from topomerge.extraction.elevations.doorways import StoreyWalls, door_places, place_classes
+from topomerge.extraction.attributes import LEVEL_KINDS, find_rooms_at
+from topomerge.extraction.elevations.doorways import StoreyWalls, classify_places, compute_door_probabilities
 from topomerge.extraction.elevations.elevation import Elevations
 from topomerge.extraction.elevations.wall_doors import (
     SOURCES,
     WALL_DOOR_FEATURES,
     WALL_DOORS_FILE,
     DoorCandidates,
-    door_candidates,
-    door_chance,
+    build_door_candidates,
+    compute_door_probability,
 )
 from topomerge.extraction.plans.storey_plan import ClassifiedStorey
 from topomerge.extraction.walls import find_doorways
-from topomerge.io.weight_files import read_weights_json
+from topomerge.io.archive import read_weights_json
 from topomerge.metrics import match_places
-from topomerge.training.closed_form import Fitted, calibration_error, run_fit
-from topomerge.training.loop import Say
+from topomerge.training.closed_form import FitResult, compute_calibration_error, run_fit
+from topomerge.training.loop import LogFn
+from topomerge.training.packed_pairs import number_buildings, read_scan_building
 from topomerge.training.scan_settings import WallDoors
-from topomerge.training.splits import number_buildings, read_scan_building
 from topomerge.types import Array, TopometricMap
 
 FEWEST_DOORS = 5  # among the candidates of a source
@@ -44,32 +44,32 @@ NEAR_DOOR = 0.7  # m: of a door that lies farther off than the metrics allow (0.
 Candidates = tuple[DoorCandidates, Array]  # of a scan, and (n,) which are doors
 
 
-def fit(settings: WallDoors, say: Say) -> dict[str, float]:
+def fit(settings: WallDoors, log_line: LogFn) -> dict[str, float]:
     """Fit the models; the scores of left-out scans."""
-    return run_fit(settings, fit_doors, say)
+    return run_fit(settings, fit_doors, log_line)
 
 
-def fit_doors(settings: WallDoors, say: Say) -> Fitted:
+def fit_doors(settings: WallDoors, log_line: LogFn) -> FitResult:
     """Weights of the models from all scans, and scores of those that were fitted without each building."""
     recipes = (settings.data, settings.frameless, settings.flat)
-    named = [scan for recipe in recipes for scan in candidates_of(recipe, settings, say)]
+    named = [scan for recipe in recipes for scan in build_candidates(recipe, settings, log_line)]
     scans, fold = [scan for _, scan in named], number_buildings([name for name, _ in named]) % settings.folds
     parts = [[scan for scan, at in zip(scans, fold, strict=True) if at == k] for k in range(settings.folds)]
     left_out = []
     for k, part in enumerate(parts):
-        weights = doors_model([scan for j, other in enumerate(parts) if j != k for scan in other], settings.pull)
-        left_out += [(door_chance(c, weights), y) for c, y in part]
+        weights = fit_doors_model([scan for j, other in enumerate(parts) if j != k for scan in other], settings.pull)
+        left_out += [(compute_door_probability(c, weights), y) for c, y in part]
     origin = {"set": settings.data.name, "split": settings.data.split, "scans": len(scans)}
-    return Fitted(doors_model(scans, settings.pull), door_figures(left_out), origin)
+    return FitResult(fit_doors_model(scans, settings.pull), score_doors(left_out), origin)
 
 
-def candidates_of(recipe: PlanRecipe, settings: WallDoors, say: Say) -> list[tuple[str, Candidates]]:
+def build_candidates(recipe: PlanRecipe, settings: WallDoors, log_line: LogFn) -> list[tuple[str, Candidates]]:
     """The building of each scan of a set, and its candidates, by the network of elevations that ships.
 
     Raises:
         InputError: too few scans.
     """
-    paths, _ = build_walls(recipe, settings, say)
+    paths, _ = build_walls(recipe, settings, log_line)
     scans = []
     for path in paths:
         example = load_walls(path)
@@ -94,15 +94,15 @@ def find_candidates_of_map(
     """
     walls = None
     if elevations is not None:
-        classes = place_classes(elevations) if classes is None else classes
-        doors = door_places(elevations, classes)
-        walls = StoreyWalls(elevations, classes, doors, find_doorways(elevations, doors, partial(rooms_at, map)))
+        classes = classify_places(elevations) if classes is None else classes
+        doors = compute_door_probabilities(elevations, classes)
+        walls = StoreyWalls(elevations, classes, doors, find_doorways(elevations, doors, partial(find_rooms_at, map)))
     level = map.edges[np.isin(map.edges["kind"], LEVEL_KINDS)]
-    return door_candidates(level, map.rooms["completeness"], storeys, walls)
+    return build_door_candidates(level, map.rooms["completeness"], storeys, walls)
 
 
-def doors_model(scans: Sequence[Candidates], pull: float) -> dict[str, list[float]]:
-    """Of each of `SOURCES` a constant and the weights of `WALL_DOOR_FEATURES`; where hardly any candidate is a door, those that
+def fit_doors_model(scans: Sequence[Candidates], pull: float) -> dict[str, list[float]]:
+    """Fit for each of `SOURCES` a constant and `WALL_DOOR_FEATURES` weights; where hardly any candidate is a door, those that
     ship stay: a constant of two doors would be chance."""
     x = np.concatenate([c.features for c, _ in scans])
     y, source = np.concatenate([y for _, y in scans]), np.concatenate([c.source for c, _ in scans])
@@ -120,21 +120,21 @@ def doors_model(scans: Sequence[Candidates], pull: float) -> dict[str, list[floa
     return weights
 
 
-def door_figures(scans: Sequence[tuple[Array, Array]]) -> dict[str, float]:
-    """Calibration error, precision and recall of the candidates at .5."""
+def score_doors(scans: Sequence[tuple[Array, Array]]) -> dict[str, float]:
+    """Compute calibration error, precision and recall of the candidates at .5."""
     p, y = (np.concatenate(arrays) for arrays in zip(*scans, strict=True))
     said = p >= 0.5
     return {
-        "calibration_error": calibration_error(p, y),
+        "calibration_error": compute_calibration_error(p, y),
         "precision": float(y[said].mean()) if said.any() else 0.0,
         "recall": float(said[y].mean()) if y.any() else 0.0,
         "candidates": float(len(y)),
     }
 
 
-def judge(settings: WallDoors, file: Path, say: Say) -> dict[str, Any]:
-    """Scores of weights on scans of buildings that trained nothing."""
+def judge(settings: WallDoors, file: Path, log_line: LogFn) -> dict[str, Any]:
+    """Return scores of weights on scans of buildings that trained nothing."""
     weights = json.loads(file.read_text(encoding="utf-8"))
     recipes = (settings.heldout, settings.heldout_frameless, settings.heldout_flat)
-    scans = [scan for recipe in recipes for _, scan in candidates_of(recipe, settings, say)]
-    return door_figures([(door_chance(c, weights), y) for c, y in scans])
+    scans = [scan for recipe in recipes for _, scan in build_candidates(recipe, settings, log_line)]
+    return score_doors([(compute_door_probability(c, weights), y) for c, y in scans])

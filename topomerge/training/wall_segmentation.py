@@ -23,15 +23,14 @@ from topomerge.extraction.elevations.elevation import (
     STRIP_CHANNELS,
     WALL_CLASSES,
     WALL_SIGNATURE,
-    place_probabilities,
+    compute_place_probabilities,
     read_network,
 )
-from topomerge.models.wall_network import WallNetwork, WallProbabilities
+from topomerge.models.convolutional import WallNetwork, WallProbabilities
 from topomerge.networks.network import Run
-from topomerge.training.loop import Say, State, mixed
-from topomerge.training.networks import Exported, ExportedJob, run_network
+from topomerge.training.loop import Exported, ExportedJob, LogFn, State, derive_seed, run_network
+from topomerge.training.packed_pairs import mark_watched, read_scan_building
 from topomerge.training.scan_settings import WallAugment, WallSegmentation
-from topomerge.training.splits import mark_watched, read_scan_building
 from topomerge.types import Array
 
 COARSE_CLASSES = ("wall", "open", "shut", "window")
@@ -41,22 +40,22 @@ ScanT = TypeVar("ScanT")
 Stretch = tuple[Array, Array, Array]  # strip, truth and weight of each place
 
 
-def fit(settings: WallSegmentation, say: Say) -> dict[str, float]:
+def fit(settings: WallSegmentation, log_line: LogFn) -> dict[str, float]:
     """Train; the scores of the best epoch.
 
     Raises:
         InputError: no scan to train on or to watch.
     """
-    paths, _ = build_walls(settings.data, settings, say)
+    paths, _ = build_walls(settings.data, settings, log_line)
     scans = [load_walls(path) for path in paths]
-    learned, watched = learned_and_watched(scans, [read_scan_building(path) for path in paths], settings)
-    torch.manual_seed(mixed(settings.seed))
+    learned, watched = split_train_val(scans, [read_scan_building(path) for path in paths], settings)
+    torch.manual_seed(derive_seed(settings.seed))
     job = WallJob(settings, learned, watched)
-    say(f"{len(learned)} scans, {sum(p.numel() for p in job.network.parameters())} weights")
-    return run_network(job, settings, settings.steps, say)
+    log_line(f"{len(learned)} scans, {sum(p.numel() for p in job.network.parameters())} weights")
+    return run_network(job, settings, settings.steps, log_line)
 
 
-def learned_and_watched(
+def split_train_val(
     scans: Sequence[ScanT], buildings: Sequence[str], settings: WallSegmentation
 ) -> tuple[list[ScanT], list[ScanT]]:
     """The scans to train on, and those of every n-th building, which are watched.
@@ -80,8 +79,8 @@ class WallJob(ExportedJob):
         self.options, self.learned, self.watched = settings, learned, watched
         self.holes = [np.flatnonzero(np.diff(scan.truth.astype(int)) != 0) for scan in learned]
 
-    def batches(self, state: State) -> Generator[tuple[torch.Tensor, ...], None, None]:
-        """Stretches, from a generator of each step."""
+    def iter_batches(self, state: State) -> Generator[tuple[torch.Tensor, ...], None, None]:
+        """Yield stretches, from a generator of each step."""
         self.network.train()
         options = self.options
         for step in range(state.step, options.steps):
@@ -92,18 +91,18 @@ class WallJob(ExportedJob):
                 middle = int(rng.integers(len(scan.truth)))
                 if len(holes) and rng.random() < options.at_holes:
                     middle = int(rng.choice(holes) + rng.integers(-options.length // 3, options.length // 3 + 1))
-                stretches.append(stretch(scan, middle, options, rng))
+                stretches.append(sample_stretch(scan, middle, options, rng))
             x, truth, weight = (np.stack(arrays) for arrays in zip(*stretches, strict=True))
             yield torch.from_numpy(x).permute(0, 3, 1, 2), torch.from_numpy(truth), torch.from_numpy(weight)
 
-    def step(self, batch: tuple[torch.Tensor, ...], state: State) -> dict[str, float]:
-        """One step of the optimizer."""
-        x, truth, weight = self.there(batch)
+    def train_step(self, batch: tuple[torch.Tensor, ...], state: State) -> dict[str, float]:
+        """Take one step of the optimizer."""
+        x, truth, weight = self.move_to_device(batch)
         each = functional.cross_entropy(self.network(x), truth, reduction="none")
-        return self.descend((each * weight).sum() / weight.sum(), self.options, state)
+        return self.optimize((each * weight).sum() / weight.sum(), self.options, state)
 
-    def size(self, batch: tuple[torch.Tensor, ...]) -> int:
-        """Stretches."""
+    def count_items(self, batch: tuple[torch.Tensor, ...]) -> int:
+        """Count the stretches of a batch."""
         return len(batch[0])
 
     def exported(self) -> Exported:
@@ -111,19 +110,19 @@ class WallJob(ExportedJob):
         assert isinstance(self.network, WallNetwork)
         return Exported(WallProbabilities(self.network), WALL_SIGNATURE, [torch.rand(2, 8, DEPTHS, STRIP_CHANNELS)])
 
-    def scores(self) -> dict[str, float]:
-        """Of the scans that are watched."""
-        return wall_scores(self.watched, self.run())
+    def compute_scores(self) -> dict[str, float]:
+        """Compute the scores of the validation scans."""
+        return score_walls(self.watched, self.run())
 
 
-def answers(truth: Array, strips: Array) -> tuple[Array, Array]:
-    """(n / 2,) class of each answer, that of its first element, and was anything seen there?"""
+def downsample_truth(truth: Array, strips: Array) -> tuple[Array, Array]:
+    """Return the (n / 2,) class of each answer, that of its first element, and (n / 2,) bool, whether anything was seen."""
     there: Array = np.asarray(strips.reshape(len(strips) // PLACES, -1).any(axis=1))
     return truth[::PLACES].astype(np.int64), there
 
 
-def stretch(scan: WallExample, middle: int, options: WallSegmentation, rng: np.random.Generator) -> Stretch:
-    """A stretch of the wall that holds a place, changed as other scans might show it.
+def sample_stretch(scan: WallExample, middle: int, options: WallSegmentation, rng: np.random.Generator) -> Stretch:
+    """Sample a stretch of the wall that holds a place, changed as other scans might show it.
 
     Args:
         middle: a place of the scan's strips.
@@ -136,15 +135,15 @@ def stretch(scan: WallExample, middle: int, options: WallSegmentation, rng: np.r
     x = np.zeros((options.length, DEPTHS, STRIP_CHANNELS), np.float32)
     truth, weight = np.zeros(options.length, np.uint8), np.zeros(options.length // PLACES, np.float32)
     x[: stop - start], truth[: stop - start] = scan.strips[start:stop] / np.float32(255), scan.truth[start:stop]
-    right, there = answers(truth, x)
+    right, there = downsample_truth(truth, x)
     weight[: (stop - start) // PLACES] = 1.0
     weight *= np.array(options.classes, np.float32)[right] * np.where(there, 1.0, options.unseen)
     if rng.random() < 0.5:
         x, right, weight = x[::-1], right[::-1], weight[::-1]
-    return _spoilt(x, options.augment, rng), np.ascontiguousarray(right), np.ascontiguousarray(weight, np.float32)
+    return _corrupt_strip(x, options.augment, rng), np.ascontiguousarray(right), np.ascontiguousarray(weight, np.float32)
 
 
-def _spoilt(x: Array, augment: WallAugment, rng: np.random.Generator) -> Array:
+def _corrupt_strip(x: Array, augment: WallAugment, rng: np.random.Generator) -> Array:
     """A strip with its face somewhat nearer or farther, without some of its points, and with what stands before it hidden."""
     x = np.roll(x, int(rng.integers(-augment.shift, augment.shift + 1)), axis=1)
     if rng.random() < augment.sparse:
@@ -160,31 +159,31 @@ def _spoilt(x: Array, augment: WallAugment, rng: np.random.Generator) -> Array:
     return np.ascontiguousarray(x)
 
 
-def wall_scores(examples: Sequence[WallExample], network: Run) -> dict[str, float]:
+def score_walls(examples: Sequence[WallExample], network: Run) -> dict[str, float]:
     """F1 of each class over the places where anything was seen, and the mean of those of doors, open or half open, and shut."""
     table = np.zeros((len(WALL_CLASSES), len(WALL_CLASSES)), np.int64)
     for scan in examples:
         for low, high in zip(scan.first[:-1], scan.first[1:], strict=True):
             strip = scan.strips[low:high] / np.float32(255)
-            right, there = answers(scan.truth[low:high], strip)
-            np.add.at(table, (right[there], place_probabilities(strip, network).argmax(axis=1)[there]), 1)
+            right, there = downsample_truth(scan.truth[low:high], strip)
+            np.add.at(table, (right[there], compute_place_probabilities(strip, network).argmax(axis=1)[there]), 1)
     coarse = np.zeros((len(COARSE_CLASSES), len(COARSE_CLASSES)), np.int64)
     np.add.at(coarse, np.ix_(COARSE_CLASS, COARSE_CLASS), table)
-    return {**f1_scores(table, WALL_CLASSES), **class_scores(coarse)}
+    return {**compute_f1_scores(table, WALL_CLASSES), **score_colour_classes(coarse)}
 
 
-def class_scores(table: Array) -> dict[str, float]:
+def score_colour_classes(table: Array) -> dict[str, float]:
     """F1 of each of `COARSE_CLASSES`, and the mean of those of doors.
 
     Args:
         table: (4, 4) how often each was taken for each.
     """
-    scores = f1_scores(table, COARSE_CLASSES)
+    scores = compute_f1_scores(table, COARSE_CLASSES)
     return {**scores, "f1_doors": float((scores["f1_open"] + scores["f1_shut"]) / 2)}
 
 
-def f1_scores(table: Array, names: Sequence[str]) -> dict[str, float]:
-    """F1 of each class.
+def compute_f1_scores(table: Array, names: Sequence[str]) -> dict[str, float]:
+    """Compute F1 of each class.
 
     Args:
         table: (k, k) how often each was taken for each.
@@ -193,7 +192,7 @@ def f1_scores(table: Array, names: Sequence[str]) -> dict[str, float]:
     return {f"f1_{name}": float(v) for name, v in zip(names, f1, strict=True)}
 
 
-def judge(settings: WallSegmentation, file: Path, say: Say) -> dict[str, Any]:
-    """Scores of weights on scans of buildings that trained nothing."""
-    paths, _ = build_walls(settings.heldout, settings, say)
-    return {**wall_scores([load_walls(path) for path in paths], read_network(file)), "scans": len(paths)}
+def judge(settings: WallSegmentation, file: Path, log_line: LogFn) -> dict[str, Any]:
+    """Return scores of weights on scans of buildings that trained nothing."""
+    paths, _ = build_walls(settings.heldout, settings, log_line)
+    return {**score_walls([load_walls(path) for path in paths], read_network(file)), "scans": len(paths)}

@@ -13,10 +13,10 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from topomerge.datasets.core.script import exit_status
+from topomerge.datasets.core.builder import run_script
 from topomerge.errors import InputError
-from topomerge.io.atomic import replacing
-from topomerge.training.tasks import TASKS, settings_of, train
+from topomerge.io.archive import replace_on_success
+from topomerge.training.tasks import TASKS, compose_settings, train
 
 RUNS = Path("runs/weights")
 SHIPPED = {"embedding": ["experiment=surroundings"]}  # words beside the defaults
@@ -36,17 +36,19 @@ def main(words: Sequence[str]) -> int:
         if unknown := next((task for task in only if task not in TASKS), ""):
             raise InputError(f"only={unknown}: {', '.join(TASKS)} are possible")
         for task in [task for task in TASKS if task in only]:
-            seconds = _seconds(runs)
-            left = [t for t in TASKS if t in only and not _ended(runs, t)]
+            seconds = _read_seconds(runs)
+            left = [t for t in TASKS if t in only and not _is_finished(runs, t)]
             if task not in left:
-                _say(f"{task}: is there ({runs / task})")
+                _print_progress(f"{task}: is there ({runs / task})")
                 continue
-            _say(f"{task}: about {_hours(seconds, [task])}; in all about {_hours(seconds, left)} left")
+            _print_progress(
+                f"{task}: about {_format_duration(seconds, [task])}; in all about {_format_duration(seconds, left)} left"
+            )
             began = time.time()
             make_task(task, runs, shared)
-            _record(runs, task, seconds.get(f"{task} so far", 0.0) + time.time() - began)
+            _record_seconds(runs, task, seconds.get(f"{task} so far", 0.0) + time.time() - began)
 
-    return exit_status("weights", work)
+    return run_script("weights", work)
 
 
 def make_task(task: str, runs: Path, shared: Sequence[str]) -> None:
@@ -59,35 +61,35 @@ def make_task(task: str, runs: Path, shared: Sequence[str]) -> None:
         build_words = [word for word in shared if word.partition("=")[0] in ("cache", "jobs", "cluster")]
         for text in SETS[task]:
             words = [f"data={text.split()[0]}", *text.split()[1:], *build_words]
-            build(compose("build", Build, words), _say)
+            build(compose("build", Build, words), _print_progress)
         training_words = [word for word in shared if not word.startswith(("jobs=", "cluster=", "part="))]
     resume = "resume=true" if (runs / task / "last").exists() else "overwrite=true"
     exported = [] if any(word.startswith("export=") for word in shared) else ["export=package"]
     words = [f"task={task}", *SHIPPED.get(task, []), f"runs={runs}", f"name={task}", resume, *exported, *training_words]
-    train(settings_of(words), _say)
+    train(compose_settings(words), _print_progress)
 
 
-def _say(text: str) -> None:
+def _print_progress(text: str) -> None:
     print(f"weights: {text}", file=sys.stderr, flush=True)
 
 
-def _ended(runs: Path, task: str) -> bool:
-    return f"{task} ended" in _seconds(runs)
+def _is_finished(runs: Path, task: str) -> bool:
+    return f"{task} ended" in _read_seconds(runs)
 
 
-def _seconds(runs: Path) -> dict[str, float]:
+def _read_seconds(runs: Path) -> dict[str, float]:
     """What was recorded of the steps."""
     path = runs / "seconds.json"
     seconds: dict[str, float] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     return seconds
 
 
-def _record(runs: Path, task: str, seconds: float) -> None:
-    with replacing(runs / "seconds.json") as beside:
-        beside.write_text(json.dumps({**_seconds(runs), task: seconds, f"{task} ended": time.time()}, indent=1) + "\n")
+def _record_seconds(runs: Path, task: str, seconds: float) -> None:
+    with replace_on_success(runs / "seconds.json") as beside:
+        beside.write_text(json.dumps({**_read_seconds(runs), task: seconds, f"{task} ended": time.time()}, indent=1) + "\n")
 
 
-def _hours(seconds: Mapping[str, float], tasks: Sequence[str]) -> str:
+def _format_duration(seconds: Mapping[str, float], tasks: Sequence[str]) -> str:
     """How long steps take, by what they took or by what is usual."""
     hours = sum(seconds.get(task, 3600 * TASKS[task].hours) for task in tasks) / 3600
     return f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.0f} min"

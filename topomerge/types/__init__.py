@@ -4,35 +4,30 @@ Conventions: z is up, lengths are metres, angles radians. Poses are float64, poi
 points of map b into the frame of map a. A room label of -1 means "no room".
 """
 
-from topomerge.types.arrays import Array
-from topomerge.types.cloud import PointCloud, TrueRoom
-from topomerge.types.deformation import Deformation
-from topomerge.types.grid import VoxelGrid
-from topomerge.types.levelling import (
-    LEVELLED,
-    between_files,
-    between_maps,
-    checked_levelling,
-    is_level,
-    levelling_of,
-    transformed,
-)
-from topomerge.types.placement import Placement
-from topomerge.types.similarity import Sim3
-from topomerge.types.some_rooms import confident, of_rooms
+from topomerge.types.grid import Array, PointCloud, Sim3, TrueRoom, VoxelGrid
+from topomerge.types.placement import Deformation, Placement
 from topomerge.types.topometric_map import (
     AREA_DTYPE,
     EDGE_DTYPE,
     JOINED,
+    LEVELLED,
     OLDER_EDGE_DTYPE,
     ROOM_DTYPE,
     ROOM_ODDS,
     STOREY_DTYPE,
     WINDOW_DTYPE,
     TopometricMap,
-    door_state,
-    mostly_unseen,
-    with_outline_odds,
+    add_outline_odds,
+    classify_door_state,
+    convert_pose_to_files,
+    convert_pose_to_maps,
+    filter_confident,
+    is_level,
+    is_mostly_unseen,
+    parse_levelling,
+    read_levelling,
+    select_rooms,
+    transform_points,
 )
 
 __all__ = [
@@ -53,15 +48,15 @@ __all__ = [
     "TopometricMap",
     "TrueRoom",
     "VoxelGrid",
-    "between_files",
-    "between_maps",
-    "checked_levelling",
-    "confident",
-    "door_state",
+    "add_outline_odds",
+    "classify_door_state",
+    "convert_pose_to_files",
+    "convert_pose_to_maps",
+    "filter_confident",
     "is_level",
-    "levelling_of",
-    "mostly_unseen",
-    "of_rooms",
-    "transformed",
-    "with_outline_odds",
+    "is_mostly_unseen",
+    "parse_levelling",
+    "read_levelling",
+    "select_rooms",
+    "transform_points",
 ]

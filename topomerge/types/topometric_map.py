@@ -1,17 +1,82 @@
-"""A grid cut into rooms with the graph of its doors (seeds 2.7), and the rows of its tables."""
+"""A grid cut into rooms with the graph of its doors (seeds 2.7), and selections of its rooms."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from topomerge.types.arrays import Array, require
-from topomerge.types.grid import VoxelGrid
-from topomerge.types.levelling import levelling_of
+from topomerge.errors import InputError
+from topomerge.types.grid import Array, Sim3, VoxelGrid, require
+
+LEVELLED = "levelled"  # parameter of a map whose cloud was tilted: the matrix, row by row
+ROUNDING = 1e-9  # by which a rotation in a file may miss one
+
+
+def read_levelling(parameters: Mapping[str, Any]) -> Array:
+    """Read the levelling of a map from its parameters.
+
+    Returns:
+        (4, 4) float64: a rotation and a translation, m, that take points of the file into the frame of the map; the identity
+        where the cloud was level.
+
+    Raises:
+        ValueError: something else stands there.
+    """
+    return np.eye(4) if LEVELLED not in parameters else parse_levelling(parameters[LEVELLED])
+
+
+def parse_levelling(listed: Any) -> Array:
+    """Parse the (4, 4) matrix of a listing; ValueError where it is no rotation and translation."""
+    matrix = np.array(listed, np.float64)
+    proper = matrix.shape == (4, 4) and bool(np.isfinite(matrix).all()) and bool((matrix[3] == (0, 0, 0, 1)).all())
+    require(proper, "a levelling that is none")
+    rotation = matrix[:3, :3]
+    rigid = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=ROUNDING) and np.linalg.det(rotation) > 0
+    require(bool(rigid), "a levelling that is none")
+    return matrix
+
+
+def is_level(levelling: Array) -> bool:
+    """Is a levelling (4, 4) none, as that of a cloud that was level?"""
+    return bool(np.array_equal(levelling, np.eye(4)))
+
+
+def convert_pose_to_files(pose: Sim3, levelling: Array, into: Array) -> Array:
+    """Carry a pose between two maps over to their files.
+
+    Args:
+        pose: takes points of the one map into the frame of the other.
+        levelling: (4, 4) of the one map.
+        into: (4, 4) of the other one.
+
+    Returns:
+        (4, 4) float64 that takes points of the one file into the frame of the other.
+    """
+    if is_level(levelling) and is_level(into):
+        return pose.matrix
+    out: Array = np.linalg.inv(into) @ pose.matrix @ levelling
+    out[3] = 0, 0, 0, 1
+    return out
+
+
+def convert_pose_to_maps(matrix: Array, levelling: Array, into: Array) -> Array:
+    """Undo `convert_pose_to_files`: the (4, 4) matrix of the pose between two maps."""
+    if is_level(levelling) and is_level(into):
+        return matrix
+    out: Array = into @ matrix @ np.linalg.inv(levelling)
+    return out
+
+
+def transform_points(matrix: Array, points: Array) -> Array:
+    """Apply a matrix (4, 4) to points (n, 3), in float64."""
+    with np.errstate(invalid="ignore", over="ignore"):  # points may be nan or infinite
+        out: Array = np.asarray(points, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    return out
+
 
 JOINED = " + "  # between the sources of a joined map
 ROOM_DTYPE = np.dtype(
@@ -71,13 +136,13 @@ WINDOW_DTYPE = np.dtype(
 STOREY_DTYPE = np.dtype([("floor", "f8"), ("ceiling", "f8"), ("area", "f8")])  # m, m (nan: not seen), m2
 
 
-def door_state(edge: Array) -> str:
-    """How a door stands, a row of EDGE_DTYPE: open, half open or shut."""
+def classify_door_state(edge: Array) -> str:
+    """Classify how a door stands, a row of EDGE_DTYPE: open, half open or shut."""
     return "shut" if not edge["open"] else "half open" if edge["half"] else "open"
 
 
-def mostly_unseen(rooms: Array) -> Array:
-    """(R,) bool: was less of a room's outline seen than `GLIMPSED_SHARE`? What learned parts were trained with.
+def is_mostly_unseen(rooms: Array) -> Array:
+    """Return (R,) bool: was less of a room's outline seen than `GLIMPSED_SHARE`? What learned parts were trained with.
 
     Args:
         rooms: (R,) ROOM_DTYPE.
@@ -85,7 +150,7 @@ def mostly_unseen(rooms: Array) -> Array:
     return np.asarray(rooms["completeness"] < GLIMPSED_SHARE)
 
 
-def with_outline_odds(rooms: Array) -> Array:
+def add_outline_odds(rooms: Array) -> Array:
     """Rooms with what the outline alone says of them, for maps of which nothing better is known: those that are mostly unseen
     were only looked into, all are rooms, and none is outside.
 
@@ -93,7 +158,7 @@ def with_outline_odds(rooms: Array) -> Array:
         rooms: (R,) ROOM_DTYPE; stays as it is.
     """
     rooms = rooms.copy()
-    rooms["glimpsed"] = mostly_unseen(rooms)
+    rooms["glimpsed"] = is_mostly_unseen(rooms)
     rooms["confidence"], rooms["outside"] = 1.0, 0.0
     rooms["entered"] = rooms["whole"] = ~rooms["glimpsed"]
     return rooms
@@ -181,7 +246,7 @@ class TopometricMap:
     @property
     def levelling(self) -> Array:
         """(4, 4) float64 that takes points of its file into the frame of the map: the identity unless the cloud was tilted."""
-        return levelling_of(self.parameters)
+        return read_levelling(self.parameters)
 
     @property
     def open_edges(self) -> Array:
@@ -189,14 +254,68 @@ class TopometricMap:
         out: Array = self.edges[self.edges["open"]]
         return out
 
-    def storey_of_cells(self) -> Array:
+    def find_cell_storeys(self) -> Array:
         """(n,) int32 storey of each occupied cell: its room's, or for a cell without a room the last one whose floor is
         not above it."""
         if not len(self.storeys):
             return np.full(len(self.grid), -1, np.int32)
-        z = self.grid.centroids()[:, 2]
+        z = self.grid.compute_centroids()[:, 2]
         by_height = np.searchsorted(self.storeys["floor"] - 2 * self.grid.edge, z) - 1
         storey = np.clip(by_height, 0, None).astype(np.int32)
         with_room = self.room >= 0
         storey[with_room] = self.rooms["storey"][self.room[with_room]]
         return storey
+
+
+def select_rooms(map: TopometricMap, stays: Array) -> TopometricMap:
+    """Return the map of some of its rooms, numbered anew in their order.
+
+    Cells of the others are of no room, and their areas, doors and stairs are left out. A window of theirs stays
+    where the room on its other side does; it then leads to where nothing was seen. Storeys stay.
+
+    Args:
+        map: any map.
+        stays: (R,) bool.
+    """
+    number = np.append(np.where(stays, np.cumsum(stays) - 1, -1), -1).astype(np.int32)
+    of_area = stays[map.areas["room"]]
+    area_number = np.append(np.where(of_area, np.cumsum(of_area) - 1, -1), -1).astype(np.int32)
+    areas = map.areas[of_area].copy()
+    areas["room"] = number[areas["room"]]
+    edges = map.edges[stays[map.edges["rooms"]].all(axis=1)].copy()
+    narrows = map.narrows[of_area[map.narrows["rooms"]].all(axis=1)].copy()
+    edges["rooms"], narrows["rooms"] = number[edges["rooms"]], area_number[narrows["rooms"]]
+    windows = map.windows.copy()
+    ends = number[windows["rooms"]]
+    both = (ends >= 0).all(axis=1, keepdims=True)
+    windows["rooms"] = np.where(both, np.sort(ends, axis=1), -np.sort(-ends, axis=1))
+    assert map.navigable_area is not None
+    return replace(
+        map,
+        room=number[map.room],
+        navigable_room=number[map.navigable_room],
+        rooms=map.rooms[stays],
+        edges=edges,
+        areas=areas,
+        navigable_area=area_number[map.navigable_area],
+        narrows=narrows,
+        windows=windows[windows["rooms"][:, 0] >= 0],
+    )
+
+
+def filter_confident(map: TopometricMap, least: float) -> TopometricMap:
+    """The map without the rooms, doors, stairs and windows that are less likely than `least`; as `select_rooms` has it.
+
+    Args:
+        map: any map.
+        least: confidence from which on they stay, 0 to 1; 0: the map itself.
+
+    Raises:
+        InputError: `least` is no probability.
+    """
+    if not 0 <= least <= 1:
+        raise InputError(f"min_confidence {least}: is no probability; give a number from 0 to 1 (0 keeps everything)")
+    if least == 0:
+        return map
+    edges, windows = (table[table["confidence"] >= least] for table in (map.edges, map.windows))
+    return select_rooms(replace(map, edges=edges, windows=windows), map.rooms["confidence"] >= least)

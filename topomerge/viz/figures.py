@@ -14,10 +14,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from topomerge.io.atomic import replacing
-from topomerge.io.palette import room_colours
+from topomerge.io.archive import replace_on_success
+from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.types import TopometricMap
-from topomerge.viz.plan import Frame, Place, StoreyPlan, frame_of, places, storey_plans
+from topomerge.viz.plan import Frame, Place, StoreyPlan, compute_frame, find_label_places, rasterize_storeys
 
 PAPER, NO_ROOM, WALL_INK, TEXT_INK = "#ffffff", "#e4e4e4", "#333333", "#222222"
 EDGE_LINES: dict[str, dict[str, Any]] = {
@@ -34,7 +34,7 @@ NARROWEST = 3.0  # inches of a panel, which must hold its caption
 DPI = 150
 
 
-def plan_figure(map: TopometricMap) -> Figure:
+def plot_plan(map: TopometricMap) -> Figure:
     """Draw a map from above, one panel a storey at one scale, lowest first.
 
     Args:
@@ -43,37 +43,37 @@ def plan_figure(map: TopometricMap) -> Figure:
     Returns:
         A matplotlib figure that belongs to no window. The same map gives the same figure.
     """
-    frame = frame_of(map)
-    plans = storey_plans(map, frame)
-    named = [places(plan, frame) for plan in plans]
+    frame = compute_frame(map)
+    plans = rasterize_storeys(map, frame)
+    named = [find_label_places(plan, frame) for plan in plans]
     with mpl.rc_context():
         mpl.rcdefaults()  # the user's own style must not change what the file shows
         columns, inches = _arrange(len(plans), frame, named)
-        figure, axes = _panels(len(plans), columns, inches, frame)
-        colours = room_colours(map) / 255.0
+        figure, axes = _create_panels(len(plans), columns, inches, frame)
+        colours = assign_room_colours(map) / 255.0
         everywhere = {room: place for of_storey in named for room, place in of_storey.items()}
         for storey, (ax, plan) in enumerate(zip(axes, plans, strict=True)):
             _draw_cells(ax, plan, frame, colours)
             _draw_edges(ax, map, storey, everywhere)
             _draw_rooms(ax, named[storey], inches)
-            _label(ax, map, storey)
-        _scale_bar(figure, frame, inches)
-        _title(figure, map)
+            _label_panel(ax, map, storey)
+        _draw_scale_bar(figure, frame, inches)
+        _draw_title(figure, map)
     return figure
 
 
 def save_figure(map: TopometricMap, path: str | Path) -> None:
-    """Write `plan_figure` in the format that the name ends with (.png, .pdf, .svg, .jpg, …).
+    """Write `plot_plan` in the format that the name ends with (.png, .pdf, .svg, .jpg, …).
 
     Raises:
         InputError: the path can't be written.
         ValueError: an unknown format.
     """
-    figure = plan_figure(map)
+    figure = plot_plan(map)
     kind = Path(path).suffix.lower().removeprefix(".") or "png"
     # No date and no program's name, so that the same map gives the same file.
     undated = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
-    with mpl.rc_context({"svg.hashsalt": "topomerge"}), replacing(path) as beside, warnings.catch_warnings():
+    with mpl.rc_context({"svg.hashsalt": "topomerge"}), replace_on_success(path) as beside, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph")  # a sign in the scan's name that the font lacks is drawn as a box
         figure.savefig(beside, format=kind, dpi=DPI, metadata=undated.get(kind))
 
@@ -91,12 +91,12 @@ def _arrange(panels: int, frame: Frame, named: list[dict[int, Place]]) -> tuple[
 
     columns = max(range(1, panels + 1), key=lambda c: inches(c, PAGE))
     clear = sorted(place.clear for of_storey in named for place in of_storey.values())
-    wanted = 0.09 / clear[len(clear) // 4] if clear else 0.0  # a number of 6 points in three of four rooms
+    requested = 0.09 / clear[len(clear) // 4] if clear else 0.0  # a number of 6 points in three of four rooms
     fitting = inches(columns, PAGE)
-    return columns, max(fitting, min(wanted, inches(columns, (LARGEST_FIGURE, LARGEST_FIGURE))), 1e-6)
+    return columns, max(fitting, min(requested, inches(columns, (LARGEST_FIGURE, LARGEST_FIGURE))), 1e-6)
 
 
-def _panels(count: int, columns: int, inches: float, frame: Frame) -> tuple[Figure, list[Axes]]:
+def _create_panels(count: int, columns: int, inches: float, frame: Frame) -> tuple[Figure, list[Axes]]:
     """A figure with one panel a storey, sized so that a metre measures `inches` everywhere."""
     width, height = ((frame.high - frame.low) * inches).tolist()
     left, bottom, right, top = PANEL_MARGIN
@@ -165,7 +165,7 @@ def _draw_rooms(ax: Axes, named: dict[int, Place], inches: float) -> None:
         ax.text(place.x, place.y, str(room), fontsize=size, ha="center", va="center", color=TEXT_INK, zorder=5, bbox=disc)
 
 
-def _label(ax: Axes, map: TopometricMap, storey: int) -> None:
+def _label_panel(ax: Axes, map: TopometricMap, storey: int) -> None:
     ax.tick_params(labelsize=7, colors="#777777", length=2.5, width=0.6)
     ax.ticklabel_format(useOffset=False, style="plain")
     for spine in ax.spines.values():
@@ -177,7 +177,7 @@ def _label(ax: Axes, map: TopometricMap, storey: int) -> None:
         ax.set_title(text, fontsize=9, color=TEXT_INK, loc="left", pad=5)
 
 
-def _scale_bar(figure: Figure, frame: Frame, inches: float) -> None:
+def _draw_scale_bar(figure: Figure, frame: Frame, inches: float) -> None:
     """A bar of a round length above the legend; it holds for every panel."""
     width = float((frame.high - frame.low).max())
     length = max((s for s in (0.1, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500) if s <= 0.2 * width), default=0.1)
@@ -188,7 +188,7 @@ def _scale_bar(figure: Figure, frame: Frame, inches: float) -> None:
     figure.text(0.5 + half + 0.08 / across, y, f"{length:g} m", ha="left", va="center", fontsize=8, color=TEXT_INK)
 
 
-def _title(figure: Figure, map: TopometricMap) -> None:
+def _draw_title(figure: Figure, map: TopometricMap) -> None:
     rooms, storeys = len(map.rooms), len(map.storeys)
     counts = f"{rooms} room{'' if rooms == 1 else 's'}, {storeys} storey{'' if storeys == 1 else 's'}"
     high = figure.get_size_inches()[1]

@@ -1,12 +1,16 @@
-"""What a plan shows, as rasters: for each storey the rooms seen from above and the walls cut at a height."""
+"""What views of a map show: rasters of its storeys, and its cells in 3D."""
 
 from __future__ import annotations
 
+import base64
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
 
+from topomerge.io.rooms_ply import NO_ROOM, assign_room_colours
 from topomerge.types import Array, TopometricMap
 
 CUT = (1.0, 1.9)  # m above the floor: what fills this band is drawn as wall, as architects cut a plan
@@ -29,12 +33,12 @@ class Frame:
         """(2,) the far corner, m."""
         return self.low + np.asarray(self.shape) * self.size
 
-    def pixels(self, cells: Array) -> Array:
-        """(n, 2) pixels of (n, 3) cells."""
+    def compute_pixels(self, cells: Array) -> Array:
+        """Compute (n, 2) pixels of (n, 3) cells."""
         return (cells[:, :2] - self.first) // self.step
 
-    def centre(self, pixel: Array) -> Array:
-        """(..., 2) middle of pixels, m."""
+    def compute_centre(self, pixel: Array) -> Array:
+        """Compute (..., 2) middle of pixels, m."""
         return self.low + (np.asarray(pixel) + 0.5) * self.size
 
 
@@ -47,8 +51,8 @@ class StoreyPlan:
     wall: Array  # (nx, ny) bool
 
 
-def frame_of(map: TopometricMap) -> Frame:
-    """Pixels over all cells of the map, as many cells each as it takes to stay below `MAX_PIXELS`."""
+def compute_frame(map: TopometricMap) -> Frame:
+    """Compute pixels over all cells of the map, as many cells each as it takes to stay below `MAX_PIXELS`."""
     cells = np.concatenate([map.grid.cells, map.navigable.cells])[:, :2]
     if not len(cells):
         cells = np.zeros((1, 2), np.int32)
@@ -58,30 +62,30 @@ def frame_of(map: TopometricMap) -> Frame:
     return Frame(map.grid.origin[:2] + first * map.grid.edge, step * map.grid.edge, (nx, ny), first, step)
 
 
-def storey_plans(map: TopometricMap, frame: Frame) -> list[StoreyPlan]:
-    """A plan of each storey, lowest first; one plan of everything where the map has no storeys."""
+def rasterize_storeys(map: TopometricMap, frame: Frame) -> list[StoreyPlan]:
+    """Return a plan of each storey, lowest first; one plan of everything where the map has no storeys."""
     count = max(len(map.storeys), 1)
-    occupied = np.maximum(map.storey_of_cells(), 0)
+    occupied = np.maximum(map.find_cell_storeys(), 0)
     walked = np.where(map.navigable_room >= 0, map.rooms["storey"][map.navigable_room], -1) if len(map.rooms) else None
-    return [_plan(map, frame, s, occupied == s, None if walked is None else walked == s) for s in range(count)]
+    return [_rasterize_storey(map, frame, s, occupied == s, None if walked is None else walked == s) for s in range(count)]
 
 
-def _plan(map: TopometricMap, frame: Frame, storey: int, of_storey: Array, walked: Array | None) -> StoreyPlan:
+def _rasterize_storey(map: TopometricMap, frame: Frame, storey: int, of_storey: Array, walked: Array | None) -> StoreyPlan:
     cells, labels = map.grid.cells[of_storey], map.room[of_storey]
-    at = frame.pixels(cells)
+    at = frame.compute_pixels(cells)
     floor = np.zeros(frame.shape, bool)
     floor[at[:, 0], at[:, 1]] = True
     room = np.full(frame.shape, -1, np.int32)
     inside = labels >= 0
     room[at[inside, 0], at[inside, 1]] = labels[inside]
     if walked is not None:  # where one walks is surer than what hangs over it
-        x, y = frame.pixels(map.navigable.cells[walked]).T
+        x, y = frame.compute_pixels(map.navigable.cells[walked]).T
         room[x, y] = map.navigable_room[walked]
         floor[x, y] = True
-    return StoreyPlan(room, floor, _walls(map, frame, storey, cells, at))
+    return StoreyPlan(room, floor, _rasterize_walls(map, frame, storey, cells, at))
 
 
-def _walls(map: TopometricMap, frame: Frame, storey: int, cells: Array, at: Array) -> Array:
+def _rasterize_walls(map: TopometricMap, frame: Frame, storey: int, cells: Array, at: Array) -> Array:
     """(nx, ny) bool: the cut of the storey, at heights above its floor."""
     if not len(cells):
         return np.zeros(frame.shape, bool)
@@ -104,7 +108,7 @@ class Place:
     clear: float  # m to the nearest edge of the room's area
 
 
-def places(plan: StoreyPlan, frame: Frame) -> dict[int, Place]:
+def find_label_places(plan: StoreyPlan, frame: Frame) -> dict[int, Place]:
     """Room -> the point of its area with most space around it; of nearly equal ones the nearest to the middle."""
     of_rooms = {}
     for i, box in enumerate(ndimage.find_objects(plan.room + 1)):
@@ -117,6 +121,132 @@ def places(plan: StoreyPlan, frame: Frame) -> dict[int, Place]:
         options = np.argwhere(space >= 0.85 * space.max())
         middle = np.argwhere(mask).mean(axis=0)
         best = options[np.argmin(((options - middle) ** 2).sum(axis=1))]
-        x, y = frame.centre(best - 1 + np.array([box[0].start, box[1].start])).tolist()
+        x, y = frame.compute_centre(best - 1 + np.array([box[0].start, box[1].start])).tolist()
         of_rooms[i] = Place(x, y, float(space[tuple(best)]) * frame.size)
     return of_rooms
+
+
+MOST_DRAWN = 2_500_000  # cells that are drawn once the view rests; of a map with more, neighbours are merged
+LONGEST_AXIS = 65_535  # cells along an axis that 16 bits can number
+
+
+def build_scene_data(
+    map: TopometricMap,
+    key: str = "",
+    turn: float = 0.0,
+    most: int = MOST_DRAWN,
+    seen: Array | None = None,
+    only: Sequence[int] | Array | None = None,
+) -> dict[str, Any]:
+    """Build the data of the 3D view, as plain values.
+
+    Cells are grouped by storey, room and `seen`; within a group they are sorted by their number
+    (x * ny + y) * nz + z, of which the differences are kept as LEB128 in base64: about 1.3 bytes a cell.
+
+    Args:
+        map: any map.
+        key: what stands before the numbers of its rooms, as in its plan and tables.
+        turn: rad, by which its plan is turned against the clock: the camera stands accordingly.
+        most: with more cells than this, cubes of 2, 3, … cells along an axis become one, of the room most of them have.
+        seen: (n,) small ints, another label for which cells can be coloured (as of maps that saw them), or None.
+        only: rooms that are numbered and looked at; None: all.
+
+    Returns:
+        `edge` (m, of what is drawn), `merged` (cells along an axis that became one), `cells` (of the map), `drawn`, `origin`
+        (m), `shape`, `turn`, `look` (box around the rooms, m from `origin`, or None), `storeys` [{name, floor}],
+        `groups` [[storey, room, seen, cells]], `colours` {name: [hex for each group]},
+        `rooms` [[key, storey, x, y, z]] in m, `data`.
+    """
+    named = np.arange(len(map.rooms)) if only is None else np.asarray(only, np.int64)
+    seen = np.zeros(len(map.grid), np.int64) if seen is None else seen.astype(np.int64)
+    labels = np.stack([np.maximum(map.find_cell_storeys(), 0), map.room + 1, seen], axis=1).astype(np.int64)
+    low = map.grid.cells.min(axis=0) if len(map.grid) else np.zeros(3, np.int32)
+    cells = map.grid.cells.astype(np.int64) - low
+    factor, number, shape, kinds, kind = _merge_cells(cells, labels, most)
+    order = np.lexsort((number, kind))
+    groups = np.concatenate([kinds, np.bincount(kind, minlength=len(kinds))[:, None]], axis=1)
+    starts = np.concatenate([[0], np.cumsum(groups[:, 3])[:-1]]).astype(np.int64)
+    steps = np.diff(number[order], prepend=0)
+    steps[starts[groups[:, 3] > 0]] = number[order][starts[groups[:, 3] > 0]]  # each group starts anew
+    palette = np.concatenate([assign_room_colours(map), np.array([NO_ROOM], np.uint8)])
+    floors = map.storeys["floor"] if len(map.storeys) else [map.grid.origin[2] + low[2] * map.grid.edge]
+    return {
+        "edge": round(map.grid.edge * factor, 6),
+        "merged": factor,
+        "cells": len(map.grid),
+        "drawn": len(number),
+        "origin": [round(float(v), 4) for v in map.grid.origin + low * map.grid.edge],
+        "shape": shape,
+        "turn": round(turn, 6),
+        "look": _compute_corners(map.rooms[named], map.grid.origin + low * map.grid.edge),
+        "storeys": [{"name": str(i), "floor": round(float(f), 3)} for i, f in enumerate(floors)],
+        "groups": groups.tolist(),
+        "colours": {"room": [format_hex_colour(palette[room]) for room in kinds[:, 1]]},
+        "rooms": [[f"{key}{i}", int(map.rooms["storey"][i]), *_compute_middle(map.rooms[i])] for i in named.tolist()],
+        "data": base64.b64encode(encode_leb128(steps)).decode("ascii"),
+    }
+
+
+def format_hex_colour(colour: Array) -> str:
+    """Format a (3,) uint8 colour as #rrggbb."""
+    return "#" + bytes(colour.tolist()).hex()
+
+
+def _compute_corners(rooms: Array, origin: Array) -> list[list[float]] | None:
+    """The corners of the box around rooms, m from the scene's corner."""
+    if not len(rooms):
+        return None
+    low, high = rooms["lo"].min(axis=0) - origin, rooms["hi"].max(axis=0) - origin
+    return [low.round(3).tolist(), high.round(3).tolist()]
+
+
+def _compute_middle(room: Any) -> list[float]:
+    return [round(float(v), 2) for v in room["centroid"]]
+
+
+def _merge_cells(cells: Array, labels: Array, most: int) -> tuple[int, Array, list[int], Array, Array]:
+    """Cells along an axis that become one, then for each drawn cell its number, the shape, kinds and each cell's kind."""
+    longest = int(cells.max(initial=0)) + 1
+    factor = -(-longest // LONGEST_AXIS)
+    base = labels.max(axis=0, initial=0) + 1
+    code, kind = np.unique((labels[:, 0] * base[1] + labels[:, 1]) * base[2] + labels[:, 2], return_inverse=True)
+    kinds = np.stack([code // (base[1] * base[2]), code // base[2] % base[1] - 1, code % base[2]], axis=1)
+    while True:
+        coarse = cells // factor
+        shape = (coarse.max(axis=0) + 1).tolist() if len(cells) else [1, 1, 1]
+        number = (coarse[:, 0] * shape[1] + coarse[:, 1]) * shape[2] + coarse[:, 2]
+        if len(number) <= most and factor == 1:
+            return factor, number, shape, kinds, kind
+        number, winner = _find_most_common(number, kind, kinds)
+        if len(number) <= most:
+            return factor, number, shape, kinds, winner
+        factor += 1
+
+
+def _find_most_common(number: Array, kind: Array, kinds: Array) -> tuple[Array, Array]:
+    """One row for each number on each storey: with the kind that most of its cells have, the lowest of equal ones."""
+    storey = kinds[:, 0]
+    order = np.lexsort((kind, number))
+    number, kind = number[order], kind[order]
+    first = np.flatnonzero(np.concatenate([[True], (np.diff(number) != 0) | (np.diff(kind) != 0)]))
+    count = np.diff(np.append(first, len(number)))
+    number, kind = number[first], kind[first]
+    order = np.lexsort((kind, -count, storey[kind], number))
+    number, kind = number[order], kind[order]
+    best = np.concatenate([[True], (np.diff(number) != 0) | (np.diff(storey[kind]) != 0)])
+    return number[best], kind[best]
+
+
+def encode_leb128(values: Array) -> bytes:
+    """Encode unsigned ints, seven bits a byte, the lowest first; the top bit says that more follow."""
+    rest = values.astype(np.uint64)
+    size = np.ones(len(rest), np.int64)
+    for bits in range(7, 64, 7):
+        size += rest >= np.uint64(1 << bits)
+    at = np.cumsum(size) - size
+    out = np.zeros(int(size.sum()), np.uint8)
+    for k in range(int(size.max(initial=0))):
+        has = size > k
+        more = np.where(size[has] > k + 1, 0x80, 0)
+        out[at[has] + k] = (((rest[has] >> np.uint64(7 * k)) & np.uint64(0x7F)) | more.astype(np.uint64)).astype(np.uint8)
+    return out.tobytes()

@@ -1,32 +1,37 @@
-"""A report of a map: one HTML file with everything in it, which needs no network.
-
-The Python side writes plans (SVG) and tables that can be read and printed as they are; the scripts in `template/` add
-what moves: zoom, highlights, sorting and the 3D view. A page runs only the script whose hash it names, so that a name in
-a file could not bring its own.
-"""
+"""A report of a map: one HTML file, and a server for this machine only."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, unquote, urlsplit
 
 import numpy as np
 
 from topomerge import __version__
+from topomerge.errors import InputError
 from topomerge.fusion.result import BEND_PARAMETER
-from topomerge.io.atomic import replacing
+from topomerge.io.archive import replace_on_success
 from topomerge.types import Array, TopometricMap
-from topomerge.viz.markup import Markup, element, join, json_data
-from topomerge.viz.plan import StoreyPlan
-from topomerge.viz.scene import scene_data
-from topomerge.viz.sheet import Sheet, lay_out
-from topomerge.viz.svg import plan_svgs
-from topomerge.viz.tables import doors_table, facts, rooms_table, seconds_table, storeys_table
+from topomerge.viz.plan import StoreyPlan, build_scene_data
+from topomerge.viz.svg import Sheet, lay_out, render_plan_svgs
+from topomerge.viz.tables import (
+    Markup,
+    build_element,
+    embed_json,
+    join,
+    render_doors_table,
+    render_properties,
+    render_rooms_table,
+    render_seconds_table,
+    render_storeys_table,
+)
 
 SCRIPTS = ("plan.js", "tables.js", "camera.js", "cells.js", "scene.js", "merge.js", "places.js", "stamp.js", "page.js")
 BESIDE = " 'self' file:"  # what a page that looks for a newer one may read: a style sheet that lies beside it, never a script
@@ -38,75 +43,77 @@ def save_report(map: TopometricMap, path: str | Path) -> None:
     Raises:
         InputError: the path can't be written.
     """
-    text = report_html(map)
-    with replacing(path) as beside:
+    text = render_report_html(map)
+    with replace_on_success(path) as beside:
         beside.write_text(text, encoding="utf-8", errors="replace", newline="\n")
 
 
-def report_html(map: TopometricMap) -> str:
-    """The report of one map as HTML: plans and rooms, 3D, doors, and what it was made with."""
+def render_report_html(map: TopometricMap) -> str:
+    """Render the report of one map as HTML: plans and rooms, 3D, doors, and what it was made with."""
     title = map.title
     sheet, plans = lay_out(map)
-    rooms = element("div", plan_view(map, sheet, plans), scroller(rooms_table(map)), class_="beside")
-    origin = element("div", storeys_table(map), seconds_table(map), parameters(map), class_="facts-row")
+    rooms = build_element("div", render_plan_view(map, sheet, plans), render_scroller(render_rooms_table(map)), class_="beside")
+    origin = build_element(
+        "div", render_storeys_table(map), render_seconds_table(map), render_parameters(map), class_="facts-row"
+    )
     sections = [
-        summary(map),
-        warnings(map.warnings),
-        section("Plan and rooms", rooms, "plan"),
-        section("3D view", scene_view("scene-data"), "space"),
-        section("Doors and stairs", scroller(doors_table(map)), "doors"),
-        section("How it was made", origin, "made"),
+        render_summary(map),
+        render_warnings(map.warnings),
+        render_section("Plan and rooms", rooms, "plan"),
+        render_section("3D view", render_scene_view("scene-data"), "space"),
+        render_section("Doors and stairs", render_scroller(render_doors_table(map)), "doors"),
+        render_section("How it was made", origin, "made"),
     ]
-    return page(title, "Topometric map", sections, {"scene-data": scene_data(map, turn=sheet.turn)})
+    return render_page(title, "Topometric map", sections, {"scene-data": build_scene_data(map, turn=sheet.turn)})
 
 
-def page(
+def render_page(
     title: str, kind: str, sections: Sequence[Markup], data: Mapping[str, Any], stamp: str = "", stamped: str = "stamp"
 ) -> str:
-    """A whole page from the template.
+    """Render a whole page from the template.
 
     Args:
         title: what it is about; escaped.
         kind: what kind of report it is; escaped.
         sections: its content.
-        data: id -> a JSON value that the scripts read, as `scene_data`.
+        data: id -> a JSON value that the scripts read, as `build_scene_data`.
         stamp: of the page; an open one loads itself anew when `report_stamp.css` beside it holds another one. Empty: never.
         stamped: the name under which that file holds it.
     """
-    script = "".join(_template(name) for name in SCRIPTS)
-    mark = [element("i", id="stamp", data_stamp=stamp, data_name=stamped, hidden=True)] if stamp else []
+    script = "".join(_read_template(name) for name in SCRIPTS)
+    mark = [build_element("i", id="stamp", data_stamp=stamp, data_name=stamped, hidden=True)] if stamp else []
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
     parts = {
-        "title": element("title", f"{title} – {kind}"),
-        "heading": join([element("p", kind, class_="kind"), element("h1", title)]),
-        "style": element("style", Markup(_template("report.css"))),
+        "title": build_element("title", f"{title} – {kind}"),
+        "heading": join([build_element("p", kind, class_="kind"), build_element("h1", title)]),
+        "style": build_element("style", Markup(_read_template("report.css"))),
         "hash": Markup(digest),
         "styles": Markup(BESIDE if stamp else ""),
         "content": join([*sections, *mark]),
-        "data": join(json_data(value, id) for id, value in data.items()),
-        "script": element("script", Markup(script)),
+        "data": join(embed_json(value, id) for id, value in data.items()),
+        "script": build_element("script", Markup(script)),
         "version": Markup(__version__),
     }
     # In one pass: what is put in is not searched again.
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _template("report.html"))
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _read_template("report.html"))
 
 
-def _template(name: str) -> str:
+def _read_template(name: str) -> str:
     return (files("topomerge.viz") / "template" / name).read_text(encoding="utf-8")
 
 
-def section(title: str, content: str, id: str) -> Markup:
-    """A part of the page under a heading."""
-    return element("section", element("h2", title), content, id=id)
+def render_section(title: str, content: str, id: str) -> Markup:
+    """Render a part of the page under a heading."""
+    return build_element("section", build_element("h2", title), content, id=id)
 
 
-def scroller(content: str) -> Markup:
-    """A frame in which a long table scrolls on the screen."""
-    return element("div", content, class_="scroller", tabindex=0)
+def render_scroller(content: str) -> Markup:
+    """Render a frame in which a long table scrolls on the screen."""
+    return build_element("div", content, class_="scroller", tabindex=0)
 
 
-def summary(map: TopometricMap) -> Markup:
-    """The figures that one wants first."""
+def render_summary(map: TopometricMap) -> Markup:
+    """Render the figures that one wants first."""
     way = np.isin(map.edges["kind"], ("door", "opening"))
     shut = int((way & ~map.edges["open"]).sum())
     glimpsed = int(map.rooms["glimpsed"].sum())
@@ -120,31 +127,33 @@ def summary(map: TopometricMap) -> Markup:
         (f"{map.grid.edge * 100:.3g} cm", "cells", f"{len(map.grid):,} occupied".replace(",", "\u202f")),
     ]
     items = [
-        element("li", element("b", value), element("span", name), *([element("small", more)] if more else []))
+        build_element(
+            "li", build_element("b", value), build_element("span", name), *([build_element("small", more)] if more else [])
+        )
         for value, name, more in figures
         if value != "0"
     ]
-    return element("ul", *items, class_="summary")
+    return build_element("ul", *items, class_="summary")
 
 
-def warnings(messages: Sequence[str]) -> Markup:
-    """What the user should know; nothing where there is nothing."""
+def render_warnings(messages: Sequence[str]) -> Markup:
+    """Render the warnings for the user; nothing where there are none."""
     if not messages:
         return Markup("")
-    items = element("ul", *(element("li", message) for message in messages))
-    return element("aside", element("h2", "Warnings"), items, class_="warnings")
+    items = build_element("ul", *(build_element("li", message) for message in messages))
+    return build_element("aside", build_element("h2", "Warnings"), items, class_="warnings")
 
 
-def parameters(map: TopometricMap) -> Markup:
-    """What the map was made from and with."""
+def render_parameters(map: TopometricMap) -> Markup:
+    """Render the source and the parameters of the map."""
     values = {"source": map.source or "–", "voxel_size": float(map.grid.edge), **map.parameters}
     if isinstance(values.get(BEND_PARAMETER), list):  # hundreds of numbers
         values[BEND_PARAMETER] = f"of {len(values[BEND_PARAMETER])} of its maps"
-    return facts(values, "Parameters")
+    return render_properties(values, "Parameters")
 
 
-def storey_names(map: TopometricMap) -> list[tuple[str, str]]:
-    """Short name and caption of each storey that has a plan."""
+def list_storey_names(map: TopometricMap) -> list[tuple[str, str]]:
+    """List short name and caption of each storey that has a plan."""
     names = []
     for i, storey in enumerate(map.storeys):
         rooms = int((map.rooms["storey"] == i).sum())
@@ -154,14 +163,14 @@ def storey_names(map: TopometricMap) -> list[tuple[str, str]]:
     return names or [("Plan", "no storeys were found")]
 
 
-def plan_view(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan], colours: Array | None = None) -> Markup:
-    """All storeys' plans, as `lay_out` made them; the page's script shows one at a time, zooms and switches layers.
+def render_plan_view(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan], colours: Array | None = None) -> Markup:
+    """Render all storeys' plans, as `lay_out` made them; the page's script shows one at a time, zooms and switches layers.
 
     Args:
         colours: (R, 3) uint8 of the rooms; neighbours differ if None.
     """
-    names = storey_names(map)
-    choices = [element("button", name, type="button", data_storey=i) for i, (name, _) in enumerate(names) if len(names) > 1]
+    names = list_storey_names(map)
+    choices = [build_element("button", name, type="button", data_storey=i) for i, (name, _) in enumerate(names) if len(names) > 1]
     layers = [("labels", "numbers", True), ("graph", "graph", True), ("doors", "doors", True)]
     if len(map.narrows):
         layers.append(("areas", "areas", True))
@@ -169,31 +178,33 @@ def plan_view(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan], col
         layers.append(("all", "rooms of all storeys", False))
     boxes = []
     for layer, name, on in layers:
-        box = element("input", type="checkbox", checked=on, data_layer=layer)
-        boxes.append(element("label", box, f" {name}"))
+        box = build_element("input", type="checkbox", checked=on, data_layer=layer)
+        boxes.append(build_element("label", box, f" {name}"))
     if len(map.rooms):
-        slider = element("input", type="range", min=0, max=90, step=10, value=0, data_sure="")
-        boxes.append(element("label", "minimum confidence: ", slider))
-    groups = [("choices", choices), ("layers", boxes), ("zoom", zoom_buttons())]
-    bar = element("div", *(element("div", *parts, class_=name) for name, parts in groups if parts), class_="controls")
+        slider = build_element("input", type="range", min=0, max=90, step=10, value=0, data_sure="")
+        boxes.append(build_element("label", "minimum confidence: ", slider))
+    groups = [("choices", choices), ("layers", boxes), ("zoom", render_zoom_buttons())]
+    bar = build_element("div", *(build_element("div", *parts, class_=name) for name, parts in groups if parts), class_="controls")
     figures = [
-        element("figure", element("figcaption", element("b", name), f" {words}"), drawing, data_storey=i)
-        for i, ((name, words), drawing) in enumerate(zip(names, plan_svgs(map, sheet, plans, colours), strict=True))
+        build_element("figure", build_element("figcaption", build_element("b", name), f" {words}"), drawing, data_storey=i)
+        for i, ((name, words), drawing) in enumerate(zip(names, render_plan_svgs(map, sheet, plans, colours), strict=True))
     ]
-    hint = element("p", "Point at a room. Drag to move; click, then scroll to zoom.", class_="told", aria_live="polite")
-    return element("div", bar, element("div", *figures, class_="sheet", tabindex=0), hint, legend(map), class_="plan-view")
+    hint = build_element("p", "Point at a room. Drag to move; click, then scroll to zoom.", class_="told", aria_live="polite")
+    return build_element(
+        "div", bar, build_element("div", *figures, class_="sheet", tabindex=0), hint, render_legend(map), class_="plan-view"
+    )
 
 
-def zoom_buttons() -> list[Markup]:
-    """The buttons by which a plan is zoomed."""
+def render_zoom_buttons() -> list[Markup]:
+    """Render the buttons by which a plan is zoomed."""
     return [
-        element("button", sign, type="button", data_zoom=step, title=words, aria_label=words)
+        build_element("button", sign, type="button", data_zoom=step, title=words, aria_label=words)
         for sign, step, words in (("+", "in", "Zoom in"), ("−", "out", "Zoom out"), ("⤢", "all", "Show all"))
     ]
 
 
-def legend(map: TopometricMap) -> Markup:
-    """What the signs of the plan mean, of those that it has."""
+def render_legend(map: TopometricMap) -> Markup:
+    """Render the legend of the signs that the plan has."""
     way = np.isin(map.edges["kind"], ("door", "opening"))
     doors = map.edges["kind"] == "door"
     entries = [
@@ -207,11 +218,73 @@ def legend(map: TopometricMap) -> Markup:
         ("wall", "wall, cut at 1 to 1.9 m", True),
         ("seen", "seen, not a room", True),
     ]
-    items = [element("li", element("i", class_=f"sign-{sign}"), words) for sign, words, there in entries if there]
-    return element("ul", *items, class_="legend")
+    items = [build_element("li", build_element("i", class_=f"sign-{sign}"), words) for sign, words, there in entries if there]
+    return build_element("ul", *items, class_="legend")
 
 
-def scene_view(data: str) -> Markup:
-    """The place of a 3D view of the cells whose `scene_data` the page carries under the id `data`."""
+def render_scene_view(data: str) -> Markup:
+    """Render the place of a 3D view of the cells whose `build_scene_data` the page carries under the id `data`."""
     words = "The 3D view needs JavaScript and WebGL 2, which this browser does not offer. The plans above show the same rooms."
-    return element("div", element("p", words, class_="missing"), class_="scene", data_scene=data)
+    return build_element("div", build_element("p", words, class_="missing"), class_="scene", data_scene=data)
+
+
+HOME = "127.0.0.1"
+ATLAS_REPORT = "report.html"
+ATLAS_PAGES = re.compile(r"map_\d+(_tile_\d+)?\.html|report_stamp\.css")  # what the report of an atlas leads to, or looks for
+
+
+class _Handler(SimpleHTTPRequestHandler):
+    """Only the page, and of an atlas those that it leads to: what else lies beside it is nobody's business."""
+
+    page: Path
+    asked: Path
+
+    def send_head(self) -> Any:
+        host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
+        requested = unquote(urlsplit(self.path).path)
+        if host not in (HOME, "localhost"):  # a page from elsewhere that had its own name lead here
+            self.send_error(403)
+            return None
+        if requested == "/":
+            self.send_response(302)
+            self.send_header("Location", f"/{quote(self.page.name)}")
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+            return None
+        name = requested.removeprefix("/")
+        if name != self.page.name and not (ATLAS_PAGES.fullmatch(name) and self.page.name == ATLAS_REPORT):
+            self.send_error(404)
+            return None
+        self.asked = self.page.with_name(name)
+        return super().send_head()
+
+    def translate_path(self, path: str) -> str:
+        return str(self.asked)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        pass
+
+
+def serve(page: Path, port: int, tell: Callable[[str], object]) -> None:
+    """Serve one page at http://127.0.0.1 until Ctrl-C.
+
+    Args:
+        page: an HTML file.
+        port: 0 for any that is free.
+        tell: is called with the address once it can be opened.
+
+    Raises:
+        InputError: the port is taken or not allowed.
+    """
+    handler = type("Handler", (_Handler,), {"page": page.resolve()})
+    try:
+        server = ThreadingHTTPServer((HOME, port), handler)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise InputError(f"--serve {port}: the port can't be used ({reason}); leave it out for a free one") from error
+    with server:
+        tell(f"http://{HOME}:{server.server_port}/{quote(page.name)}")
+        try:
+            server.serve_forever(poll_interval=0.2)
+        except KeyboardInterrupt:
+            return

@@ -13,7 +13,7 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.result import AtlasResult
-from topomerge.io.palette import room_colours
+from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.types import Sim3, TopometricMap
 
 CELLS_SHOWN = 50_000  # of a component, at most
@@ -61,11 +61,11 @@ class RerunLog:
             map, pose = joined.get(n), Sim3()
             if map is None:
                 map, pose = result.maps[members[0]], result.transforms[members[0]]
-            low, high = _bounds(map, pose)
+            low, high = _compute_bounds(map, pose)
             entity = f"atlas/component_{n}"
             self._stream.log(entity, rr.Transform3D(translation=[left - low[0], -low[1], 0.0]))
-            self._map(entity, map, pose)
-            self._links(entity, result, members)
+            self._log_map(entity, map, pose)
+            self._log_links(entity, result, members)
             left += high[0] - low[0] + GAP
         self._stream.flush()
         self._change += 1
@@ -75,11 +75,11 @@ class RerunLog:
         self._stream.flush()
         self._stream.disconnect()
 
-    def _map(self, entity: str, map: TopometricMap, pose: Sim3) -> None:
+    def _log_map(self, entity: str, map: TopometricMap, pose: Sim3) -> None:
         """Cells, rooms and the ways between them."""
         rr, step = self._rerun, max(len(map.grid) // CELLS_SHOWN, 1)
-        colours = np.vstack([room_colours(map), [NO_LINK]])  # the last one is that of cells without a room
-        cells = pose.apply(map.grid.centroids()[::step])
+        colours = np.vstack([assign_room_colours(map), [NO_LINK]])  # the last one is that of cells without a room
+        cells = pose.apply(map.grid.compute_centroids()[::step])
         self._stream.log(f"{entity}/cells", rr.Points3D(cells, colors=colours[map.room[::step]], radii=map.grid.edge / 2))
         if not len(map.rooms):
             return
@@ -96,7 +96,7 @@ class RerunLog:
         ways = [pose.apply(np.array([middles[e["rooms"][0]], e["centre"], middles[e["rooms"][1]]])) for e in map.edges]
         self._stream.log(f"{entity}/graph", rr.LineStrips3D(ways, radii=0.03))
 
-    def _links(self, entity: str, result: AtlasResult, members: tuple[int, ...]) -> None:
+    def _log_links(self, entity: str, result: AtlasResult, members: tuple[int, ...]) -> None:
         """Where each map of a component begins, and the links between maps."""
         rr = self._rerun
         places = {k: np.array(result.transforms[k].translation) for k in members}
@@ -109,7 +109,7 @@ class RerunLog:
             self._stream.log(f"{entity}/links", rr.LineStrips3D(strips, labels=labels, radii=0.05))
 
 
-def _bounds(map: TopometricMap, pose: Sim3) -> tuple[np.ndarray, np.ndarray]:
+def _compute_bounds(map: TopometricMap, pose: Sim3) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest place (3,) of a map under a pose, m."""
-    cells = pose.apply(map.grid.centroids())
+    cells = pose.apply(map.grid.compute_centroids())
     return cells.min(axis=0), cells.max(axis=0)

@@ -1,21 +1,91 @@
-"""The tables of a report: rooms, doors, storeys, parameters and seconds, as HTML."""
+"""The tables of a report, as HTML into which nothing from outside can get as markup."""
 
 from __future__ import annotations
 
+import html
+import json
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from topomerge.io.listing import plain, room_words
-from topomerge.io.palette import room_colours
-from topomerge.types import TopometricMap, door_state
-from topomerge.viz.markup import Markup, element, join
-from topomerge.viz.scene import hex_colour
-from topomerge.viz.sureness import edge_sureness, room_sureness
+from topomerge.io.listing import convert_to_plain, describe_room
+from topomerge.io.rooms_ply import assign_room_colours
+from topomerge.types import TopometricMap, classify_door_state
+from topomerge.viz.plan import format_hex_colour
 
-ROOM_WORDS = {  # of `room_words`, and why
+CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")  # no text on a page needs them, and names of files may hold them
+VOID = frozenset(("br", "input", "meta", "col"))
+
+
+class Markup(str):
+    """Text that is markup already; any other string is escaped where it is put into an element."""
+
+    __slots__ = ()
+
+
+def _escape(text: str) -> str:
+    return html.escape(CONTROL.sub("\N{REPLACEMENT CHARACTER}", text))
+
+
+def build_element(name: str, *content: str, **attributes: Any) -> Markup:
+    """Build one element with its content.
+
+    Args:
+        name: its name.
+        content: `Markup` as it is; other strings escaped.
+        attributes: values are escaped. An underscore stands for a hyphen, one at the end is dropped (`class_`); None and
+            False leave the attribute out, True gives it without a value.
+    """
+    words = [name]
+    for key, value in attributes.items():
+        if value is None or value is False:
+            continue
+        key = key.rstrip("_").replace("_", "-")
+        words.append(key if value is True else f'{key}="{_escape(str(value))}"')
+    inside = "".join(part if isinstance(part, Markup) else _escape(part) for part in content)
+    if name in VOID:
+        return Markup(f"<{' '.join(words)}>")
+    return Markup(f"<{' '.join(words)}>{inside}</{name}>")
+
+
+def join(parts: Iterable[str], between: str = "") -> Markup:
+    """Join parts one after another; those that are no markup are escaped."""
+    safe = [part if isinstance(part, Markup) else _escape(part) for part in parts]
+    return Markup(between.join(safe))
+
+
+def embed_json(value: Any, id: str) -> Markup:
+    """A value for the page's script, in an element that is not run; it can't end that element before its time."""
+    text = json.dumps(value, allow_nan=False, ensure_ascii=True, separators=(",", ":"))
+    for sign in "<>&":
+        text = text.replace(sign, f"\\u{ord(sign):04x}")
+    return build_element("script", Markup(text), type="application/json", id=id)
+
+
+def format_room_confidence(room: Any) -> str:
+    """Format the confidence of a row of ROOM_DTYPE."""
+    return _format_probability(room["confidence"])
+
+
+def format_edge_confidence(map: TopometricMap, edge: Any) -> str:
+    """Format the confidence of a door, an opening or a flight of stairs: no more than of its two rooms."""
+    return _format_probability(min(edge["confidence"], *map.rooms["confidence"][edge["rooms"]]))
+
+
+def format_window_confidence(map: TopometricMap, window: Any) -> str:
+    """Format the confidence of a window: no more than of the surer one of its rooms."""
+    rooms = window["rooms"][window["rooms"] >= 0]
+    return _format_probability(min(window["confidence"], map.rooms["confidence"][rooms].max()))
+
+
+def _format_probability(odds: float) -> str:
+    return f"{odds:.3f}"
+
+
+ROOM_WORDS = {  # of `describe_room`, and why
     "outside": "probably outdoors",
     "glimpsed": "probably only looked into, through a door or a window",
     "doubtful": "probably not a room, or only part of one",
@@ -23,71 +93,73 @@ ROOM_WORDS = {  # of `room_words`, and why
 Column = tuple[str, str]  # heading; "number" or "text"
 
 
-def table(columns: Sequence[Column], rows: Iterable[Markup], caption: str) -> Markup:
-    """A table with a heading a column, by which the page's script sorts."""
-    heads = [element("th", name, class_=kind, scope="col") for name, kind in columns]
-    body = element("tbody", *rows)
-    return element("table", element("caption", caption), element("thead", element("tr", *heads)), body, class_="sortable")
+def render_table(columns: Sequence[Column], rows: Iterable[Markup], caption: str) -> Markup:
+    """Render a table with a heading a column, by which the page's script sorts."""
+    heads = [build_element("th", name, class_=kind, scope="col") for name, kind in columns]
+    body = build_element("tbody", *rows)
+    return build_element(
+        "table", build_element("caption", caption), build_element("thead", build_element("tr", *heads)), body, class_="sortable"
+    )
 
 
-def cell(content: str, value: float | None = None, kind: str = "number", **attributes: Any) -> Markup:
-    """One cell; `value` is what it is sorted by where that is not its text."""
+def render_cell(content: str, value: float | None = None, kind: str = "number", **attributes: Any) -> Markup:
+    """Render one cell; `value` is what it is sorted by where that is not its text."""
     number = None if value is None else f"{value:.6g}"
-    return element("td", content, class_=kind, data_value=number, **attributes)
+    return build_element("td", content, class_=kind, data_value=number, **attributes)
 
 
 def measure(value: float, digits: int, measured: bool = True) -> Markup:
     """A cell with a number, or a dash where it is not known."""
     if not measured or not math.isfinite(value):
-        return cell("–", -1.0)
-    return cell(f"{value:.{digits}f}", float(value))
+        return render_cell("–", -1.0)
+    return render_cell(f"{value:.{digits}f}", float(value))
 
 
-def room_link(key: str, room: int) -> Markup:
-    """A room's number, which points at it in every view."""
-    return element("a", str(room), data_room=f"{key}{room}", href="#", class_="room-link")
+def render_room_link(key: str, room: int) -> Markup:
+    """Render a room's number, which points at it in every view."""
+    return build_element("a", str(room), data_room=f"{key}{room}", href="#", class_="room-link")
 
 
-def share_bar(share: float) -> Markup:
-    """A share as a percentage and a bar."""
+def render_share_bar(share: float) -> Markup:
+    """Render a share as a percentage and a bar."""
     full = min(max(float(share), 0.0), 1.0)
-    bar = element("span", element("i", style=f"width:{100 * full:.0f}%"), class_="bar")
+    bar = build_element("span", build_element("i", style=f"width:{100 * full:.0f}%"), class_="bar")
     return join([bar, f"{100 * full:.0f} %"])
 
 
-def rooms_table(map: TopometricMap, key: str = "", only: Iterable[int] | None = None) -> Markup:
-    """All rooms, or some of them; rows carry `data-room`, `data-storey` and `data-sure`."""
+def render_rooms_table(map: TopometricMap, key: str = "", only: Iterable[int] | None = None) -> Markup:
+    """Render all rooms, or some of them; rows carry `data-room`, `data-storey` and `data-sure`."""
     names = ("room", "storey", "area m²", "height m", "seen", "entered", "confidence", "doors")
     columns = [*((name, "number") for name in names), ("leads to", "text")]
     several_storeys = len(map.storeys) > 1
     columns = [column for column in columns if several_storeys or column[0] != "storey"]
-    colours = room_colours(map)
+    colours = assign_room_colours(map)
     doors = np.bincount(map.edges["rooms"].ravel(), minlength=len(map.rooms))
     rows = []
-    neighbours = _neighbours(map)
+    neighbours = _list_neighbours(map)
     for i in range(len(map.rooms)) if only is None else only:
         room, beside = map.rooms[i], neighbours[i]
-        swatch = element("span", class_="swatch glimpsed" if room["glimpsed"] else "swatch",
-                         style=f"background-color:{hex_colour(colours[i])}")  # fmt: skip
-        seen = share_bar(room["completeness"])
-        words = [element("em", word, title=ROOM_WORDS[word]) for word in room_words(room)]
-        leads = join([*words, *(room_link(key, other) for other in beside)], " ")
+        swatch = build_element("span", class_="swatch glimpsed" if room["glimpsed"] else "swatch",
+                         style=f"background-color:{format_hex_colour(colours[i])}")  # fmt: skip
+        seen = render_share_bar(room["completeness"])
+        words = [build_element("em", word, title=ROOM_WORDS[word]) for word in describe_room(room)]
+        leads = join([*words, *(render_room_link(key, other) for other in beside)], " ")
         cells = [
-            cell(join([swatch, str(i)]), i),
-            *([cell(str(room["storey"]), int(room["storey"]))] if several_storeys else []),
+            render_cell(join([swatch, str(i)]), i),
+            *([render_cell(str(room["storey"]), int(room["storey"]))] if several_storeys else []),
             measure(room["area"], 1),
             measure(room["height"], 2, room["height"] > 0),
-            cell(seen, float(room["completeness"])),
-            *(cell(f"{100 * room[name]:.0f} %", float(room[name])) for name in ("entered", "confidence")),
-            cell(str(doors[i]), int(doors[i])),
-            cell(leads, kind="text"),
+            render_cell(seen, float(room["completeness"])),
+            *(render_cell(f"{100 * room[name]:.0f} %", float(room[name])) for name in ("entered", "confidence")),
+            render_cell(str(doors[i]), int(doors[i])),
+            render_cell(leads, kind="text"),
         ]
-        place = {"data_room": f"{key}{i}", "data_storey": int(room["storey"]), "data_sure": room_sureness(room)}
-        rows.append(element("tr", *cells, **place, tabindex=0))
-    return table(columns, rows, "Rooms")
+        place = {"data_room": f"{key}{i}", "data_storey": int(room["storey"]), "data_sure": format_room_confidence(room)}
+        rows.append(build_element("tr", *cells, **place, tabindex=0))
+    return render_table(columns, rows, "Rooms")
 
 
-def _neighbours(map: TopometricMap) -> list[list[int]]:
+def _list_neighbours(map: TopometricMap) -> list[list[int]]:
     beside: list[set[int]] = [set() for _ in map.rooms]
     for a, b in map.edges["rooms"].tolist():
         beside[a].add(b)
@@ -95,8 +167,8 @@ def _neighbours(map: TopometricMap) -> list[list[int]]:
     return [sorted(rooms) for rooms in beside]
 
 
-def doors_table(map: TopometricMap, key: str = "") -> Markup:
-    """All doors, openings, stairs and ramps; rows carry `data-edge` and `data-sure`."""
+def render_doors_table(map: TopometricMap, key: str = "") -> Markup:
+    """Render all doors, openings, stairs and ramps; rows carry `data-edge` and `data-sure`."""
     words, numbers = ("kind", "between", "storey", "state"), ("width m", "height m", "confidence", "x m", "y m")
     columns = [("no.", "number"), *((name, "text") for name in words), *((name, "number") for name in numbers)]
     rows = []
@@ -105,61 +177,72 @@ def doors_table(map: TopometricMap, key: str = "") -> Markup:
         storeys = sorted(set(map.rooms["storey"][[a, b]].tolist()))
         way = edge["kind"] in ("door", "opening")
         cells = [
-            cell(str(i), i),
-            cell(str(edge["kind"]), kind="text"),
-            cell(join([room_link(key, a), room_link(key, b)], " – "), a, kind="text"),
-            cell(" – ".join(texts(storeys)), storeys[0], kind="text"),
-            cell(door_state(edge) if way else "", kind="text"),
+            render_cell(str(i), i),
+            render_cell(str(edge["kind"]), kind="text"),
+            render_cell(join([render_room_link(key, a), render_room_link(key, b)], " – "), a, kind="text"),
+            render_cell(" – ".join(format_texts(storeys)), storeys[0], kind="text"),
+            render_cell(classify_door_state(edge) if way else "", kind="text"),
             measure(edge["width"], 2),
             measure(edge["height"], 2, edge["height"] > 0),
-            cell(f"{100 * edge['confidence']:.0f} %", float(edge["confidence"])),
+            render_cell(f"{100 * edge['confidence']:.0f} %", float(edge["confidence"])),
             measure(edge["centre"][0], 2),
             measure(edge["centre"][1], 2),
         ]
-        place = {"data_edge": f"{key}{i}", "data_storey": " ".join(texts(storeys)), "data_sure": edge_sureness(map, edge)}
-        rows.append(element("tr", *cells, **place, tabindex=0))
-    return table(columns, rows, "Doors, openings and stairs")
+        place = {
+            "data_edge": f"{key}{i}",
+            "data_storey": " ".join(format_texts(storeys)),
+            "data_sure": format_edge_confidence(map, edge),
+        }
+        rows.append(build_element("tr", *cells, **place, tabindex=0))
+    return render_table(columns, rows, "Doors, openings and stairs")
 
 
-def texts(values: Iterable[Any]) -> list[str]:
-    """Each value as text."""
+def format_texts(values: Iterable[Any]) -> list[str]:
+    """Format each value as text."""
     return [str(value) for value in values]
 
 
-def storeys_table(map: TopometricMap) -> Markup:
-    """Floor, ceiling, area and number of rooms of each storey."""
+def render_storeys_table(map: TopometricMap) -> Markup:
+    """Render floor, ceiling, area and number of rooms of each storey."""
     columns = [("storey", "number"), ("floor m", "number"), ("ceiling m", "number"), ("area m²", "number"), ("rooms", "number")]
     count = np.bincount(map.rooms["storey"], minlength=len(map.storeys))
     rows = []
     for i, storey in enumerate(map.storeys):
         numbers = [measure(storey["floor"], 2), measure(storey["ceiling"], 2), measure(storey["area"], 1)]
-        rows.append(element("tr", cell(str(i), i), *numbers, cell(str(count[i]))))
-    return table(columns, rows, "Storeys")
+        rows.append(build_element("tr", render_cell(str(i), i), *numbers, render_cell(str(count[i]))))
+    return render_table(columns, rows, "Storeys")
 
 
-def facts(values: Mapping[str, Any], caption: str) -> Markup:
-    """Names and values, such as the parameters of a map."""
-    rows = [element("tr", element("th", str(name), scope="row"), element("td", _text(value))) for name, value in values.items()]
-    return element("table", element("caption", caption), element("tbody", *rows), class_="facts")
+def render_properties(values: Mapping[str, Any], caption: str) -> Markup:
+    """Render names and values, such as the parameters of a map."""
+    rows = [
+        build_element("tr", build_element("th", str(name), scope="row"), build_element("td", _format_value(value)))
+        for name, value in values.items()
+    ]
+    return build_element("table", build_element("caption", caption), build_element("tbody", *rows), class_="facts")
 
 
-def _text(value: Any) -> str:
-    value = plain(value)
+def _format_value(value: Any) -> str:
+    value = convert_to_plain(value)
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, list):
-        return ", ".join(_text(item) for item in value)
+        return ", ".join(_format_value(item) for item in value)
     return str(value)
 
 
-def seconds_table(map: TopometricMap) -> Markup:
-    """Seconds of each step, with a bar by their share."""
+def render_seconds_table(map: TopometricMap) -> Markup:
+    """Render seconds of each step, with a bar by their share."""
     total = sum(map.seconds.values())
     rows = []
     for step, s in map.seconds.items():
-        share = cell(share_bar(s / total if total else 0), kind="share")
-        rows.append(element("tr", element("th", str(step), scope="row"), cell(f"{s:.2f}"), share))
-    rows.append(element("tr", element("th", "all", scope="row"), cell(f"{total:.2f}"), element("td"), class_="total"))
-    return element("table", element("caption", "Seconds"), element("tbody", *rows), class_="facts")
+        share = render_cell(render_share_bar(s / total if total else 0), kind="share")
+        rows.append(build_element("tr", build_element("th", str(step), scope="row"), render_cell(f"{s:.2f}"), share))
+    rows.append(
+        build_element(
+            "tr", build_element("th", "all", scope="row"), render_cell(f"{total:.2f}"), build_element("td"), class_="total"
+        )
+    )
+    return build_element("table", build_element("caption", "Seconds"), build_element("tbody", *rows), class_="facts")

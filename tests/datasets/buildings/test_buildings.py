@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import shapely
 from topomerge.datasets.buildings.layouts import SHAPES
-from topomerge.datasets.buildings.procedural import BUILDING_KINDS, connected, make_building
-from topomerge.datasets.core.building import SURFACES, Building
-from topomerge.datasets.core.difficulty import Difficulty
+from topomerge.datasets.buildings.procedural import BUILDING_KINDS, is_connected, make_building
+from topomerge.datasets.core.building import SURFACES, Building, Difficulty
 
 from topomerge.errors import InputError
 
@@ -28,7 +27,7 @@ def digest(building: Building) -> str:
 @pytest.mark.parametrize("storeys", [1, 3])
 def test_buildings_of_every_kind_are_sound(kind: str, storeys: int) -> None:
     building = make_building(kind, 3, storeys, EMPTY)
-    assert len(building.storeys) == storeys and connected(building)
+    assert len(building.storeys) == storeys and is_connected(building)
     shapes = [shapely.Polygon(r.polygon) for r in building.rooms]
     assert all(s.is_valid and s.exterior.is_ccw for s in shapes)
     areas = np.array([s.area for s in shapes])
@@ -48,7 +47,7 @@ def test_buildings_of_every_kind_are_sound(kind: str, storeys: int) -> None:
 @pytest.mark.parametrize("shape", SHAPES)
 def test_every_shape_of_corridor_can_be_asked_for(shape: str) -> None:
     building = make_building("office", 5, 1, EMPTY, shape=shape)
-    assert connected(building) and len(building.rooms) >= 5
+    assert is_connected(building) and len(building.rooms) >= 5
 
 
 @pytest.mark.longer

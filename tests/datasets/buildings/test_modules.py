@@ -6,10 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from topomerge.datasets.buildings.modules import MODULE_LAYOUTS, ModuleRow, draw_module, make_row, rooms_of
-from topomerge.datasets.buildings.refurnish import copied, refurnished, replaced, restrewn
-from topomerge.datasets.core.building import SURFACES
-from topomerge.datasets.core.difficulty import Difficulty
+from topomerge.datasets.buildings.modules import (
+    MODULE_LAYOUTS,
+    ModuleRow,
+    copy_furniture,
+    draw_module,
+    find_module_rooms,
+    make_row,
+    replace_clutter,
+    replace_furniture,
+    replace_things,
+)
+from topomerge.datasets.core.building import SURFACES, Difficulty
 
 COUNT = 4  # modules
 
@@ -27,7 +35,7 @@ def shifted(row: ModuleRow, k: int) -> np.ndarray:
 
 def test_inner_modules_are_congruent_a_period_apart(row) -> None:
     rooms = row.building.rooms
-    first, second = rooms_of(row.module, 1), rooms_of(row.module, 2)
+    first, second = find_module_rooms(row.module, 1), find_module_rooms(row.module, 2)
     assert len(first) == len(second) >= 2 and len(rooms) == COUNT * len(first)
     for i, j in zip(first, second, strict=True):
         assert rooms[i].kind == rooms[j].kind
@@ -45,7 +53,7 @@ def test_doors_stand_at_the_same_place_of_each_module_and_stand_open_alike(row) 
 
 
 def test_all_modules_can_be_reached_on_foot(row) -> None:
-    assert len(set(row.building.parts().tolist())) == 1
+    assert len(set(row.building.find_components().tolist())) == 1
 
 
 def test_windows_repeat_with_the_period(row) -> None:
@@ -59,9 +67,9 @@ def test_windows_repeat_with_the_period(row) -> None:
 
 
 def test_furniture_is_copied_thing_by_thing(row) -> None:
-    source, target = rooms_of(row.module, 1), rooms_of(row.module, 3)
-    filled = refurnished(row.building, source, 1.3, 0.8, np.random.default_rng(0))
-    both = copied(filled, source, target, shifted(row, 2))
+    source, target = find_module_rooms(row.module, 1), find_module_rooms(row.module, 3)
+    filled = replace_furniture(row.building, source, 1.3, 0.8, np.random.default_rng(0))
+    both = copy_furniture(filled, source, target, shifted(row, 2))
     things = both.things[both.things["kind"] != "leaf"]
     here, there = (things[np.isin(things["room"], rooms)] for rooms in (source, target))
     assert len(here) == len(there) > 0
@@ -76,13 +84,13 @@ def test_furniture_is_copied_thing_by_thing(row) -> None:
 
 def test_what_is_replaced_leaves_the_shell_alone(row) -> None:
     rng = np.random.default_rng(0)
-    filled = refurnished(row.building, range(len(row.building.rooms)), 1.3, 0.8, rng)
+    filled = replace_furniture(row.building, range(len(row.building.rooms)), 1.3, 0.8, rng)
     shell = [b.vertices[b.triangles[b.thing_of < 0]] for b in (row.building, filled)]
     assert np.array_equal(*shell)
-    bare = refurnished(filled, range(len(row.building.rooms)), 0.0, 0.0, rng)
+    bare = replace_furniture(filled, range(len(row.building.rooms)), 0.0, 0.0, rng)
     assert set(bare.things["kind"]) <= {"leaf", "column"} and len(bare.things) == len(row.building.things)
     gone = np.zeros(len(filled.things), bool)
-    same = replaced(filled, gone, [])
+    same = replace_things(filled, gone, [])
     assert np.array_equal(same.vertices[same.triangles], filled.vertices[filled.triangles])
     assert np.array_equal(same.thing_of, filled.thing_of)
 
@@ -91,8 +99,8 @@ def test_what_is_replaced_leaves_the_shell_alone(row) -> None:
 def test_only_clutter_is_strewn_anew(row) -> None:
     rng = np.random.default_rng(1)
     rooms = range(len(row.building.rooms))
-    filled = refurnished(row.building, rooms, 1.0, 2.0, rng)
-    again = restrewn(filled, rooms, 2.0, rng)
+    filled = replace_furniture(row.building, rooms, 1.0, 2.0, rng)
+    again = replace_clutter(filled, rooms, 2.0, rng)
     lasting = [b.things[b.things["kind"] != "clutter"] for b in (filled, again)]
     assert np.array_equal(*lasting)
     strewn = [b.things[b.things["kind"] == "clutter"]["centre"] for b in (filled, again)]

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import shapely
-from topomerge.datasets.buildings.erect import erect
-from topomerge.datasets.buildings.niches import BEHIND_NICHE, CORNER, NICHE_DEPTHS
+from topomerge.datasets.buildings.construction import build_building
+from topomerge.datasets.buildings.openings import BEHIND_NICHE, CORNER, NICHE_DEPTHS
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.pairs.wall_truth import true_classes
+from topomerge.datasets.pairs.wall_examples import compute_true_classes
 
 from tests.datasets.boxes import BARE, two_rooms
 from topomerge.extraction.elevations.elevation import ALONG, DEPTHS, FACE_DTYPE, STRIP_CHANNELS, WALL_CLASSES, Elevations
@@ -27,13 +27,13 @@ def walls_at(*faces: tuple[object, ...]) -> Elevations:
 
 
 def test_without_niches_buildings_stay_what_they_were():
-    one, same = erect([two_rooms()], BARE, 3), erect([two_rooms()], replace(BARE, niches=0.0), 3)
+    one, same = build_building([two_rooms()], BARE, 3), build_building([two_rooms()], replace(BARE, niches=0.0), 3)
     assert one.vertices.tobytes() == same.vertices.tobytes() and not len(one.niches)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_niches_lie_in_walls_and_leave_something_behind(seed):
-    building = erect([two_rooms()], MANY, seed)
+    building = build_building([two_rooms()], MANY, seed)
     assert len(building.niches) >= 2
     rooms = shapely.union_all([shapely.Polygon(r.polygon) for r in building.rooms])
     for niche in building.niches:
@@ -57,14 +57,14 @@ def test_the_same_seed_gives_the_same_niches_and_every_room_stays_reachable():
 
 
 def test_a_niche_is_labelled_on_its_own_face_alone():
-    building = erect([two_rooms()], MANY, 0)
+    building = build_building([two_rooms()], MANY, 0)
     niche = building.niches[0]
     out = np.array([np.cos(niche["direction"]), np.sin(niche["direction"])])
     along, before = np.array([-out[1], out[0]]), niche["centre"][:2] - niche["depth"] / 2 * out
     start = before - 2 * along
     own = (0, start, along, out, 4.0, 0.0)
     behind = (1, start + (niche["depth"] + 0.06) * out, along, -out, 4.0, 0.0)
-    truth = true_classes(building, walls_at(own, behind), Sim3(), None)
+    truth = compute_true_classes(building, walls_at(own, behind), Sim3(), None)
     at = np.flatnonzero(truth[:80] == WALL_CLASSES.index("niche")) * ALONG
     assert at.mean() + ALONG / 2 == pytest.approx(2.0, abs=ALONG) and np.ptp(at) + ALONG == pytest.approx(niche["width"], abs=0.1)
     assert not (truth[80:] == WALL_CLASSES.index("niche")).any()
@@ -72,8 +72,8 @@ def test_a_niche_is_labelled_on_its_own_face_alone():
 
 @pytest.mark.parametrize(("state", "name"), [("open", "open"), ("half", "half"), ("shut", "shut")])
 def test_doors_are_labelled_by_how_they_stand(state, name):
-    building = erect([two_rooms(state=state)], BARE, 0)
-    truth = true_classes(building, walls_at((0, (4.0, 0.5), (0, 1), (1, 0), 4.0, 0.0)), Sim3(), None)
+    building = build_building([two_rooms(state=state)], BARE, 0)
+    truth = compute_true_classes(building, walls_at((0, (4.0, 0.5), (0, 1), (1, 0), 4.0, 0.0)), Sim3(), None)
     there = np.flatnonzero(truth == WALL_CLASSES.index(name)) * ALONG + 0.5
     assert there.min() == pytest.approx(2.0, abs=ALONG) and there.max() == pytest.approx(2.9, abs=2 * ALONG)
     assert set(truth.tolist()) == {0, WALL_CLASSES.index(name)}
@@ -90,7 +90,7 @@ def test_a_cupboard_is_labelled_in_its_own_room_and_not_behind_the_wall():
     back = thing["centre"][:2] + (thing["size"][1] / 2 + 0.03) * out
     own = (0, back - 2 * along, along, out, 4.0, 0.0)
     beyond = (1, back + 0.12 * out - 2 * along, along, -out, 4.0, 0.0)
-    truth = true_classes(building, walls_at(own, beyond), Sim3(), None)
+    truth = compute_true_classes(building, walls_at(own, beyond), Sim3(), None)
     middle = slice(36, 44)
     assert (truth[:80][middle] == WALL_CLASSES.index("cupboard")).all()
     assert not (truth[80:][middle] == WALL_CLASSES.index("cupboard")).any()

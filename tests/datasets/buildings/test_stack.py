@@ -8,13 +8,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from topomerge.datasets.buildings.erect import erect
+from topomerge.datasets.buildings.construction import build_building
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.buildings.stack import COVER, DRAWN_WALLS, SURVEYED_WALLS, alike, iter_stacks, moved, register, stack
-from topomerge.datasets.buildings.stairwell import fit_flight
-from topomerge.datasets.core.plan import Opening, Plan
-from topomerge.datasets.pairs.parts import twin_rooms, two_parts
-from topomerge.datasets.simulation.twin_wing import bent, twin_wing
+from topomerge.datasets.buildings.stack import (
+    COVER,
+    DRAWN_WALLS,
+    SURVEYED_WALLS,
+    count_matching_rooms,
+    iter_stacks,
+    register,
+    stack_storeys,
+    transform_plan,
+)
+from topomerge.datasets.buildings.stairs import fit_flight
+from topomerge.datasets.core.building import Opening, Plan
+from topomerge.datasets.pairs.parts import find_twin_rooms, sample_two_parts
+from topomerge.datasets.simulation.twin_wing import make_twin_wing, stretch_building
 from topomerge.datasets.simulation.walk import plan_walk
 
 from tests.datasets.boxes import BARE, room
@@ -35,7 +44,7 @@ def storey(well: bool = True, extra: bool = False, height: float = 3.4) -> Plan:
 @pytest.mark.parametrize(("scale", "shift"), [(1.0, (0.0, 0.0)), (1.4, (30.0, -12.0)), (0.6, (-7.0, 55.0))])
 def test_a_storey_in_a_frame_of_its_own_is_found(scale: float, shift: tuple[float, float]) -> None:
     low, high = storey(extra=True), storey()
-    fit = register(low, moved(high, scale, np.array(shift)))
+    fit = register(low, transform_plan(high, scale, np.array(shift)))
     assert fit.walls > 0.9 and fit.cover > 0.9
     assert fit.scale == pytest.approx(1 / scale, rel=0.01)
     assert np.array(shift) * fit.scale + fit.shift == pytest.approx([0, 0], abs=0.2)
@@ -45,21 +54,21 @@ def test_storeys_that_do_not_fit_are_refused() -> None:
     turned = np.array([[0.8, 0.6], [-0.6, 0.8]])
     other = Plan(tuple(replace(r, polygon=r.polygon @ turned) for r in storey(extra=True).rooms))
     with pytest.raises(InputError, match="storeys do not fit: .* of the walls of storey 1"):
-        stack([storey(), other])
+        stack_storeys([storey(), other])
     with pytest.raises(InputError, match="over floor"):
-        stack([storey(), moved(storey(), 1.0, np.array([15.0, 6.0]))], common=True)
+        stack_storeys([storey(), transform_plan(storey(), 1.0, np.array([15.0, 6.0]))], common=True)
     with pytest.raises(InputError, match="two storeys or more"):
-        stack([storey()])
+        stack_storeys([storey()])
 
 
 def test_two_storeys_become_a_building_with_stairs_that_are_walked() -> None:
     low, high = storey(extra=True), storey()
-    result = stack([low, moved(high, 1.25, np.array([3.0, 4.0]))])
+    result = stack_storeys([low, transform_plan(high, 1.25, np.array([3.0, 4.0]))])
     assert result.stairs == (1,) and result.plans[0].flights[0].kind == "dogleg"
-    building = erect(result.plans, BARE)
+    building = build_building(result.plans, BARE)
     (stair,) = building.stairs
     assert [building.rooms[r].name for r in stair["rooms"]] == ["well", "well"] and stair["storeys"].tolist() == [0, 1]
-    assert len(set(building.parts())) == 1
+    assert len(set(building.find_components())) == 1
     names = {(r.name, r.storey): i for i, r in enumerate(building.rooms)}
     walk = plan_walk(building, [names["a", 0], names["c", 1]], np.random.default_rng(0))
     assert walk.points[:, 2].min() < 0.01 and walk.points[:, 2].max() > 3.39
@@ -70,16 +79,18 @@ def test_two_storeys_become_a_building_with_stairs_that_are_walked() -> None:
 
 
 def test_no_stairs_where_only_one_storey_has_a_stairwell() -> None:
-    result = stack([storey(), storey(well=False)])
+    result = stack_storeys([storey(), storey(well=False)])
     assert result.stairs == (0,) and not result.plans[0].flights
-    assert len(set(erect(result.plans, BARE).parts())) == 2
+    assert len(set(build_building(result.plans, BARE).find_components())) == 2
 
 
 def test_a_flight_goes_on_over_the_one_from_below() -> None:
-    result = stack([storey(), storey(), storey()])
+    result = stack_storeys([storey(), storey(), storey()])
     assert result.stairs == (1, 1) and result.plans[0].flights == result.plans[1].flights
-    assert len(set(erect(result.plans, BARE).parts())) == 1
-    assert stack([storey(), storey(height=4.6), storey()]).stairs == (1, 0), "a storey that is too high for the same flight"
+    assert len(set(build_building(result.plans, BARE).find_components())) == 1
+    assert stack_storeys([storey(), storey(height=4.6), storey()]).stairs == (1, 0), (
+        "a storey that is too high for the same flight"
+    )
 
 
 def test_a_flight_leaves_the_doors_free() -> None:
@@ -90,11 +101,11 @@ def test_a_flight_leaves_the_doors_free() -> None:
 
 
 def test_parts_over_stairs() -> None:
-    building = erect(stack([storey(extra=True), storey()]).plans, BARE)
-    a, b = two_parts(building, 5, 0.6, np.random.default_rng(1), over_stairs=True)
+    building = build_building(stack_storeys([storey(extra=True), storey()]).plans, BARE)
+    a, b = sample_two_parts(building, 5, 0.6, np.random.default_rng(1), over_stairs=True)
     for part in (a, b):
         assert {building.rooms[i].storey for i in part} == {0, 1}
-    a, b = two_parts(building, 4, 0.0, np.random.default_rng(1), over_stairs=True)
+    a, b = sample_two_parts(building, 4, 0.0, np.random.default_rng(1), over_stairs=True)
     assert not set(a) & set(b)
 
 
@@ -102,8 +113,8 @@ def test_storeys_that_are_nearly_alike() -> None:
     low, high = storey(), storey()
     grown = replace(high.rooms[2], polygon=high.rooms[2].polygon * (1.0, 0.96) + (0.0, 0.1))
     high = replace(high, rooms=(*high.rooms[:2], grown, *high.rooms[3:]))
-    assert alike(low, high) == 5
-    twins = twin_rooms(erect([low, high], BARE))
+    assert count_matching_rooms(low, high) == 5
+    twins = find_twin_rooms(build_building([low, high], BARE))
     assert twins == {i: i + 5 for i in range(5)}
 
 
@@ -111,26 +122,26 @@ def test_storeys_that_are_nearly_alike() -> None:
 def test_a_twin_wing_is_nearly_the_same() -> None:
     building = make_building("hotel", 5)
     for seed in range(3):
-        twin = twin_wing(building, seed)
+        twin = make_twin_wing(building, seed)
         assert [r.kind for r in twin.rooms] == [r.kind for r in building.rooms]
         areas = [np.array([shapely.Polygon(r.polygon).area for r in b.rooms]) for b in (building, twin)]
         ratio = areas[1] / areas[0]
         assert ratio.min() > 0.6 and ratio.max() < 1.4 and (np.abs(ratio - 1) > 0.02).any() and (np.abs(ratio - 1) < 1e-3).any()
         assert all(shapely.Polygon(r.polygon).exterior.is_ccw for r in twin.rooms)
         plan_walk(twin, [0, len(twin.rooms) - 1], np.random.default_rng(0))
-    same, other = twin_wing(building, 1), twin_wing(building, 2)
-    assert same.vertices.tobytes() == twin_wing(building, 1).vertices.tobytes() != other.vertices.tobytes()
+    same, other = make_twin_wing(building, 1), make_twin_wing(building, 2)
+    assert same.vertices.tobytes() == make_twin_wing(building, 1).vertices.tobytes() != other.vertices.tobytes()
 
 
 def test_bent_by_hand() -> None:
     building = make_building("house", 3)
-    mirrored = bent(building, 0, lambda x: x, mirrored=True)
+    mirrored = stretch_building(building, 0, lambda x: x, mirrored=True)
     assert np.allclose(mirrored.vertices * (-1, 1, 1), building.vertices)
     corners = mirrored.vertices[mirrored.triangles].astype(float)
     before = building.vertices[building.triangles].astype(float)
     normal, old = (np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]) for c in (corners, before))
     assert np.allclose(normal * (-1, 1, 1), old, atol=1e-4), "faces still look at the free space"
-    wider = bent(building, 0, lambda x: 2 * x)
+    wider = stretch_building(building, 0, lambda x: 2 * x)
     across = np.abs(np.sin(building.doors["direction"])) > 0.99
     assert np.allclose(wider.doors["width"][across], 2 * building.doors["width"][across], rtol=1e-6)
     assert np.allclose(wider.doors["width"][~across], building.doors["width"][~across], rtol=1e-6)
@@ -147,8 +158,8 @@ def test_real_storeys(data_dir: Path, folder: str, stacks: int, joined: int) -> 
         assert (
             result.fits[0].walls >= (SURVEYED_WALLS if result.fits[0].common else DRAWN_WALLS) and result.fits[0].cover >= COVER
         )
-        building = erect(result.plans, BARE)
-        walked = [p for p, r in zip(building.parts(), building.rooms, strict=True) if r.kind != "lift"]
+        building = build_building(result.plans, BARE)
+        walked = [p for p, r in zip(building.find_components(), building.rooms, strict=True) if r.kind != "lift"]
         assert len(set(walked)) == (1 if result.stairs[0] else 2), result.names
         for stair in building.stairs[building.stairs["kind"] != "lift"]:
             walk = plan_walk(building, stair["rooms"].tolist(), np.random.default_rng(0))

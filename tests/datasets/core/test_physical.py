@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 
 import pytest
-from topomerge.datasets.core.physical import named_storey, physical_building
+from topomerge.datasets.core.building import find_physical_building, parse_storey_name
 from topomerge.datasets.plans import splits
 
 HOTEL = "rmf_demos_maps/maps/hotel/"
@@ -33,7 +33,7 @@ HOTEL = "rmf_demos_maps/maps/hotel/"
     ],
 )
 def test_names_of_one_building(source, names) -> None:
-    assert len({physical_building(source, name) for name in names}) == 1
+    assert len({find_physical_building(source, name) for name in names}) == 1
 
 
 @pytest.mark.parametrize(
@@ -54,31 +54,31 @@ def test_names_of_one_building(source, names) -> None:
     ],
 )
 def test_names_of_as_many_buildings(source, names) -> None:
-    assert len({physical_building(source, name) for name in names}) == len(names)
+    assert len({find_physical_building(source, name) for name in names}) == len(names)
 
 
 def test_one_building_of_two_owners() -> None:
-    assert physical_building("ipa", "Freiburg101_scan_furnitures") == physical_building("carmen", "freiburg-101")
-    assert physical_building("ipa-plan", "Freiburg101_scan") == physical_building("ipa", "Freiburg101_scan")
-    assert physical_building("gdc", "3") == physical_building("utexas", "gdc")
+    assert find_physical_building("ipa", "Freiburg101_scan_furnitures") == find_physical_building("carmen", "freiburg-101")
+    assert find_physical_building("ipa-plan", "Freiburg101_scan") == find_physical_building("ipa", "Freiburg101_scan")
+    assert find_physical_building("gdc", "3") == find_physical_building("utexas", "gdc")
 
 
 def test_of_two_buildings_the_first() -> None:
-    assert physical_building("procedural", "office-3-1 + office-5-1") == physical_building("procedural", "office-3-1")
+    assert find_physical_building("procedural", "office-3-1 + office-5-1") == find_physical_building("procedural", "office-3-1")
 
 
 def test_the_lists_of_the_splits_part_no_building() -> None:
     buildings = Counter()
     for split in splits.SPLITS:
-        named = [(s, n) for s in splits.FOLDERS for n in splits.members(split, s)]
+        named = [(s, n) for s in splits.FOLDERS for n in splits.list_members(split, s)]
         assert named
-        buildings.update({physical_building(*n) for n in named})
+        buildings.update({find_physical_building(*n) for n in named})
     assert max(buildings.values()) == 1
 
 
 def test_storeys_by_name() -> None:
-    assert named_storey("Sabadell2") == ("sabadell", 2)
-    assert named_storey("B1") == ("", -1)
-    assert named_storey("3ne") == ("", 3.5)
-    assert named_storey("bluefieldschoolfirstfloor") == ("bluefieldschool", 1)
-    assert named_storey("herndon") == ("herndon", 0)
+    assert parse_storey_name("Sabadell2") == ("sabadell", 2)
+    assert parse_storey_name("B1") == ("", -1)
+    assert parse_storey_name("3ne") == ("", 3.5)
+    assert parse_storey_name("bluefieldschoolfirstfloor") == ("bluefieldschool", 1)
+    assert parse_storey_name("herndon") == ("herndon", 0)

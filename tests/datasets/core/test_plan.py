@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from topomerge.datasets.core.plan import Opening, Plan, PlanRoom, check_plan
+from topomerge.datasets.core.building import Opening, Plan, PlanRoom, check_plan
 
 from tests.datasets.boxes import one_room, room, two_rooms
 from topomerge.errors import InputError

@@ -15,18 +15,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from topomerge.datasets.core import builder as module
-from topomerge.datasets.core.builder import Row
-from topomerge.datasets.core.plan import Opening, Plan
+from topomerge.datasets.core.builder import BuildRow
+from topomerge.datasets.core.building import Opening, Plan
 from topomerge.datasets.pairs import example, items
 from topomerge.datasets.pairs.build import Build, build, main
 from topomerge.datasets.pairs.example import PairSet, load_example
-from topomerge.datasets.pairs.items import Item, draw_items, plans_of
-from topomerge.datasets.pairs.recipe import Recipe, check
+from topomerge.datasets.pairs.items import Item, Recipe, check, draw_items, select_plans
 
 from tests.datasets.boxes import room
 from tests.package_copy import copied, edited_kernel
 from tests.recipes import SMALL_HOUSES
-from topomerge.code_digest import code_digest, data_digest
+from topomerge.code_digest import compute_code_digest, compute_data_digest
 from topomerge.config import compose
 from topomerge.errors import InputError
 
@@ -70,7 +69,7 @@ def test_what_is_there_is_not_made_again(whole: Path) -> None:
 def test_another_kernel_refuses_cached_maps(monkeypatch, tmp_path, addition: str, maps: bool, same: bool) -> None:
     item = replace(draw_items(SMALL, {})[0], maps=maps)
     before = item.name
-    monkeypatch.setattr(items, "code_digest", partial(code_digest, package=edited_kernel(tmp_path, addition)))
+    monkeypatch.setattr(items, "compute_code_digest", partial(compute_code_digest, package=edited_kernel(tmp_path, addition)))
     assert (item.name == before) is same
 
 
@@ -80,7 +79,7 @@ def test_other_weights_of_the_extraction_refuse_cached_pairs(monkeypatch, tmp_pa
     before, package = item.name, copied(tmp_path)
     with (package / "networks" / "plan_network.onnx").open("r+b") as file:
         file.write(b" ")
-    for digest in (code_digest, data_digest):
+    for digest in (compute_code_digest, compute_data_digest):
         monkeypatch.setattr(items, digest.__name__, partial(digest, package=package))
     assert item.name != before
 
@@ -163,7 +162,7 @@ def test_real_storeys_are_stacked_where_the_recipe_says_so() -> None:
     assert all(set(i.buildings) <= {"x", "y"} for i in items if i.storeys == 1)
     assert 0.3 < np.mean([i.over_stairs for i in stacked]) < 0.7 and not any(i.over_stairs for i in items if i.storeys == 1)
     assert not any(i.storeys == 2 for i in draw_items(replace(recipe, stacks=0.0), plans))
-    assert plans_of(stacked[0], plans)[0] == (one, one)
+    assert select_plans(stacked[0], plans)[0] == (one, one)
 
 
 def test_what_takes_too_long_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -248,16 +247,16 @@ def test_no_scheduler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         build(Build(SMALL, str(tmp_path), cluster="tcp://127.0.0.1:9"))
 
 
-def crash(item: Item, plans: list[Plan], folder: str) -> Row:
+def crash(item: Item, plans: list[Plan], folder: str) -> BuildRow:
     """Stands in for `make_file`: the second item kills its worker."""
     if item.name == draw_items(SMALL, {})[1].name:
         os.kill(os.getpid(), signal.SIGKILL)
-    return Row(item.name, "", 0.0)
+    return BuildRow(item.name, "", 0.0)
 
 
-def misnamed(item: Item, plans: list[Plan], folder: str) -> Row:
+def misnamed(item: Item, plans: list[Plan], folder: str) -> BuildRow:
     """Stands in for `make_file`: a file that no task asked for."""
-    return Row(f"{item.name}.3", "", 0.0)
+    return BuildRow(f"{item.name}.3", "", 0.0)
 
 
 def test_a_file_of_another_name_ends_the_building() -> None:

@@ -9,8 +9,8 @@ import pytest
 import shapely
 from scipy.spatial import cKDTree
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.pairs.drawing import draw, with_plan
-from topomerge.datasets.pairs.flat import raise_flat
+from topomerge.datasets.pairs.drawing import draw, replace_map_with_plan
+from topomerge.datasets.pairs.flat_maps import extrude_flat
 from topomerge.datasets.pairs.pairs import PairSettings, make_pair
 
 from topomerge.errors import InputError
@@ -26,14 +26,14 @@ def test_walls_stand_where_rooms_end_and_doors_are_open() -> None:
     free = shapely.union_all(shapely.points(flat.free)[::7]).buffer(0.1)
     inner = building.doors[(building.doors["rooms"] >= 0).all(axis=1)]
     assert shapely.distance(free, shapely.points(inner["centre"][:, :2])).max() < 0.2
-    map = extract(raise_flat(flat), carve=False)
+    map = extract(extrude_flat(flat), carve=False)
     assert abs(len(map.rooms) - len(building.rooms)) <= 2 and len(map.edges) >= 0.7 * len(inner)
 
 
 def test_the_plan_lies_where_the_scan_would_be() -> None:
     building = make_building("house", 3)
     pair = make_pair(building, PairSettings(0.5, ("depth", "depth"), 4), 4)
-    drawn = with_plan(pair, building)
+    drawn = replace_map_with_plan(pair, building)
     assert drawn.truth == pair.truth and drawn.sensors == ("depth", "drawing")
     assert drawn.truth is not None and drawn.frames is not None
     for room, other in zip(drawn.a.rooms, drawn.b.rooms, strict=True):
@@ -42,7 +42,7 @@ def test_the_plan_lies_where_the_scan_would_be() -> None:
         assert abs(drawn.truth.apply(corners)[0, 2] - room.floor) < 0.05
     assert len(drawn.shared) >= len(pair.visited[0])
     with pytest.raises(InputError, match="one storey"):
-        with_plan(replace(pair, kind="twin-wing", shared=()), building)
+        replace_map_with_plan(replace(pair, kind="twin-wing", shared=()), building)
 
 
 @pytest.mark.longer

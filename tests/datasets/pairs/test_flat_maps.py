@@ -10,12 +10,10 @@ import shapely
 from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.core.building import Building
 from topomerge.datasets.pairs import drawing
-from topomerge.datasets.pairs.atlases import FLAT_KINDS, make_atlas, partial_map
-from topomerge.datasets.pairs.items import draw_items
-from topomerge.datasets.pairs.recipe import Recipe, check
-from topomerge.datasets.pairs.robot_grid import GRID_CELL, counted_rays
-from topomerge.datasets.simulation.sensors import get_sensor
-from topomerge.datasets.simulation.spoils import drifting
+from topomerge.datasets.pairs.atlases import FLAT_KINDS, make_atlas, simulate_partial_map
+from topomerge.datasets.pairs.flat_maps import GRID_CELL, count_rays
+from topomerge.datasets.pairs.items import Recipe, check, draw_items
+from topomerge.datasets.simulation.sensors import get_sensor, scale_sensor_drift
 
 from tests.recipes import SMALL_HOUSES
 from topomerge.errors import InputError
@@ -35,7 +33,7 @@ def test_a_cell_is_occupied_where_rays_end_and_free_where_they_pass():
     """Rays from one place to a wall 2 m ahead: the wall's cells are occupied, those before it free, those behind it unknown."""
     across = np.linspace(-1.0, 1.0, 400)
     ends = np.column_stack([np.full(400, 2.01), across])
-    occupied, free, corner = counted_rays(np.zeros((400, 2)), ends)
+    occupied, free, corner = count_rays(np.zeros((400, 2)), ends)
     y, x = ((np.argwhere(occupied) + 0.5) * GRID_CELL + corner[::-1]).T
     assert np.allclose(x, 2.025) and y.min() < -0.95 and y.max() > 0.95
     y, x = ((np.argwhere(free) + 0.5) * GRID_CELL + corner[::-1]).T
@@ -48,14 +46,14 @@ def test_a_cell_that_most_rays_pass_is_free():
     starts = np.zeros((101, 2))
     ends = np.tile([[3.01, 0.01]], (101, 1))
     ends[0] = [1.01, 0.01]
-    occupied, free, corner = counted_rays(starts, ends)
+    occupied, free, corner = count_rays(starts, ends)
     row, column = np.floor((np.array([0.01, 1.01]) - corner[::-1]) / GRID_CELL).astype(int)
     assert free[row, column] and not occupied[row, column] and occupied.sum() == 1
 
 
 @pytest.mark.parametrize("kind", FLAT_KINDS)
 def test_flat_maps_tell_the_true_rooms_of_their_points(kind: str, house: Building):
-    cloud = partial_map(house, kind, np.arange(len(house.rooms)), np.random.default_rng(0), FRAME, drift=0.0)
+    cloud = simulate_partial_map(house, kind, np.arange(len(house.rooms)), np.random.default_rng(0), FRAME, drift=0.0)
     assert cloud.labels is not None and len(cloud.rooms) == len(house.rooms)
     room = max(range(len(house.rooms)), key=lambda i: shapely.Polygon(house.rooms[i].polygon).area)
     outline = shapely.Polygon(FRAME.apply(np.column_stack([house.rooms[room].polygon, np.zeros(len(house.rooms[room].polygon))])))
@@ -69,7 +67,7 @@ def test_flat_maps_tell_the_true_rooms_of_their_points(kind: str, house: Buildin
 
 def test_a_robot_draws_what_it_drove_through_and_an_architect_also_what_lies_about_it(house: Building):
     some = np.array([0, 1])
-    grid, plan = (partial_map(house, kind, some, np.random.default_rng(1), Sim3(), 0.0) for kind in FLAT_KINDS)
+    grid, plan = (simulate_partial_map(house, kind, some, np.random.default_rng(1), Sim3(), 0.0) for kind in FLAT_KINDS)
     assert grid.free is not None and plan.free is None
     assert len(np.unique(plan.labels[plan.labels >= 0])) >= 2
 
@@ -79,22 +77,22 @@ def test_a_drawing_has_arcs_outlines_and_names_or_walls_alone(house: Building, m
     counts = []
     for shares in ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 1.0, 1.0)):
         monkeypatch.setattr(drawing, "SYMBOLS_SHARES", shares)
-        cloud = partial_map(house, "drawing", every, np.random.default_rng(2), Sim3())
+        cloud = simulate_partial_map(house, "drawing", every, np.random.default_rng(2), Sim3())
         counts.append(int((cloud.points[:, 2] > cloud.points[:, 2].min() + 1.0).sum()))
     bare, *each, full = counts
     assert all(bare < count < full for count in each)
 
 
 def test_a_leaf_swings_from_its_hinge_to_the_other_end_of_the_opening(house: Building):
-    door = drawing.inner_doors(house, 0)[0].copy()
+    door = drawing.find_inner_doors(house, 0)[0].copy()
     door["state"] = "shut"
-    leaf, arc = drawing._leaf_and_arc(door, np.random.default_rng(0))
+    leaf, arc = drawing._draw_leaf_and_arc(door, np.random.default_rng(0))
     assert np.allclose(np.hypot(*(arc - leaf[0]).T), door["width"])
     assert np.allclose(leaf[1], arc[-1])
     centre = np.array(door["centre"][:2])
     assert np.hypot(*((leaf[0] + arc[0]) / 2 - centre)) == pytest.approx(door["thickness"] / 2, abs=1e-9)
     door["state"] = "none"
-    assert not drawing._leaf_and_arc(door, np.random.default_rng(0))
+    assert not drawing._draw_leaf_and_arc(door, np.random.default_rng(0))
 
 
 def test_maps_of_one_building_fit_by_their_true_transforms_whatever_made_them(house: Building):
@@ -124,5 +122,5 @@ def test_items_draw_flat_maps_and_drifts_and_what_makes_no_sense_is_refused():
 
 
 def test_a_multiple_of_the_drift_is_that_of_the_sensor():
-    assert drifting("lidar", 2.0).drift == pytest.approx(2 * get_sensor("lidar").drift)
-    assert drifting("lidar", 1.0) == get_sensor("lidar") and drifting("lidar", 0.0).tilt == 0.0
+    assert scale_sensor_drift("lidar", 2.0).drift == pytest.approx(2 * get_sensor("lidar").drift)
+    assert scale_sensor_drift("lidar", 1.0) == get_sensor("lidar") and scale_sensor_drift("lidar", 0.0).tilt == 0.0

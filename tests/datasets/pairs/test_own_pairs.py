@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from topomerge.datasets.core.physical import physical_building
+from topomerge.datasets.core.building import find_physical_building
 from topomerge.datasets.pairs import own_pairs
 from topomerge.datasets.pairs.evaluation_pair import load_set
 from topomerge.datasets.pairs.own_pairs import build_own_sets, extract_captures, split_pairs
@@ -32,8 +32,8 @@ from topomerge.evaluation.settings import Evaluation
 from topomerge.evaluation.tasks import Data
 from topomerge.io.maps import save_map
 from topomerge.training import room_matcher
-from topomerge.training.packed import load_pairs
-from topomerge.training.tasks import settings_of, train, weights_of
+from topomerge.training.packed_pairs import load_pairs
+from topomerge.training.tasks import compose_settings, find_weights, train
 from topomerge.types import TopometricMap, TrueRoom
 
 SHIFT = (7.0, -3.0, 1.5)
@@ -320,8 +320,8 @@ def test_storeys_of_one_frame_are_no_pair_but_strangers(tmp_path: Path) -> None:
 
 
 def test_the_building_is_what_its_owner_calls_it() -> None:
-    assert physical_building("own", "Site/b2-scan") == "own/Site/b2-scan" != physical_building("own", "Other/b2-scan")
-    assert physical_building("own", "x + y") == "own/x"
+    assert find_physical_building("own", "Site/b2-scan") == "own/Site/b2-scan" != find_physical_building("own", "Other/b2-scan")
+    assert find_physical_building("own", "x + y") == "own/x"
 
 
 def test_sets_are_made_once_and_say_what_is_true(houses: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -330,7 +330,7 @@ def test_sets_are_made_once_and_say_what_is_true(houses: Path, cache: Path, monk
     loaded = {part: load_set(sets.manifests[part]) for part in PARTS}
     assert [sum(pair.about["kind"] == "overlap" for pair in loaded[part]) for part in PARTS] == [1, 1, 1]
     for pair in (pair for pairs in loaded.values() for pair in pairs):
-        a, b = pair.maps()
+        a, b = pair.load_maps()
         assert len(a.rooms) == len(pair.true[0]) and len(b.rooms) == len(pair.true[1])
         if pair.about["kind"] != "overlap":
             assert pair.transform is None and not len(pair.matches) and " + " in pair.about["building"]
@@ -355,7 +355,7 @@ def rooms_of(entry: Mapping[str, Any]) -> tuple[TrueRoom, ...]:
 
 
 def test_rooms_that_match_are_those_of_the_simulator(houses: Path, cache: Path) -> None:
-    from topomerge.datasets.pairs.truth import room_truth, true_matches
+    from topomerge.datasets.pairs.parts import find_true_matches, match_true_rooms
 
     listing = read_pairs_file(houses)
     items, _ = extract_captures(listing, cache)
@@ -366,17 +366,17 @@ def test_rooms_that_match_are_those_of_the_simulator(houses: Path, cache: Path) 
         for name, entry in zip((pair.a, pair.b), truth["maps"], strict=True):
             maps.append(topomerge.load_map(cache / "own" / "captures" / f"{items[name].name}.tmap"))
             cloud = topomerge.read_points(listing.captures[name].path)
-            rooms.append(room_truth(maps[-1], replace(cloud, rooms=rooms_of(entry), labels=None)))
+            rooms.append(match_true_rooms(maps[-1], replace(cloud, rooms=rooms_of(entry), labels=None)))
         ids = [[room["id"] for room in entry["rooms"]] for entry in truth["maps"]]
         shared = [(ids[0].index(k), ids[1].index(k)) for k in set(ids[0]) & set(ids[1])]
-        wanted = {tuple(row) for row in true_matches(rooms[0], rooms[1], shared).tolist()}
+        requested = {tuple(row) for row in find_true_matches(rooms[0], rooms[1], shared).tolist()}
         found = {tuple(row) for row in find_overlap(pair, (maps[0], maps[1])).matches.tolist()}
-        assert found and len(found & wanted) >= 0.5 * len(found), (found, wanted)
+        assert found and len(found & requested) >= 0.5 * len(found), (found, requested)
 
 
 def test_train_and_evaluate(houses: Path, cache: Path, tmp_path: Path) -> None:
     words = ["data=folder", f"path={houses}", f"cache={cache}", f"runs={tmp_path}", "name=own", "tensorboard=false", "epochs=2"]
-    best = train(settings_of([*words, "experiment=surroundings", "batch=1"]), quiet)
+    best = train(compose_settings([*words, "experiment=surroundings", "batch=1"]), quiet)
     assert 0 <= best["val/recall@1"] <= 1 and best["val/rooms"] > 0
     told = json.loads((tmp_path / "own" / "config.json").read_text())
     assert told["data"].endswith("-train.jsonl") and told["validation"].endswith("-val.jsonl")
@@ -402,20 +402,20 @@ def test_retrieval_takes_them(houses: Path, cache: Path) -> None:
 
 def test_the_matcher_of_rooms_takes_them(houses: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(room_matcher, "run_network", lambda job, *_: {"learned": len(job.learned), "watched": len(job.watched)})
-    settings = settings_of(["task=room_matcher", "data=folder", f"path={houses}", f"cache={cache}", "views=1"])
+    settings = compose_settings(["task=room_matcher", "data=folder", f"path={houses}", f"cache={cache}", "views=1"])
     assert room_matcher.fit(settings, quiet) == {"learned": 1, "watched": 2}
-    scores = room_matcher.judge(settings, weights_of("room_matcher", ""), quiet)
+    scores = room_matcher.judge(settings, find_weights("room_matcher", ""), quiet)
     assert scores["pairs"] == 2 and scores["rooms"] > 0
 
 
 def test_a_path_needs_its_data_and_data_its_path(houses: Path) -> None:
     for task in ("embedding", "room_matcher"):
         with pytest.raises(InputError, match="data=folder needs path="):
-            settings_of([f"task={task}", "data=folder"])
+            compose_settings([f"task={task}", "data=folder"])
         with pytest.raises(InputError, match="is of data=folder, not of data=train_small"):
-            settings_of([f"task={task}", "data=train_small", f"path={houses}"])
+            compose_settings([f"task={task}", "data=train_small", f"path={houses}"])
     with pytest.raises(InputError, match="data=folder: is for the tasks embedding and room_matcher"):
-        settings_of(["task=match_odds", "data=folder"])
+        compose_settings(["task=match_odds", "data=folder"])
     settings = Evaluation(descriptors={"engineered": {"name": "engineered"}}, only=["engineered"])
     settings.data.name = "folder"
     with pytest.raises(InputError, match="data=folder needs path="):

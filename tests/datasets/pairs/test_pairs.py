@@ -9,8 +9,16 @@ import pytest
 from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.core.building import Building
 from topomerge.datasets.pairs.pairs import Pair, PairSettings, draw_frames, make_pair
-from topomerge.datasets.pairs.parts import room_graph, share, twin_rooms, two_parts
-from topomerge.datasets.pairs.truth import TRUTH_DTYPE, cell_labels, room_truth, true_matches
+from topomerge.datasets.pairs.parts import (
+    TRUTH_DTYPE,
+    build_room_graph,
+    compute_dice,
+    find_true_matches,
+    find_twin_rooms,
+    label_cells,
+    match_true_rooms,
+    sample_two_parts,
+)
 
 from topomerge.errors import InputError
 from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, PointCloud, Sim3, TopometricMap, TrueRoom, VoxelGrid
@@ -27,7 +35,7 @@ def pair() -> Pair:
 
 
 def connected(building: Building, part: set[int]) -> bool:
-    graph = room_graph(building)
+    graph = build_room_graph(building)
     seen, edge = set(), {min(part)}
     while edge:
         seen |= edge
@@ -38,27 +46,27 @@ def connected(building: Building, part: set[int]) -> bool:
 @pytest.mark.parametrize("overlap", [0.0, 0.1, 0.25, 0.5, 0.75, 1.0])
 def test_parts_hang_together_and_share_what_was_asked(tower: Building, overlap: float) -> None:
     for seed in range(5):
-        a, b = (set(part.tolist()) for part in two_parts(tower, 12, overlap, np.random.default_rng(seed)))
+        a, b = (set(part.tolist()) for part in sample_two_parts(tower, 12, overlap, np.random.default_rng(seed)))
         assert connected(tower, a) and connected(tower, b)
-        assert abs(share(a, b) - overlap) <= 0.1
+        assert abs(compute_dice(a, b) - overlap) <= 0.1
         assert max(len(a), len(b)) <= 12 and not {i for i in a | b if tower.rooms[i].kind == "lift"}
 
 
 def test_a_building_without_such_parts_is_refused() -> None:
     with pytest.raises(InputError, match="no two connected parts"):
-        two_parts(make_building("house", 3), 20, 0.0, np.random.default_rng(0))
+        sample_two_parts(make_building("house", 3), 20, 0.0, np.random.default_rng(0))
     with pytest.raises(InputError, match="overlap must be"):
-        two_parts(make_building("house", 3), 20, -0.1, np.random.default_rng(0))
+        sample_two_parts(make_building("house", 3), 20, -0.1, np.random.default_rng(0))
 
 
 @pytest.mark.longer
 def test_twin_rooms_lie_above_each_other() -> None:
     building = make_building("hotel", 5, 3)
-    for i, j in twin_rooms(building).items():
+    for i, j in find_twin_rooms(building).items():
         assert building.rooms[i].storey != building.rooms[j].storey
         assert np.allclose(building.rooms[i].polygon.mean(axis=0), building.rooms[j].polygon.mean(axis=0), atol=0.05)
     with pytest.raises(InputError, match="same plan"):
-        twin_rooms(make_building("hotel", 5, 1))
+        find_twin_rooms(make_building("hotel", 5, 1))
 
 
 def test_the_truth_takes_b_to_a(pair: Pair) -> None:
@@ -69,7 +77,7 @@ def test_the_truth_takes_b_to_a(pair: Pair) -> None:
         moved = pair.truth.apply(np.column_stack([twin.polygon, np.full(len(twin.polygon), twin.floor)]))
         assert np.allclose(moved[:, :2], room.polygon, atol=1e-6) and np.allclose(moved[:, 2], room.floor)
     both = set(pair.visited[0]) & set(pair.visited[1])
-    assert both <= {i for i, _ in pair.shared} and pair.overlap == share(*pair.visited)
+    assert both <= {i for i, _ in pair.shared} and pair.overlap == compute_dice(*pair.visited)
 
 
 def test_points_of_a_shared_room_coincide(pair: Pair) -> None:
@@ -122,28 +130,28 @@ def strip() -> tuple[TopometricMap, PointCloud]:
     labels[column < 2] = -1
     square = np.array([[0, 0], [2, 0], [2, 2], [0, 2.0]])
     rooms_true = tuple(TrueRoom(str(i), square + [2 * i, 0], 0.0, 2.5) for i in range(4))
-    return map, PointCloud(grid.centroids().astype(np.float32), labels=labels, rooms=rooms_true)
+    return map, PointCloud(grid.compute_centroids().astype(np.float32), labels=labels, rooms=rooms_true)
 
 
 def test_room_truth_by_hand() -> None:
     map, cloud = strip()
-    truth = room_truth(map, cloud)
+    truth = match_true_rooms(map, cloud)
     assert truth.dtype == TRUTH_DTYPE and truth["room"].tolist() == [0, 1, 1, 2]
     assert truth["one"].tolist() == [True, True, False, True]
     assert np.allclose(truth["iou"], [18 / 20, 12 / 20, 8 / 20, 30 / 40])
-    assert true_matches(truth, truth, [(0, 0), (1, 1)]).tolist() == [[0, 0], [1, 1], [1, 2], [2, 1], [2, 2]]
-    assert true_matches(truth, truth, []).shape == (0, 2)
+    assert find_true_matches(truth, truth, [(0, 0), (1, 1)]).tolist() == [[0, 0], [1, 1], [1, 2], [2, 1], [2, 2]]
+    assert find_true_matches(truth, truth, []).shape == (0, 2)
 
 
 def test_labels_from_outlines() -> None:
     map, cloud = strip()
-    by_outline = cell_labels(map, replace(cloud, labels=None))
+    by_outline = label_cells(map, replace(cloud, labels=None))
     assert (by_outline == map.grid.cells[:, 0] // 20).mean() > 0.95
-    assert room_truth(map, replace(cloud, labels=None))["room"].tolist()[:3] == [0, 1, 1]
+    assert match_true_rooms(map, replace(cloud, labels=None))["room"].tolist()[:3] == [0, 1, 1]
 
 
 def test_no_labels_no_truth() -> None:
     map, cloud = strip()
-    truth = room_truth(map, replace(cloud, labels=np.full(len(cloud), -1, np.int32)))
+    truth = match_true_rooms(map, replace(cloud, labels=np.full(len(cloud), -1, np.int32)))
     assert (truth["room"] == -1).all() and not truth["one"].any()
-    assert (room_truth(map, PointCloud(cloud.points))["room"] == -1).all()
+    assert (match_true_rooms(map, PointCloud(cloud.points))["room"] == -1).all()

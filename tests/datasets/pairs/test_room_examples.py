@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from topomerge.datasets.pairs import room_examples
-from topomerge.datasets.pairs.plan_examples import PlanRecipe
+from topomerge.datasets.pairs.plan_examples import PlanRecipe, draw_item
 from topomerge.datasets.pairs.room_examples import ANSWERS, build_rooms, draw_room_item
-from topomerge.datasets.pairs.scan_items import draw_item
 
-from topomerge.training.shared_settings import TaskSettings
+from topomerge.training.settings import TaskSettings
 
 
 def test_files_are_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -21,7 +20,7 @@ def test_files_are_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         made.append(item.name)
         return {"x": np.zeros((2, 3)), "about": np.frombuffer(b"{}", np.uint8), **dict.fromkeys(ANSWERS, np.ones(2))}
 
-    monkeypatch.setattr(room_examples, "room_rows", rows)
+    monkeypatch.setattr(room_examples, "build_room_rows", rows)
     recipe, sharing = PlanRecipe("room_scans", scans=3, seed=5), TaskSettings(cache=str(tmp_path))
     paths = build_rooms(recipe, sharing)
     assert [path.stem for path in paths] == made and len(made) == 3

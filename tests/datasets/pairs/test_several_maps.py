@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 from topomerge.datasets.pairs.build import Build, build
 from topomerge.datasets.pairs.example import load_example
-from topomerge.datasets.pairs.items import draw_items
-from topomerge.datasets.pairs.recipe import Recipe, check
+from topomerge.datasets.pairs.items import Recipe, check, draw_items
 
 from tests.recipes import SMALL_HOUSES
 from topomerge.errors import InputError
 from topomerge.io import archive
-from topomerge.training.packed import SHEET, load_pairs
+from topomerge.training.packed_pairs import SHEET, load_pairs
 
 THREE = Recipe(name="three", pairs=2, walks=3, **SMALL_HOUSES)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from topomerge.datasets.pairs.plan_examples import PlanRecipe, build_plans
-from topomerge.datasets.pairs.wall_examples import LOST_BY_CHANCE, SPACING_LEFT, draw_wall_item, thinned
+from topomerge.datasets.pairs.wall_examples import LOST_BY_CHANCE, SPACING_LEFT, draw_wall_item, thin_cloud
 
 from topomerge.errors import InputError
 from topomerge.training.scan_settings import WallDoors
@@ -17,13 +17,13 @@ CLOUD = PointCloud(POINTS, poses=np.eye(4)[None], pose_of=np.zeros(len(POINTS), 
 
 def test_a_thinned_cloud_is_part_of_the_cloud_and_the_same_again():
     by_chance = np.array([np.random.default_rng([seed, 10]).random() < LOST_BY_CHANCE for seed in range(40)])
-    left = [thinned(CLOUD, seed) for seed in range(40)]
+    left = [thin_cloud(CLOUD, seed) for seed in range(40)]
     whole = {tuple(p) for p in POINTS.tolist()}
     assert all({tuple(p) for p in cloud.points.tolist()} <= whole for cloud in left[:6])
     assert all(cloud.pose_of is not None and len(cloud.pose_of) == len(cloud) for cloud in left)
     shares = np.array([len(cloud) / len(CLOUD) for cloud in left])
     assert 0 < by_chance.sum() < 40 and (shares[by_chance] < 0.33).all() and (shares[by_chance] > 0.02).all()
-    assert (thinned(CLOUD, 7).points == left[7].points).all()
+    assert (thin_cloud(CLOUD, 7).points == left[7].points).all()
 
 
 def test_of_a_cloud_in_a_raster_one_point_stays_in_each_cell():
@@ -31,7 +31,7 @@ def test_of_a_cloud_in_a_raster_one_point_stays_in_each_cell():
     rng = np.random.default_rng([seed, 10])
     rng.random()
     cell = rng.uniform(*SPACING_LEFT)
-    cells = np.floor(thinned(CLOUD, seed).points.astype(float) / cell).astype(int)
+    cells = np.floor(thin_cloud(CLOUD, seed).points.astype(float) / cell).astype(int)
     assert len(np.unique(cells, axis=0)) == len(cells) == len(np.unique(np.floor(POINTS.astype(float) / cell), axis=0))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from topomerge.datasets.pairs.truth import cell_labels, room_truth
+from topomerge.datasets.pairs.parts import label_cells, match_true_rooms
 
 from topomerge.extraction.extract import extract
 from topomerge.types import PointCloud, TrueRoom
@@ -32,10 +32,10 @@ def test_a_slice_labels_the_walls_that_were_made_of_it(uneven: float) -> None:
     cloud.points[:, 2] += uneven * (np.arange(len(cloud)) % 2)
     map = extract(cloud, voxel_size=0.1, carve=False)
     assert "slice" in " ".join(map.warnings)
-    labels = cell_labels(map, cloud)
+    labels = label_cells(map, cloud)
     assert (labels >= 0).mean() > 0.95
-    places = map.grid.centroids()
+    places = map.grid.compute_centroids()
     clear = np.abs(places[:, 0] - 4) > 0.2
     assert (labels[clear & (labels >= 0)] == (places[clear & (labels >= 0), 0] > 4)).all()
-    truth = room_truth(map, cloud)
+    truth = match_true_rooms(map, cloud)
     assert sorted(truth["room"][truth["one"]].tolist()) == [0, 1] and truth["iou"][truth["one"]].min() > 0.6

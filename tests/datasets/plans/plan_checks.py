@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from topomerge.datasets.core.plan import Plan
+from topomerge.datasets.core.building import Plan
 from topomerge.datasets.plans.floorplans import Refusal, iter_plans, read_plans
 
 from tests.datasets.plans import plan_files as write

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from topomerge.datasets.buildings.erect import erect
-from topomerge.datasets.core.plan import Plan
-from topomerge.datasets.plans.floorplans import Refusal, iter_plans, read_plans, siblings, summarise
+from topomerge.datasets.buildings.construction import build_building
+from topomerge.datasets.core.building import Plan
+from topomerge.datasets.plans.floorplans import Refusal, group_siblings, iter_plans, read_plans, summarise
 
 from tests.datasets.plans import plan_files as write
 from tests.datasets.plans.plan_checks import MAKERS, areas, door
@@ -95,7 +95,7 @@ def test_rmf_levels_share_their_lift(tmp_path: Path) -> None:
     plans = read_plans(write.rmf(tmp_path / "a.building.yaml", levels=2))
     assert [len(p.rooms) for p in plans] == [3, 3] and [len(p.flights) for p in plans] == [1, 0]
     assert plans[0].height == pytest.approx(3.5)
-    building = erect(plans)
+    building = build_building(plans)
     assert len(building.stairs) == 1 and building.stairs["kind"][0] == "lift"
     assert np.allclose(building.stairs["lower"][0, :2], [9, -4])
 
@@ -146,7 +146,7 @@ def test_ifc(tmp_path: Path) -> None:
 @pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
 def test_erects_to_the_same_rooms_and_door(make: Callable[[Path], Path], tmp_path: Path) -> None:
     (plan,) = read_plans(make(tmp_path))
-    building = erect([plan])
+    building = build_building([plan])
     assert len(building.rooms) == 2 and len(building.doors) == 1
     assert sorted(building.doors["rooms"][0].tolist()) == [0, 1]
     middle, width = door(plan)
@@ -187,11 +187,11 @@ def test_schools_and_offices_come_through(data_dir: Path) -> None:
 
 @pytest.mark.data
 def test_school_storeys(data_dir: Path) -> None:
-    groups = siblings(data_dir / "plans_schools_offices")
+    groups = group_siblings(data_dir / "plans_schools_offices")
     assert ["school/Sabadell1", "school/Sabadell2", "school/Sabadell3"] in groups
     (plan,) = read_plans(data_dir / "plans_schools_offices/school/Sabadell1_updated.xml")
-    building = erect([plan])
-    assert len(building.rooms) == 18 and len(set(building.parts().tolist())) == 1
+    building = build_building([plan])
+    assert len(building.rooms) == 18 and len(set(building.find_components().tolist())) == 1
 
 
 @pytest.mark.longer

@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from topomerge.datasets.buildings.erect import erect
-from topomerge.datasets.core.building import SURFACES
-from topomerge.datasets.core.difficulty import Difficulty
-from topomerge.datasets.plans.doors import place_door, sides
+from topomerge.datasets.buildings.construction import build_building
+from topomerge.datasets.core.building import SURFACES, Difficulty
 from topomerge.datasets.plans.floorplans import read_plans
-from topomerge.datasets.plans.raster import contacts, flood, outline
-from topomerge.datasets.plans.sketch import outline as cut_open
+from topomerge.datasets.plans.raster import find_contacts, flood, trace_outline
+from topomerge.datasets.plans.sketch import build_outline as cut_open
+from topomerge.datasets.plans.sketch import find_side_rooms, place_door
 
 from tests.datasets.plans import plan_files as write
 
@@ -29,7 +28,7 @@ def test_hole_is_cut_open_and_closes_again() -> None:
 
 def test_slit_of_a_hole_becomes_no_wall(tmp_path: Path) -> None:
     (plan,) = read_plans(write.campus(tmp_path / "a.xml", rooms=((0, 0, 300, 300), (100, 40, 250, 250)), portal=(100, 150)))
-    building = erect([plan], Difficulty(furniture=0, clutter=0, columns=0, beams=0, lamps=0))
+    building = build_building([plan], Difficulty(furniture=0, clutter=0, columns=0, beams=0, lamps=0))
     middles = building.vertices[building.triangles][building.labels == SURFACES.index("wall")].mean(axis=1)[:, :2]
     walls = shapely.union_all([shapely.box(0, -15, 15, 0).exterior, shapely.box(5, -12.5, 12.5, -2).exterior])
     assert shapely.distance(walls, shapely.points(middles)).max() < 0.3
@@ -46,7 +45,7 @@ def test_place_door_where_rooms_face_each_other() -> None:
 
 def test_sides_are_left_and_right() -> None:
     shapes = [shapely.box(0, 0, 4, 4), shapely.box(4, 0, 8, 4)]
-    joined_rooms = sides(np.array([[4.0, 1], [0, 1]]), np.array([[4.0, 2], [0, 2]]), shapes, 0.3)
+    joined_rooms = find_side_rooms(np.array([[4.0, 1], [0, 1]]), np.array([[4.0, 2], [0, 2]]), shapes, 0.3)
     assert joined_rooms.tolist() == [[0, 1], [-1, 0]]
 
 
@@ -60,6 +59,6 @@ def test_flood_meets_in_the_narrowest_place() -> None:
     height[3:6, 8] = 1
     labels = flood(seeds, free, height)
     assert (labels[:, :8] == 1).all() and (labels[:, 9:] == 2).all() and (labels[:3, 8] == 0).all()
-    ((a, b, ends),) = contacts(labels, 0.1, np.zeros(2))
+    ((a, b, ends),) = find_contacts(labels, 0.1, np.zeros(2))
     assert (a, b) == (1, 2) and np.ptp(ends, axis=0) == pytest.approx([0, 0.3])
-    assert outline(labels == 1, 0.1, np.array([5.0, 0])).bounds[:2] == pytest.approx((5.0, 0.0))
+    assert trace_outline(labels == 1, 0.1, np.array([5.0, 0])).bounds[:2] == pytest.approx((5.0, 0.0))

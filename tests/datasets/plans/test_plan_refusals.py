@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from topomerge.datasets.core.plan import Plan
-from topomerge.datasets.plans.floorplans import Refusal, iter_plans, read_plans, siblings, summarise
+from topomerge.datasets.core.building import Plan
+from topomerge.datasets.plans.floorplans import Refusal, group_siblings, iter_plans, read_plans, summarise
 
 from tests.datasets.plans import plan_files as write
 from tests.datasets.plans.plan_checks import MAKERS, pack, reason
@@ -204,7 +204,7 @@ def test_folder_names_are_unique_and_siblings_are_found(tmp_path: Path) -> None:
         write.mall(tmp_path / floor)
     names = [name for name, result in iter_plans(tmp_path) if isinstance(result, Plan)]
     assert len(names) == len(set(names)) == 11 and "B1" in names and "two/L2" in names
-    assert siblings(tmp_path) == [
+    assert group_siblings(tmp_path) == [
         ["B1", "F1", "F2"],
         ["site/Sabadell1", "site/Sabadell2"],
         ["site/hillgroundfloor", "site/hillsecondfloor"],

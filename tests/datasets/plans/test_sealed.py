@@ -12,14 +12,13 @@ from pathlib import Path
 import pytest
 from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.pairs.build import Build, build
-from topomerge.datasets.pairs.example import candidate
-from topomerge.datasets.pairs.flat import read_flat
-from topomerge.datasets.pairs.grid_pairs import GridRecipe, grid_items
-from topomerge.datasets.pairs.items import draw_items
+from topomerge.datasets.pairs.example import build_candidate
+from topomerge.datasets.pairs.flat_maps import read_flat
+from topomerge.datasets.pairs.grid_pairs import GridRecipe, draw_grid_items
+from topomerge.datasets.pairs.items import Recipe, draw_items
 from topomerge.datasets.pairs.plan_examples import PlanRecipe, check_plans
-from topomerge.datasets.pairs.recipe import Recipe
 from topomerge.datasets.plans import sealed, splits
-from topomerge.datasets.plans.floorplans import Refusal, iter_plans, plan_names, read_plans, siblings
+from topomerge.datasets.plans.floorplans import Refusal, group_siblings, iter_plans, list_plan_names, read_plans
 from topomerge.datasets.public import s3dis
 from topomerge.datasets.public.sources import iter_public_pairs
 
@@ -27,7 +26,7 @@ from tests.datasets.plans import plan_files as write
 from topomerge.cli.main import main as cli
 from topomerge.config import compose
 from topomerge.errors import InputError
-from topomerge.training.tasks import settings_of, train
+from topomerge.training.tasks import compose_settings, train
 
 ROOT = Path(__file__).parents[3]
 GATE = "sealed_run"
@@ -62,9 +61,9 @@ def line_maps(tmp_path: Path) -> Path:
 MADE_OF_SEEDS: dict[str, Callable[[Path], object]] = {
     "a building": lambda folder: make_building("office", SEED),
     "pairs": lambda folder: build(Build(Recipe(split="sealed", sources={"procedural": 1.0}), cache=str(folder))),
-    "pairs of grids": lambda folder: grid_items(GridRecipe(split="sealed")),
+    "pairs of grids": lambda folder: draw_grid_items(GridRecipe(split="sealed")),
     "scans of plans": lambda folder: check_plans(PlanRecipe(split="sealed")),
-    "a name": lambda folder: splits.members("sealed", "utexas"),
+    "a name": lambda folder: splits.list_members("sealed", "utexas"),
 }
 
 
@@ -77,7 +76,7 @@ def test_seeds_are_refused(what: str, tmp_path: Path) -> None:
 def test_an_item_of_a_cache_that_names_a_sealed_seed_is_refused() -> None:
     (item,) = draw_items(Recipe(pairs=1, sources={"procedural": 1.0}, kinds={"office": 1.0}, sensors={"tls": 1.0}), {})
     with pytest.raises(InputError, match=f"sealed: seed {SEED}"):
-        candidate(replace(item, buildings=(str(SEED),)), 0, [])
+        build_candidate(replace(item, buildings=(str(SEED),)), 0, [])
 
 
 @pytest.mark.parametrize(
@@ -86,7 +85,7 @@ def test_an_item_of_a_cache_that_names_a_sealed_seed_is_refused() -> None:
         ("merge_belief", "grids"),
         ("plan_segmentation", "plan_scans"),
         ("door_classification", "door_scans"),
-        ("room_odds", "room_scans"),
+        ("room_odds", "build_room_scans"),
         ("match_odds", "matching_train"),
         ("match_belief", "matching_validation"),
         ("feature_scale", "matching_train"),
@@ -97,7 +96,7 @@ def test_training_and_fitting_are_refused(task: str, data: str, tmp_path: Path) 
     pytest.importorskip("torch")
     words = [f"task={task}", f"data={data}", "data.split=sealed", "data.folder=", f"cache={tmp_path}", f"runs={tmp_path}"]
     with pytest.raises(InputError, match="sealed: split 'sealed'"):
-        train(settings_of(words), print)
+        train(compose_settings(words), print)
 
 
 def test_the_user_command_is_refused_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -112,10 +111,10 @@ def test_plans_are_refused(line_maps: Path) -> None:
     refusal = results["AHG1/AHG1.vectormap"]
     assert isinstance(refusal, Refusal) and refusal.reason.startswith("sealed: AHG1")
     assert not isinstance(results["GDC1"], Refusal)
-    assert plan_names(line_maps) == ["GDC1"] and siblings(line_maps) == []
+    assert list_plan_names(line_maps) == ["GDC1"] and group_siblings(line_maps) == []
     with pytest.raises(InputError, match="sealed: AHG1"):
         read_plans(file)
-    with sealed.sealed_run():
+    with sealed.open_sealed_set():
         assert len(read_plans(file)) == 1
     with pytest.raises(InputError, match="sealed"):
         read_plans(file)
@@ -149,10 +148,10 @@ def test_nothing_sealed_is_in_another_list() -> None:
     first, last = sealed.read_list("sealed")[2]
     assert (first, last) == (1_000_000, 1_099_999)
     for split in splits.SPLITS:
-        assert splits.seeds(split)[1] < first
-        assert not [n for source in splits.FOLDERS for n in splits.members(split, source) if sealed.is_sealed(source, n)]
-    assert splits.split_of("procedural", str(SEED)) == splits.split_of("utexas", "ASE4") == "sealed"
-    assert splits.split_of("utexas", "GDC1") == "test" and splits.split_of("strands", "tsc-2015-2016") == "test"
+        assert splits.get_seed_range(split)[1] < first
+        assert not [n for source in splits.FOLDERS for n in splits.list_members(split, source) if sealed.is_sealed(source, n)]
+    assert splits.find_split("procedural", str(SEED)) == splits.find_split("utexas", "ASE4") == "sealed"
+    assert splits.find_split("utexas", "GDC1") == "test" and splits.find_split("strands", "tsc-2015-2016") == "test"
 
 
 def test_a_line_holds_for_what_lies_below_it_and_for_nothing_else() -> None:
@@ -193,14 +192,14 @@ def test_the_sealed_run_alone_enters_the_gate() -> None:
 
 def test_the_gate_closes_behind_an_error() -> None:
     def broken() -> None:
-        with sealed.sealed_run():
-            assert splits.seeds("sealed")[0] == 1_000_000
+        with sealed.open_sealed_set():
+            assert splits.get_seed_range("sealed")[0] == 1_000_000
             raise KeyError
 
     with pytest.raises(KeyError):
         broken()
     with pytest.raises(InputError):
-        splits.seeds("sealed")
+        splits.get_seed_range("sealed")
 
 
 def test_every_recipe_that_ships_is_of_another_split() -> None:

@@ -209,7 +209,7 @@ def test_scannet_scene_is_aligned_and_its_objects_are_known(tmp_path):
     assert scene.objects == ("floor", "wall")
     np.testing.assert_array_equal(scene.object_of, np.repeat(box(0)[:, 2] > 0, 3).astype(int))
     assert scene.cloud.rooms[0].kind == "Apartment"
-    assert scannet.places(tmp_path) == {"scene0000": ["scene0000_00", "scene0000_01"]}
+    assert scannet.group_scans_by_place(tmp_path) == {"scene0000": ["scene0000_00", "scene0000_01"]}
 
 
 @pytest.mark.parametrize(
@@ -335,7 +335,7 @@ def test_dual_quaternion_turns_then_moves():
     real, shift = np.array([np.cos(0.3), 0, 0, np.sin(0.3)]), np.array([1.0, 2.0, 3.0])
     w, v = real[0], real[1:]
     dual = np.array([-shift @ v, *(w * shift + np.cross(shift, v))]) / 2  # 1/2 t q
-    matrix = cslamd.dual_quaternion(real, dual)
+    matrix = cslamd.convert_dual_quaternion(real, dual)
     np.testing.assert_allclose(matrix, Sim3(0.6, (1, 2, 3)).matrix, atol=1e-12)
 
 
@@ -365,8 +365,8 @@ def test_an_unknown_source_is_refused(tmp_path):
 def test_parts_are_connected_and_overlap():
     chain = {k: {n for n in (k - 1, k + 1) if 0 <= n < 9} for k in range(9)}
     for seed in range(20):
-        a, b = public.two_parts(chain, np.random.default_rng(seed))
+        a, b = public.sample_two_parts(chain, np.random.default_rng(seed))
         assert set(a) & set(b) and set(a) - set(b) and set(b) - set(a)
         assert all(np.diff(part).max(initial=1) == 1 for part in (a, b))
     with pytest.raises(InputError, match="hang together"):
-        public.two_parts({0: {1}, 1: {0}}, np.random.default_rng(0))
+        public.sample_two_parts({0: {1}, 1: {0}}, np.random.default_rng(0))

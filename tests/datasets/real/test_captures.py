@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from topomerge.datasets.real.captures import captures
-from topomerge.datasets.real.sources import REAL_SOURCES, pair_makers
+from topomerge.datasets.real.sources import REAL_SOURCES, find_captures, iter_pair_makers
 
 from topomerge.errors import InputError
 
@@ -26,19 +25,19 @@ from topomerge.errors import InputError
     ],
 )
 def test_captures_by_hand(source: str, title: str, expected: tuple[str, str]) -> None:
-    assert captures(source, title) == expected
+    assert find_captures(source, title) == expected
 
 
 @pytest.mark.parametrize(("source", "title"), [("strands", "tsc-2015"), ("r2v", "a-b"), ("halmstad", "HIH_01")])
 def test_other_titles_are_refused(source: str, title: str) -> None:
     with pytest.raises(InputError, match=f"{source}/{title}: no such real pair"):
-        captures(source, title)
+        find_captures(source, title)
 
 
 @pytest.mark.data
 def test_the_independent_pairs_of_each_source(data_dir: Path) -> None:
-    titles = {source: [title for title, _ in pair_makers(source, data_dir)] for source in REAL_SOURCES}
-    pairs = {source: [captures(source, title) for title in names] for source, names in titles.items()}
+    titles = {source: [title for title, _ in iter_pair_makers(source, data_dir)] for source in REAL_SOURCES}
+    pairs = {source: [find_captures(source, title) for title in names] for source, names in titles.items()}
     assert {source: (len(p), sum(a != b for a, b in p)) for source, p in pairs.items()} == {
         "halmstad": (20, 20),
         "utexas": (7, 4),

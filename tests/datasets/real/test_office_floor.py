@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 from topomerge.datasets.pairs.pairs import Pair
-from topomerge.datasets.real import halmstad, office_floor, sources, wall_fit
+from topomerge.datasets.real import halmstad, office_floor, sources
+from topomerge.datasets.real import sources as wall_fit
 
 from topomerge.config import compose
 from topomerge.errors import InputError
@@ -37,14 +38,14 @@ def floor(tmp_path: Path) -> Path:
 
 
 def test_key_points_count_from_the_lower_left_in_metres(floor: Path) -> None:
-    ((name, make),) = office_floor.pairs(floor)
+    ((name, make),) = office_floor.iter_pairs(floor)
     pair = make()
     assert (name, pair.source, pair.building) == ("F5_01-F5_02", "halmstad", "F5")
     assert pair.truth.translation == pytest.approx((-20 * 0.03, -10 * 0.03, 0.0))
     assert pair.truth.scale == pytest.approx(1) and pair.truth.yaw == pytest.approx(0)
     assert np.ptp(pair.a.points[:, 0]) == pytest.approx(100 * 0.03, abs=0.1)
-    assert wall_fit.residual(pair).median < 0.02
-    ((_, smaller),) = halmstad.pairs(floor)  # the apartments' pixels are smaller
+    assert wall_fit.measure_residual(pair).median < 0.02
+    ((_, smaller),) = halmstad.iter_pairs(floor)  # the apartments' pixels are smaller
     assert smaller().truth.translation == pytest.approx((-0.4, -0.2, 0.0))
 
 
@@ -65,10 +66,10 @@ def test_no_other_set_is_of_it() -> None:
 @pytest.mark.longer
 @pytest.mark.data
 def test_walls_agree_though_drift_bends_them(data_dir: Path) -> None:
-    makers = list(office_floor.pairs(data_dir / sources.DEVELOPMENT_FOLDERS["office_floor"]))
+    makers = list(office_floor.iter_pairs(data_dir / sources.DEVELOPMENT_FOLDERS["office_floor"]))
     assert len(makers) == 15 * 14 / 2
     for _, make in (makers[0], makers[-1]):
         pair = make()
-        assert wall_fit.residual(pair).median < 0.15
+        assert wall_fit.measure_residual(pair).median < 0.15
         drawn = "drawing" in pair.sensors
         assert (abs(pair.truth.scale - 1) > 0.1) == drawn

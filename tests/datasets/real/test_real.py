@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy.spatial import cKDTree
-from topomerge.datasets.pairs import flat
+from topomerge.datasets.pairs import flat_maps
 from topomerge.datasets.pairs.pairs import Pair, is_identity
 from topomerge.datasets.plans.floorplans import Refusal
-from topomerge.datasets.real import carmen, halmstad, sources, utexas, wall_fit
+from topomerge.datasets.real import carmen, halmstad, sources, utexas
+from topomerge.datasets.real import sources as wall_fit
 
 from topomerge.errors import InputError
 from topomerge.types import PointCloud, Sim3
@@ -33,7 +34,7 @@ def check(name: str, pair: Pair | Refusal) -> None:
     assert isinstance(pair, Pair), pair.reason
     assert pair.truth is not None and not is_identity(pair.truth)
     assert name == f"{pair.source}/{pair.name}" and pair.kind == "overlap"
-    assert wall_fit.residual(pair).median < BOUNDS[pair.source], name
+    assert wall_fit.measure_residual(pair).median < BOUNDS[pair.source], name
     for cloud in (pair.a, pair.b):
         assert len(cloud) > 10_000 and np.isfinite(cloud.points).all()
     if pair.source == "carmen":
@@ -45,7 +46,7 @@ def check(name: str, pair: Pair | Refusal) -> None:
 @pytest.mark.longer
 @pytest.mark.data
 def test_walls_agree_in_halmstad_pairs(data_dir):
-    makers = list(halmstad.pairs(data_dir / sources.REAL_FOLDERS["halmstad"]))
+    makers = list(halmstad.iter_pairs(data_dir / sources.REAL_FOLDERS["halmstad"]))
     assert len(makers) == COUNTS["halmstad"]
     for name, make in makers[3::4]:
         pair = make()
@@ -57,12 +58,12 @@ def test_walls_agree_in_halmstad_pairs(data_dir):
 @pytest.mark.longer
 @pytest.mark.data
 @pytest.mark.parametrize("wanted", QUICK)
-def test_walls_agree_in_single_pairs(data_dir, wanted):
-    source, name = wanted.split("/")
+def test_walls_agree_in_single_pairs(data_dir, requested):
+    source, name = requested.split("/")
     if source == "ifc":
         pytest.importorskip("ifcopenshell")
-    pair = dict(sources.pair_makers(source, data_dir))[name]()
-    check(wanted, pair)
+    pair = dict(sources.iter_pair_makers(source, data_dir))[name]()
+    check(requested, pair)
     if source == "utexas":  # rooms of the robot grid are rooms of the other map
         assert len(pair.shared) == SHARED[name]
         for i, j in pair.shared:
@@ -88,7 +89,7 @@ def test_a_missing_source_is_refused_and_the_rest_goes_on(tmp_path):
     results = list(sources.iter_real_pairs(tmp_path))
     assert all(isinstance(r, Refusal) and "\n" not in r.reason for _, r in results)
     assert {name.split("/")[0] for name, _ in results} == set(sources.REAL_SOURCES)
-    assert list(sources.table(iter(results)))[3] == f"Refused: {len(results)}"
+    assert list(sources.iter_table_lines(iter(results)))[3] == f"Refused: {len(results)}"
     with pytest.raises(InputError, match="halmstad"):
         sources.iter_real_pairs(tmp_path, ["kitti"])
     with pytest.raises(InputError, match="no such folder"):
@@ -118,7 +119,7 @@ def write_log(path, poses, ranges, tail=""):
 def test_carmen_log_is_cut_into_parts_that_fit(tmp_path):
     poses, ranges = scans()
     write_log(tmp_path / "corridor-corrected.log.gz", poses, ranges)
-    results = list(sources.collect("carmen", carmen.pairs(tmp_path)))
+    results = list(sources.collect("carmen", carmen.iter_pairs(tmp_path)))
     assert [name for name, _ in results] == [f"carmen/corridor-{a}-{b}" for a, b in carmen.PAIRS]
     for _, pair in results:
         assert isinstance(pair, Pair), pair.reason
@@ -130,7 +131,7 @@ def test_carmen_log_is_cut_into_parts_that_fit(tmp_path):
 def test_carmen_scans_draw_walls_and_free_space():
     poses, ranges = scans()
     frame = Sim3(0.6, (3.0, -2.0, 0.0))
-    drawn = carmen.draw(poses, ranges, frame)
+    drawn = carmen.draw_map(poses, ranges, frame)
     x, y = frame.inverse().apply(np.column_stack([drawn.walls, np.zeros(len(drawn.walls))]))[:, :2].T
     edge = np.minimum(np.minimum(np.abs(np.abs(y) - 1), np.abs(x + 2)), np.abs(x - 14))
     assert edge.max() < 0.06
@@ -140,14 +141,14 @@ def test_carmen_scans_draw_walls_and_free_space():
 
 def test_carmen_parts_share_no_scan_and_failed_ranges_say_nothing():
     for a, b in carmen.PAIRS:
-        first, second = carmen.split(100, a, b)
+        first, second = carmen.split_log(100, a, b)
         assert not set(first) & set(second)
         assert min(len(first), len(second)) >= 37
     poses, ranges = scans()
     ranges[:, 90] = 81.9
-    assert len(carmen.draw(poses, np.full_like(ranges, 81.9), Sim3()).free) == 0
+    assert len(carmen.draw_map(poses, np.full_like(ranges, 81.9), Sim3()).free) == 0
     with pytest.raises(InputError, match="too short"):
-        carmen.split(30, "first", "last")
+        carmen.split_log(30, "first", "last")
 
 
 @pytest.mark.parametrize(
@@ -165,7 +166,7 @@ def test_carmen_damage_is_refused_in_one_line(tmp_path, damage, said):
     path = tmp_path / "x-corrected.log.gz"
     write_log(path, *scans())
     damage(path)
-    results = [result for _, result in sources.collect("carmen", carmen.pairs(tmp_path))]
+    results = [result for _, result in sources.collect("carmen", carmen.iter_pairs(tmp_path))]
     assert results
     for result in results:
         assert isinstance(result, Refusal) and said in result.reason and "\n" not in result.reason
@@ -183,11 +184,11 @@ def test_halmstad_similarity_is_that_of_the_key_points():
 def test_halmstad_list_is_checked(tmp_path):
     path = tmp_path / "ground_truth_pairs.json"
     path.write_text("{")
-    ((_, result),) = sources.collect("halmstad", halmstad.pairs(tmp_path))
+    ((_, result),) = sources.collect("halmstad", halmstad.iter_pairs(tmp_path))
     assert "key points" in result.reason
     listed = {"keypoints_px": {"A_01": [[0, 0], [9, 9]]}, "pairs": [{"a": "A_01", "b": "A_02", "idx": [[0, 5]]}]}
     path.write_text(json.dumps(listed))
-    ((_, result),) = sources.collect("halmstad", halmstad.pairs(tmp_path))
+    ((_, result),) = sources.collect("halmstad", halmstad.iter_pairs(tmp_path))
     assert "no such file" in result.reason
 
 
@@ -213,14 +214,14 @@ def test_grid_is_raised_at_its_place_without_what_is_written_beside_it(tmp_path)
     (tmp_path / "m.yaml").write_text(
         "image: m.png\nresolution: 0.1\norigin: [-5, 2, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
     )
-    read = flat.read_flat(tmp_path / "m.yaml")
+    read = flat_maps.read_flat(tmp_path / "m.yaml")
     assert read.walls.min(axis=0) == pytest.approx([-5 + 1.05, 2 + 3.05])
     assert read.walls.max(axis=0) == pytest.approx([-5 + 4.95, 2 + 4.95])
-    cloud = flat.raise_flat(read, z=1.0)
-    assert cloud.points[:, 2].min() == 1.0 and cloud.points[:, 2].max() == pytest.approx(1.0 + flat.WALL_HEIGHT)
+    cloud = flat_maps.extrude_flat(read, z=1.0)
+    assert cloud.points[:, 2].min() == 1.0 and cloud.points[:, 2].max() == pytest.approx(1.0 + flat_maps.WALL_HEIGHT)
     assert len(cloud.free) == 18 * 38
     with pytest.raises(InputError, match="no such file"):
-        flat.read_flat(tmp_path / "none.yaml")
+        flat_maps.read_flat(tmp_path / "none.yaml")
 
 
 def test_walls_are_fitted_and_measured():
@@ -239,7 +240,7 @@ def test_walls_are_fitted_and_measured():
         for p in (a, b)
     ]
     pair = Pair("x", *clouds, truth, (), 1.0, ("a", "b"), "s", "x")
-    fit = wall_fit.residual(pair)
+    fit = wall_fit.measure_residual(pair)
     assert fit.median < 0.03 and fit.near > 0.99 and fit.seen == 1.0
     wrong = Pair("x", *clouds, Sim3(0.3, (2.0, 1.25, 0.0)), (), 1.0, ("a", "b"), "s", "x")
-    assert wall_fit.residual(wrong).median > 0.2
+    assert wall_fit.measure_residual(wrong).median > 0.2

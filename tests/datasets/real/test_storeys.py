@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 from topomerge.datasets.pairs.pairs import Pair
-from topomerge.datasets.real import sources, storeys, wall_fit
+from topomerge.datasets.real import sources, storeys
+from topomerge.datasets.real import sources as wall_fit
 
 
 @pytest.fixture
@@ -27,7 +28,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_storeys_have_no_truth_and_years_of_one_storey_have(folder: Path) -> None:
-    made = {name: make() for name, make in storeys.pairs(folder)}
+    made = {name: make() for name, make in storeys.iter_pairs(folder)}
     apart = [p for p in made.values() if p.kind == "other-storey"]
     together = [p for p in made.values() if p.kind == "overlap"]
     assert len(apart) == 9 + 3 and len(together) == 6 and len(made) == 18
@@ -44,5 +45,5 @@ def test_they_are_read_where_they_are_named_only(folder: Path) -> None:
 @pytest.mark.longer
 @pytest.mark.data
 def test_walls_of_one_storey_agree_over_the_years(data_dir: Path) -> None:
-    makers = dict(storeys.pairs(data_dir / sources.DEVELOPMENT_FOLDERS["storeys"]))
-    assert wall_fit.residual(makers["eng2-7f_2019-7f"]()).median < 0.05
+    makers = dict(storeys.iter_pairs(data_dir / sources.DEVELOPMENT_FOLDERS["storeys"]))
+    assert wall_fit.measure_residual(makers["eng2-7f_2019-7f"]()).median < 0.05

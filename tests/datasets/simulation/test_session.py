@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import shapely
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.core.building import SURFACES, Building
-from topomerge.datasets.core.difficulty import Difficulty
-from topomerge.datasets.simulation.session import session
+from topomerge.datasets.core.building import SURFACES, Building, Difficulty
+from topomerge.datasets.simulation.session import simulate_session
 
 STILL = Difficulty(moved=0, gone=0, doors_moved=0, people=0)
 
@@ -19,13 +18,13 @@ def office() -> Building:
 
 
 def test_nothing_happens_when_nothing_may(office: Building) -> None:
-    other = session(office, STILL, 1)
+    other = simulate_session(office, STILL, 1)
     assert np.array_equal(other.vertices, office.vertices) and np.array_equal(other.triangles, office.triangles)
 
 
 def test_a_share_of_the_furniture_goes(office: Building) -> None:
     movable = office.things["movable"] & (office.things["kind"] != "leaf")
-    other = session(office, replace(STILL, gone=0.5), 1)
+    other = simulate_session(office, replace(STILL, gone=0.5), 1)
     left = np.isin(np.flatnonzero(movable), other.thing_of)
     assert 0.3 < left.mean() < 0.7
     fixed = office.thing_of < 0
@@ -33,7 +32,7 @@ def test_a_share_of_the_furniture_goes(office: Building) -> None:
 
 
 def test_moved_things_stay_in_their_room_and_move_as_one(office: Building) -> None:
-    other = session(office, replace(STILL, moved=0.5), 2)
+    other = simulate_session(office, replace(STILL, moved=0.5), 2)
     shift = np.hypot(*(other.things["centre"] - office.things["centre"])[:, :2].T)
     assert 0.2 < (shift > 0).mean() < 0.9 and (shift > 1.0).any()
     for i in np.flatnonzero(shift > 0):
@@ -46,7 +45,7 @@ def test_moved_things_stay_in_their_room_and_move_as_one(office: Building) -> No
 
 
 def test_doors_open_and_shut_about_their_hinges(office: Building) -> None:
-    other = session(office, replace(STILL, doors_moved=1, open=0, half=0), 3)
+    other = simulate_session(office, replace(STILL, doors_moved=1, open=0, half=0), 3)
     assert set(other.doors["state"].tolist()) <= {"shut", "none"}
     leaves = other.things[other.things["kind"] == "leaf"]
     for leaf in leaves:
@@ -58,7 +57,7 @@ def test_doors_open_and_shut_about_their_hinges(office: Building) -> None:
 
 
 def test_people_stand_about(office: Building) -> None:
-    other = session(office, replace(STILL, people=2), 4)
+    other = simulate_session(office, replace(STILL, people=2), 4)
     people = other.things[other.things["kind"] == "person"]
     assert len(people) > 10
     assert (other.labels == SURFACES.index("person")).sum() == 36 * len(people)
@@ -66,5 +65,5 @@ def test_people_stand_about(office: Building) -> None:
 
 
 def test_the_same_seed_gives_the_same_session(office: Building) -> None:
-    one, same, other = (session(office, Difficulty(), s).vertices.tobytes() for s in (1, 1, 2))
+    one, same, other = (simulate_session(office, Difficulty(), s).vertices.tobytes() for s in (1, 1, 2))
     assert one == same != other

@@ -8,7 +8,7 @@ import pytest
 from tests.extraction.elevations.doors import extracted
 from tests.extraction.elevations.test_doorways import chances, face, walls
 from tests.scenes import Scene
-from topomerge.extraction.elevations.doorways import doorways
+from topomerge.extraction.elevations.doorways import detect_doorways
 from topomerge.types import Sim3
 
 PLACES_OF_DOOR = slice(20, 29)  # along 6 m in steps of 0.1 m
@@ -22,7 +22,7 @@ PLACES_OF_DOOR = slice(20, 29)  # along 6 m in steps of 0.1 m
 def test_the_floor_before_a_doorway_tells_its_room(before, room):
     spots = np.full((60, 3), 7)  # elsewhere along the wall
     spots[PLACES_OF_DOOR] = before
-    (door,) = doorways(walls(face(room=5)), chances(6, (2.0, 2.9, 0.9, 0.05)), spots)
+    (door,) = detect_doorways(walls(face(room=5)), chances(6, (2.0, 2.9, 0.9, 0.05)), spots)
     assert door["rooms"].tolist() == [room, -1]
 
 

@@ -13,14 +13,14 @@ from topomerge.extraction.elevations.doorways import (
     HALF_OPEN,
     OPEN,
     SHUT,
-    doorways,
-    joined_openings,
+    detect_doorways,
+    merge_openings,
     read_both_ways,
 )
 from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, STRIP_CHANNELS, WALL_CLASSES, Elevations
-from topomerge.extraction.elevations.wall_doors import SOURCES, WALL_DOOR_FEATURES, DoorCandidates, door_chance
+from topomerge.extraction.elevations.wall_doors import SOURCES, WALL_DOOR_FEATURES, DoorCandidates, compute_door_probability
 from topomerge.training.wall_doors import find_candidates_of_map
-from topomerge.types import Sim3, door_state
+from topomerge.types import Sim3, classify_door_state
 
 STEP = 2 * ALONG
 
@@ -44,7 +44,7 @@ def chances(length, *doors):
 
 
 def test_a_stretch_is_a_doorway_in_its_middle_and_as_wide():
-    (door,) = doorways(walls(face()), chances(6, (2.0, 2.9, 0.9, 0.05)))
+    (door,) = detect_doorways(walls(face()), chances(6, (2.0, 2.9, 0.9, 0.05)))
     assert door["centre"][0] == pytest.approx(2.45) and 0 < door["centre"][1] < 0.15 and door["centre"][2] == 0
     assert door["width"] == pytest.approx(0.9 * 0.95) and door["open"] == pytest.approx(0.9 / 0.95)
     assert door["rooms"].tolist() == [0, -1] and door["faces"] == 1 and door["probability"] == pytest.approx(0.95)
@@ -53,13 +53,13 @@ def test_a_stretch_is_a_doorway_in_its_middle_and_as_wide():
 @pytest.mark.parametrize(("half", "state"), [(0.7, "half open"), (0.3, "open")])
 def test_most_of_what_speaks_for_a_door_says_how_its_leaf_stands(half, state):
     states = (2.0, 2.9, 0.9 - half, 0.05, half)
-    (door,) = doorways(walls(face()), chances(6, states))
+    (door,) = detect_doorways(walls(face()), chances(6, states))
     assert door["open"] == pytest.approx(0.9 / 0.95) and door["half"] == pytest.approx(half / 0.95)
     (edge,) = seen(chances(8, states)).edges  # beside one of the plan
-    assert door_state(edge) == state
+    assert classify_door_state(edge) == state
     map = two_doors(0)[0]
     map.edges["centre"][0, 0] = 7.2
-    assert door_state(seen(chances(8, states), map).edges[1]) == state  # of the wall alone
+    assert classify_door_state(seen(chances(8, states), map).edges[1]) == state  # of the wall alone
 
 
 def way(rooms=(0, 1), at=0.0, width=1.1, out=(0.0, 1.0), probability=0.9, level=0.0, off=0.0):
@@ -72,7 +72,7 @@ def test_two_doorways_that_meet_are_one_wide_opening(out, order):
     halves = [way(at=-0.6, out=out, width=1.2), way((1, 0), at=0.55, out=tuple(-v for v in out), width=1.1, probability=0.95)]
     halves[1] = (halves[1][0], way(at=0.55, out=out)[1], *halves[1][2:])
     rows = np.array([halves[k] for k in order], DOORWAY_DTYPE)
-    (opening,), (shown,) = joined_openings(rows)
+    (opening,), (shown,) = merge_openings(rows)
     middle = (-1.2 + 1.1) / 2
     assert opening["width"] == pytest.approx(2.3) and shown == 1.1 and opening["probability"] == 0.95
     assert opening["centre"][:2] == pytest.approx([middle * out[1], -middle * out[0]])
@@ -85,15 +85,15 @@ def test_two_doorways_that_meet_are_one_wide_opening(out, order):
 )
 def test_other_doorways_stay_what_they_are(other):
     rows = np.array([way(), other], DOORWAY_DTYPE)
-    ways, shown = joined_openings(rows)
+    ways, shown = merge_openings(rows)
     assert np.array_equal(ways, rows) and shown.tolist() == [1.1, 1.1]
 
 
 def test_three_parts_in_a_row_are_one_and_none_are_none():
     rows = np.array([way(at=k) for k in (2.4, 0.0, 1.2)], DOORWAY_DTYPE)
-    (opening,), _ = joined_openings(rows)
+    (opening,), _ = merge_openings(rows)
     assert opening["width"] == pytest.approx(3.5) and opening["centre"][0] == pytest.approx(1.2)
-    ways, shown = joined_openings(rows[:0])
+    ways, shown = merge_openings(rows[:0])
     assert not len(ways) and ways.dtype == DOORWAY_DTYPE and not len(shown)
 
 
@@ -108,13 +108,13 @@ def test_an_opening_wider_than_doors_is_one(width, turn):
 
 def test_what_is_narrow_or_unlikely_is_none():
     doors = chances(6, (1.0, 1.3, 1.0, 0.0), (3.0, 4.0, 0.2, 0.2))
-    assert not len(doorways(walls(face()), doors))
+    assert not len(detect_doorways(walls(face()), doors))
 
 
 def test_both_faces_show_one_doorway_in_the_middle_of_the_wall():
     both = walls(face(), face(room=1, start=(6.0, 0.2), along=(-1.0, 0.0), out=(0.0, -1.0)))
     doors = np.concatenate([chances(6, (2.0, 3.0, 0.1, 0.8)), chances(6, (3.0, 4.0, 0.0, 0.7))])
-    (door,) = doorways(both, doors)
+    (door,) = detect_doorways(both, doors)
     assert sorted(door["rooms"].tolist()) == [0, 1] and door["faces"] == 2
     assert door["centre"][:2] == pytest.approx([2.5, 0.1], abs=0.01) and door["open"] < 0.15
 
@@ -122,7 +122,7 @@ def test_both_faces_show_one_doorway_in_the_middle_of_the_wall():
 @pytest.mark.parametrize("change", [{"start": (0.0, 0.9)}, {"floor": 3.0}])
 def test_doorways_of_two_walls_or_two_storeys_stay_two(change):
     doors = np.concatenate([chances(6, (2.0, 3.0, 0.9, 0.0))] * 2)
-    assert len(doorways(walls(face(), face(room=1, **change)), doors)) == 2
+    assert len(detect_doorways(walls(face(), face(room=1, **change)), doors)) == 2
 
 
 def seen(doors, map=None):
@@ -173,7 +173,7 @@ def test_a_model_each_for_what_shows_a_door():
         "wall": [1.0, *zeros],
         "flat": [2.0, *zeros],
     }
-    assert door_chance(candidates, models) == pytest.approx(1 / (1 + np.exp([-2.0, 1.0, -1.0, -2.0])))
+    assert compute_door_probability(candidates, models) == pytest.approx(1 / (1 + np.exp([-2.0, 1.0, -1.0, -2.0])))
 
 
 def test_a_mirrored_wall_has_the_same_doors_mirrored():
@@ -186,7 +186,7 @@ def test_a_wide_opening_of_the_plan_stays_though_walls_show_no_door():
     map = two_doors(0)[0]
     map.edges["width"], map.edges["kind"] = 2.4, "opening"
     candidates = seen(chances(8), map)
-    assert door_chance(candidates).tolist() == [pytest.approx(0.9)]
+    assert compute_door_probability(candidates).tolist() == [pytest.approx(0.9)]
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.6])

@@ -67,9 +67,9 @@ def test_rays_went_through_the_open_door_and_not_through_the_shut_one(found):
     cell = 0.2
     nx, ny, nz = 36, 26, 14
     grid = VoxelGrid.from_cells(np.array([(0, 0, 0)]), np.zeros(3), cell, (nx, ny, nz))
-    x, y, z = (grid.centroids(np.argwhere(np.ones((nx, ny, nz), bool))))[:, :3].T
+    x, y, z = (grid.compute_centroids(np.argwhere(np.ones((nx, ny, nz), bool))))[:, :3].T
     free = (np.abs(x - 4) > 0.2) | ((np.abs(y - 4.0) < 0.4) & (z < 2.2))
-    crossed = grid.with_cells(np.argwhere(np.ones((nx, ny, nz), bool))[free])
+    crossed = grid.replace_cells(np.argwhere(np.ones((nx, ny, nz), bool))[free])
     walls, unknown = wall_elevations(found, voxelise(CLOUD, 0.05), crossed=crossed), wall_elevations(found, voxelise(CLOUD, 0.05))
     face = max(between(walls.faces, 3.925 + 0.013), key=lambda f: walls.faces["length"][f])
     strip = walls.strips[walls.first[face] : walls.first[face + 1], :, BANDS + 1 :]

@@ -18,12 +18,12 @@ from tests.extraction.elevations.doors import (
     three_doors,
 )
 from tests.scenes import Scene
-from topomerge.extraction.elevations.doorways import door_places, doorways, place_classes
+from topomerge.extraction.elevations.doorways import classify_places, compute_door_probabilities, detect_doorways
 from topomerge.extraction.elevations.elevation import BANDS, DEPTHS, FACE_DTYPE, STRIP_CHANNELS, Elevations
 from topomerge.extraction.extract import extract, gather_evidence, read_navigable
 from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.stopwatch import Stopwatch
-from topomerge.types import door_state
+from topomerge.types import classify_door_state
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_a_sliding_door_that_stands_half_open_is_one_open_door(cover: float):
 def test_a_leaf_that_stands_half_open_is_told_from_one_that_is_shut_or_wide_open(angle: float):
     map = extracted(ajar_door(angle).points(0.003))
     shut, ajar, wide = (map.edges[int(np.abs(map.edges["centre"][:, 1] - y).argmin())] for y in (SHUT_DOOR, AJAR_DOOR, 7.0))
-    assert len(map.edges) == 3 and [door_state(door) for door in (shut, ajar, wide)] == ["shut", "half open", "open"]
+    assert len(map.edges) == 3 and [classify_door_state(door) for door in (shut, ajar, wide)] == ["shut", "half open", "open"]
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -106,11 +106,11 @@ def test_elevations_of_hardly_any_points_show_no_doorways(count: int):
     """The walls stand, but of what is looked at closely hardly a point is left."""
     scan, navigable = read_navigable(three_doors().points(), 0.1, PRESETS["default"], Stopwatch())
     assert scan.fine is not None
-    cells = scan.fine.subset(np.arange(len(scan.fine)) < count)
+    cells = scan.fine.select_cells(np.arange(len(scan.fine)) < count)
     seen = gather_evidence(replace(scan, fine=cells), navigable, PRESETS["default"], Stopwatch()).walls
     assert seen is not None and not len(seen.doorways)
     walls = seen.elevations
-    assert len(walls.faces) and not len(doorways(walls, door_places(walls, place_classes(walls))))
+    assert len(walls.faces) and not len(detect_doorways(walls, compute_door_probabilities(walls, classify_places(walls))))
 
 
 def test_a_wall_as_short_as_one_place_shows_no_doorway():
@@ -118,5 +118,5 @@ def test_a_wall_as_short_as_one_place_shows_no_doorway():
     strips = np.zeros((2, DEPTHS, STRIP_CHANNELS), np.float32)
     strips[0, DEPTHS // 2, BANDS // 2] = 1
     walls = Elevations(face, np.array([0, 2]), strips)
-    classes = place_classes(walls)
-    assert classes.shape == (1, 7) and not len(doorways(walls, door_places(walls, classes)))
+    classes = classify_places(walls)
+    assert classes.shape == (1, 7) and not len(detect_doorways(walls, compute_door_probabilities(walls, classes)))

@@ -11,10 +11,17 @@ from tests.training.tiny import two_doors
 from topomerge.extraction.elevations.wall_doors import (
     SOURCES,
     WALL_DOOR_FEATURES,
-    door_chance,
-    with_wall_doors,
+    add_wall_doors,
+    compute_door_probability,
 )
-from topomerge.extraction.plans.storey_plan import DOORWAY_CLASS, PLAN_SIGNS, SHUT_CLASS, WALL_CLASS, ClassifiedStorey, plan_signs
+from topomerge.extraction.plans.storey_plan import (
+    DOORWAY_CLASS,
+    PLAN_SIGNS,
+    SHUT_CLASS,
+    WALL_CLASS,
+    ClassifiedStorey,
+    compute_plan_features,
+)
 from topomerge.training.wall_doors import find_candidates_of_map
 from topomerge.types import EDGE_DTYPE
 
@@ -30,7 +37,7 @@ def storey(*holes: tuple[float, float, int], height: float = 0.0) -> ClassifiedS
 
 
 def signs_at(x: float, *storeys: ClassifiedStorey, z: float = 0.0) -> dict[str, float]:
-    (row,) = plan_signs(storeys, np.array([[x, 3.05, z]]))
+    (row,) = compute_plan_features(storeys, np.array([[x, 3.05, z]]))
     return dict(zip(PLAN_SIGNS, row.tolist(), strict=True))
 
 
@@ -44,8 +51,8 @@ def test_signs_are_those_around_the_passage_on_its_storey():
 
 
 def test_no_plan_has_no_signs():
-    assert not plan_signs((), np.zeros((2, 3))).any()
-    assert not plan_signs((storey(),), np.array([[-90.0, 0.0, 0.0]])).any()
+    assert not compute_plan_features((), np.zeros((2, 3))).any()
+    assert not compute_plan_features((storey(),), np.array([[-90.0, 0.0, 0.0]])).any()
 
 
 def test_of_a_map_without_walls_the_plan_is_weighed():
@@ -56,15 +63,15 @@ def test_of_a_map_without_walls_the_plan_is_weighed():
         candidates = find_candidates_of_map(map, (plan,), None)
         at = dict(zip(WALL_DOOR_FEATURES, candidates.features[0], strict=True))
         assert [SOURCES[k] for k in candidates.source] == ["flat"] and at["plan"] == pytest.approx(0.9) and at["wall"] == 0
-        chances += door_chance(candidates).tolist()
+        chances += compute_door_probability(candidates).tolist()
     assert chances[0] > 0.8 and chances[1] < 0.4
-    (edge,) = with_wall_doors(map, (open_there,), None).edges
+    (edge,) = add_wall_doors(map, (open_there,), None).edges
     assert edge["confidence"] == pytest.approx(chances[0]) and edge["centre"].tolist() == map.edges["centre"][0].tolist()
 
 
 def test_a_map_without_edges_stays_as_it_is():
     map = replace(two_doors(0)[0], edges=np.zeros(0, EDGE_DTYPE))
-    assert len(with_wall_doors(map, (storey(),), None).edges) == 0
+    assert len(add_wall_doors(map, (storey(),), None).edges) == 0
 
 
 def test_the_only_way_between_two_rooms_stays_however_unlikely_and_a_second_one_does_not():
@@ -72,7 +79,7 @@ def test_the_only_way_between_two_rooms_stays_however_unlikely_and_a_second_one_
     two = np.concatenate([map.edges, map.edges])
     two["centre"][1, 0] = 6.5
     faint = storey((2.0, 2.9, DOORWAY_CLASS))
-    edges = with_wall_doors(replace(map, edges=two), (faint,), None).edges
+    edges = add_wall_doors(replace(map, edges=two), (faint,), None).edges
     assert edges["centre"][:, 0].tolist() == [map.edges["centre"][0, 0]] and edges["confidence"][0] > 0.5
-    (edge,) = with_wall_doors(map, (storey(),), None).edges
+    (edge,) = add_wall_doors(map, (storey(),), None).edges
     assert edge["confidence"] < 0.4

@@ -17,7 +17,7 @@ from topomerge.extraction.elevations.elevation import (
     UPWARDS,
     Elevations,
 )
-from topomerge.extraction.elevations.windows import windows_on_walls
+from topomerge.extraction.elevations.windows import detect_windows
 
 WALL = 12  # element across, in which the wall lies
 PLACE_COUNT = 80  # of a wall of 8 m
@@ -34,7 +34,7 @@ def seen_window(empty: tuple[slice, slice], likely: tuple[float, float]) -> np.v
         strips[k, 2 * low : 2 * high, WALL, empty[k]] = 0.0
         chance[k, low:high] = likely[k]
     ends = 2 * PLACE_COUNT * np.arange(3)
-    (window,) = windows_on_walls(Elevations(faces, ends, strips.reshape(-1, *strips.shape[2:])), chance.ravel())
+    (window,) = detect_windows(Elevations(faces, ends, strips.reshape(-1, *strips.shape[2:])), chance.ravel())
     return window
 
 

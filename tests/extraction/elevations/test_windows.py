@@ -14,7 +14,7 @@ from tests.extraction.elevations.panes import HEAD, SILL, WINDOWS, three_windows
 from tests.scenes import two_rooms
 from topomerge.errors import InputError
 from topomerge.types import Sim3, TopometricMap
-from topomerge.viz.report import report_html
+from topomerge.viz.report import render_report_html
 
 MOVE = Sim3(0.7, (12.0, -5.0, 1.0))
 
@@ -120,5 +120,5 @@ def test_geojson_and_a_building_model_hold_them(map, tmp_path: Path):
 
 
 def test_the_plan_draws_them(map):
-    page = report_html(map)
+    page = render_report_html(map)
     assert page.count('<g class="window" data-sure') == 3 and "sign-window" in page

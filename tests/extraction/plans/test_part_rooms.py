@@ -10,15 +10,22 @@ import pytest
 from tests import scenes
 from tests.extraction.segments import find_rooms_of_segments
 from topomerge.extraction.extract import extract
-from topomerge.extraction.navigable import navigable_volume
+from topomerge.extraction.navigable import compute_navigable_volume
 from topomerge.extraction.parameters import PRESETS
-from topomerge.extraction.plans.part_rooms import GLIMPSED, LOG_ODDS, PartRooms, door_log_odds, laid_rooms, parted_columns
-from topomerge.extraction.plans.passages import clearance_of, find_passages, regions_of
-from topomerge.extraction.plans.plan import storey_plan
-from topomerge.extraction.plans.plan_network import column_probabilities
+from topomerge.extraction.plans.part_rooms import (
+    GLIMPSED,
+    LOG_ODDS,
+    PartRooms,
+    compute_door_log_odds,
+    find_boundary_columns,
+    rasterise_part_rooms,
+)
+from topomerge.extraction.plans.passages import compute_clearance, find_passages, segment_regions
+from topomerge.extraction.plans.plan import build_storey_plan
+from topomerge.extraction.plans.plan_network import compute_column_probabilities
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.segment import score_by_plan
-from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
+from topomerge.extraction.storeys import find_storeys, measure_floor_to_ceiling
 from topomerge.extraction.voxels import voxelise
 
 DOOR_X = 4.0  # m, of the wall with the door between the two rooms
@@ -32,11 +39,11 @@ def grid():
 @pytest.fixture(scope="module")
 def cut(grid):
     """Plan, regions, clearance and passages of two rooms, and the pair that the door joins."""
-    _, navigable = navigable_volume(Scan(grid), PRESETS["default"])
-    _, storey = find_storeys(navigable, floor_to_ceiling(grid, navigable, 1.75))
-    plan = storey_plan(grid, navigable, storey, 0)
-    clearance, probability = clearance_of(plan), column_probabilities(plan)
-    region = regions_of(plan, probability)
+    _, navigable = compute_navigable_volume(Scan(grid), PRESETS["default"])
+    _, storey = find_storeys(navigable, measure_floor_to_ceiling(grid, navigable, 1.75))
+    plan = build_storey_plan(grid, navigable, storey, 0)
+    clearance, probability = compute_clearance(plan), compute_column_probabilities(plan)
+    region = segment_regions(plan, probability)
     passages = find_passages(plan, clearance, region, probability)
     x = {pair: plan.origin[0] + (p.place[0] + 0.5) * plan.edge for pair, p in passages.items()}
     (door,) = [pair for pair in passages if abs(x[pair] - DOOR_X) < 0.3]
@@ -61,7 +68,7 @@ def two(x):
 
 def at_the_door(cut, *parts) -> float:
     plan, region, _, passages, door = cut
-    return door_log_odds(region, plan.edge, passages, laid_rooms(plan, parts))[door]
+    return compute_door_log_odds(region, plan.edge, passages, rasterise_part_rooms(plan, parts))[door]
 
 
 def test_one_room_speaks_against_a_door_and_two_for_it(cut):
@@ -108,7 +115,7 @@ def test_rooms_that_a_map_parts_stay_apart(grid):
     """A map parts the larger room by a line that nothing shows: not where no narrowing is. It has both rooms as one: its single
     word does not outweigh a clear door, four of one mind do."""
     alone = extract(grid)
-    floor = alone.navigable.centroids()
+    floor = alone.navigable.compute_centroids()
     whole = PartRooms(floor, np.zeros(len(floor), np.int64), np.ones(1), 0.01)
     line = PartRooms(floor, (floor[:, 0] > 2.0).astype(np.int64), np.ones(2), 0.01)
     assert len(alone.rooms) == len(extract(grid, parts=[line]).rooms) == 2
@@ -118,12 +125,12 @@ def test_rooms_that_a_map_parts_stay_apart(grid):
 def test_regions_end_where_rooms_of_a_part_meet(cut):
     """At a line that nothing shows, if somebody was in both rooms; a part of one room ends nothing."""
     plan = cut[0]
-    columns = parted_columns(laid_rooms(plan, [part(cut, lambda x: (x > 2.0).astype(np.int64))]))
+    columns = find_boundary_columns(rasterise_part_rooms(plan, [part(cut, lambda x: (x > 2.0).astype(np.int64))]))
     x = plan.origin[0] + (np.argwhere(columns)[:, 0] + 0.5) * plan.edge
     assert columns.any() and np.abs(x - 2.0).max() <= 0.4
     unsure = part(cut, lambda x: (x > 2.0).astype(np.int64), (0.9, 0.4))
     for silent in (part(cut, one), part(cut, two, (0.4, 0.4)), unsure):
-        assert not parted_columns(laid_rooms(plan, [silent])).any()
-    probability = column_probabilities(plan)
-    more = regions_of(plan, probability, columns)
+        assert not find_boundary_columns(rasterise_part_rooms(plan, [silent])).any()
+    probability = compute_column_probabilities(plan)
+    more = segment_regions(plan, probability, columns)
     assert ((more >= 0) == (cut[1] >= 0)).all() and more.max() > cut[1].max()

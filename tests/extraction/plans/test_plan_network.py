@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from topomerge.extraction.plans import plan_network
-from topomerge.extraction.plans.plan import profile_bands
+from topomerge.extraction.plans.plan import build_profile_bands
 from topomerge.extraction.plans.plan_network import (
     EVIDENCE_CHANNELS,
-    column_probabilities,
-    evidence,
-    without_furniture,
+    compute_column_probabilities,
+    compute_evidence,
+    remove_furniture,
 )
-from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES, ClassifiedStorey, StoreyPlan, leads_through_wall
-from topomerge.kernels.profile import PROFILE_BELOW
+from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES, ClassifiedStorey, StoreyPlan, is_through_wall
+from topomerge.kernels.rasters import PROFILE_BELOW
 from topomerge.types import Array
 
 WALL, FLOOR = ((1 << 24) - 1) << PROFILE_BELOW, 1 << PROFILE_BELOW
@@ -26,7 +26,7 @@ def drawn(wall: Array) -> StoreyPlan:
     none = np.full(wall.shape, np.nan)
     inside = ~wall
     inside[[0, -1]] = inside[:, [0, -1]] = False
-    return StoreyPlan(np.zeros(2), 0.1, wall, inside, profile, profile_bands(0.1), np.zeros(wall.shape), none)
+    return StoreyPlan(np.zeros(2), 0.1, wall, inside, profile, build_profile_bands(0.1), np.zeros(wall.shape), none)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def two_rooms() -> StoreyPlan:
 
 
 def test_what_it_sees(two_rooms: StoreyPlan) -> None:
-    probability = column_probabilities(two_rooms)
+    probability = compute_column_probabilities(two_rooms)
     assert probability.shape == (106, 46, len(COLUMN_CLASSES)) and np.allclose(probability.sum(axis=-1), 1, atol=1e-5)
     answer = probability.argmax(axis=-1)
     assert (answer[5:50, 5:41] == COLUMN_CLASSES.index("inside")).mean() > 0.95
@@ -51,27 +51,27 @@ def test_what_it_sees(two_rooms: StoreyPlan) -> None:
 
 
 def test_furniture_is_no_wall(two_rooms: StoreyPlan) -> None:
-    plan = without_furniture(two_rooms, column_probabilities(two_rooms))
+    plan = remove_furniture(two_rooms, compute_column_probabilities(two_rooms))
     assert not plan.wall[65:90, 10:30].any() and plan.inside[65:90, 10:30].all()
     assert plan.wall[52:54, 5:15].any(axis=0).all() and not (plan.wall & plan.inside).any()
 
 
 def test_through_a_wall(two_rooms: StoreyPlan) -> None:
-    drawn_storey = ClassifiedStorey(column_probabilities(two_rooms), np.zeros(2), 0.1, 0.0)
+    drawn_storey = ClassifiedStorey(compute_column_probabilities(two_rooms), np.zeros(2), 0.1, 0.0)
     storeys = [drawn_storey, ClassifiedStorey(np.zeros((106, 46, 5)), np.zeros(2), 0.1, 3.0)]
-    assert not leads_through_wall(storeys, np.array([5.3, 2.25, 0.1]))
-    assert not leads_through_wall(storeys, np.array([2.5, 2.0, 0.0]))
-    assert leads_through_wall(storeys, np.array([5.3, 0.8, 0.1])) and not leads_through_wall(storeys, np.array([5.3, 0.8, 2.9]))
-    assert not leads_through_wall(storeys, np.array([50.0, -20.0, 0.0])) and not leads_through_wall([], np.zeros(3))
+    assert not is_through_wall(storeys, np.array([5.3, 2.25, 0.1]))
+    assert not is_through_wall(storeys, np.array([2.5, 2.0, 0.0]))
+    assert is_through_wall(storeys, np.array([5.3, 0.8, 0.1])) and not is_through_wall(storeys, np.array([5.3, 0.8, 2.9]))
+    assert not is_through_wall(storeys, np.array([50.0, -20.0, 0.0])) and not is_through_wall([], np.zeros(3))
 
 
 @pytest.mark.parametrize("turn", [1, 2, 3])
 def test_turned_and_shifted(two_rooms: StoreyPlan, turn: int) -> None:
     """A plan that is turned, mirrored and shifted by a few columns is classified alike."""
     wall = np.pad(two_rooms.wall, ((turn, 7), (3, turn)))
-    there = column_probabilities(drawn(np.rot90(wall, turn)[::-1])).argmax(axis=-1)[::-1]
+    there = compute_column_probabilities(drawn(np.rot90(wall, turn)[::-1])).argmax(axis=-1)[::-1]
     back = np.rot90(there, -turn)[turn : turn + 106, 3 : 3 + 46]
-    same = back == column_probabilities(two_rooms).argmax(axis=-1)
+    same = back == compute_column_probabilities(two_rooms).argmax(axis=-1)
     assert same[4:-4, 4:-4].mean() > 0.97
 
 
@@ -79,12 +79,12 @@ def test_turned_and_shifted(two_rooms: StoreyPlan, turn: int) -> None:
 def test_a_turned_plan_has_turned_probabilities(two_rooms: StoreyPlan, turn: int) -> None:
     """Exactly, where its sides fit the network's coarsest level: all four sides are looked at from."""
     wall = np.pad(two_rooms.wall, ((3, 3), (1, 1)))  # 112 x 48
-    turned = np.rot90(column_probabilities(drawn(np.rot90(wall, turn))), -turn)
-    assert np.abs(turned - column_probabilities(drawn(wall))).max() < 1e-5
+    turned = np.rot90(compute_column_probabilities(drawn(np.rot90(wall, turn))), -turn)
+    assert np.abs(turned - compute_column_probabilities(drawn(wall))).max() < 1e-5
 
 
 def test_evidence(two_rooms: StoreyPlan) -> None:
-    x = evidence(two_rooms)
+    x = compute_evidence(two_rooms)
     assert x.shape == (106, 46, EVIDENCE_CHANNELS) and x.dtype == np.float32 and np.isfinite(x).all()
     assert x[52, 5].tolist() == pytest.approx([0, 1, 1, 1, 1, 1, 1, 0, 1, -0.6, 0.5])
     assert x[20, 20].tolist() == pytest.approx([1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0.5])
@@ -98,13 +98,13 @@ def test_far_parts_of_a_plan_are_looked_at_one_by_one_and_alike(two_rooms, step,
         at = slice(x, x + 106), slice(y, y + 46)
         wall[at], inside[at], profile[at] = two_rooms.wall, two_rooms.inside, two_rooms.profile
     none = np.full(wall.shape, np.nan)
-    plan = StoreyPlan(np.zeros(2), 0.1, wall, inside, profile, profile_bands(0.1), np.zeros(wall.shape), none)
+    plan = StoreyPlan(np.zeros(2), 0.1, wall, inside, profile, build_profile_bands(0.1), np.zeros(wall.shape), none)
     sizes = []
-    whole = plan_network.forward
-    monkeypatch.setattr(plan_network, "forward", lambda x, w: sizes.append(x[0].size) or whole(x, w))
-    by_parts = column_probabilities(plan)
+    whole = plan_network.run_network
+    monkeypatch.setattr(plan_network, "run_network", lambda x, w: sizes.append(x[0].size) or whole(x, w))
+    by_parts = compute_column_probabilities(plan)
     looked_at = sum(sizes)
-    monkeypatch.setattr(plan_network, "_separate_parts", lambda known: None)
-    at_once = column_probabilities(plan)
+    monkeypatch.setattr(plan_network, "_split_parts", lambda known: None)
+    at_once = compute_column_probabilities(plan)
     assert np.array_equal(by_parts[plan.explored], at_once[plan.explored])
     assert looked_at < 0.9 * (sum(sizes) - looked_at)

@@ -10,26 +10,24 @@ import pytest
 from tests import scenes
 from tests.extraction.segments import find_rooms_of_segments
 from topomerge.extraction.extract import extract
-from topomerge.extraction.floors import has_floor
-from topomerge.extraction.navigable import navigable_volume
+from topomerge.extraction.navigable import compute_navigable_volume, has_floor
 from topomerge.extraction.parameters import PRESETS, DefaultParameters
-from topomerge.extraction.partition import FLAT_LEAST, ROOM_LEAST, LeastSize
 from topomerge.extraction.plans.passages import (
     DOOR_FEATURES,
     Passage,
-    clearance_of,
-    door_features,
-    door_probability,
+    compute_clearance,
+    compute_door_features,
     find_passages,
-    regions_of,
+    predict_door,
+    segment_regions,
 )
-from topomerge.extraction.plans.plan import _box_around, storey_plan
-from topomerge.extraction.plans.plan_network import COARSEST_STRIDE, column_probabilities
-from topomerge.extraction.plans.storey_floor import FLOOR_PROPERTIES, joined_floor
+from topomerge.extraction.plans.plan import _find_box_around, build_storey_plan
+from topomerge.extraction.plans.plan_network import COARSEST_STRIDE, compute_column_probabilities
+from topomerge.extraction.plans.storey_floor import FLOOR_PROPERTIES, join_floor
 from topomerge.extraction.scan import Scan
-from topomerge.extraction.segment import _is_upper_side, score_by_plan
+from topomerge.extraction.segment import FLAT_LEAST, ROOM_LEAST, LeastSize, _is_upper_side, score_by_plan
 from topomerge.extraction.slices import is_slice
-from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
+from topomerge.extraction.storeys import find_storeys, measure_floor_to_ceiling
 from topomerge.extraction.voxels import voxelise
 from topomerge.types import STOREY_DTYPE, Array, PointCloud, TopometricMap, VoxelGrid
 
@@ -37,7 +35,7 @@ CORRIDOR_ROOMS = [(x, y) for x in (2, 6, 10, 14) for y in (2, 8)]
 
 
 def room_at(result: TopometricMap, x: float, y: float, z: float = 0.0) -> int:
-    distance = np.linalg.norm(result.navigable.centroids() - (x, y, z), axis=1)
+    distance = np.linalg.norm(result.navigable.compute_centroids() - (x, y, z), axis=1)
     return int(result.navigable_room[distance.argmin()])
 
 
@@ -55,9 +53,9 @@ def turned(points: Array, degrees: float) -> Array:
 
 def agreement(a: TopometricMap, b: TopometricMap, back: float = 0.0) -> float:
     """Mean IoU of the rooms of a with their best in b, on a's floor; b is turned by `back` degrees against a."""
-    places = turned(a.navigable.centroids(), back)
-    row = b.navigable.rows(b.navigable.locate(places))
-    row = np.where(row >= 0, row, b.navigable.rows(b.navigable.locate(places) + (0, 0, 1)))
+    places = turned(a.navigable.compute_centroids(), back)
+    row = b.navigable.find_rows(b.navigable.locate(places))
+    row = np.where(row >= 0, row, b.navigable.find_rows(b.navigable.locate(places) + (0, 0, 1)))
     label = np.where(row >= 0, b.navigable_room[np.maximum(row, 0)], -1)
     best = []
     for r in range(len(a.rooms)):
@@ -97,7 +95,7 @@ def test_furniture_hides_the_floor_and_stays_in_the_room() -> None:
     assert len(result.rooms) == 2
     assert result.rooms["area"][room_at(result, 2, 2)] == pytest.approx(20, rel=0.08)
     standing = result.navigable.properties["standing"]
-    on_counter = (np.abs(result.navigable.centroids()[:, :2] - (2, 4.2)) < 0.4).all(axis=1)
+    on_counter = (np.abs(result.navigable.compute_centroids()[:, :2] - (2, 4.2)) < 0.4).all(axis=1)
     assert on_counter.any() and not standing[on_counter].any() and standing.mean() > 0.6
 
 
@@ -131,13 +129,13 @@ def test_a_slice_gets_walls_and_a_floor(corridor: Array, poses: bool) -> None:
 def test_the_upper_half_gets_a_floor(corridor: Array) -> None:
     upper = corridor[corridor[:, 2] > 1.0]
     grid = voxelise(upper, 0.1, [])
-    _, navigable = navigable_volume(Scan(grid), DefaultParameters(assume=False))
+    _, navigable = compute_navigable_volume(Scan(grid), DefaultParameters(assume=False))
     assert not has_floor(grid, navigable, 1.75)
     result = extract(upper)
     assert any("no floor was seen" in w for w in result.warnings)
     is_the_corridor(result, float(result.storeys["floor"][0]))
     whole = voxelise(corridor, 0.1, [])
-    assert has_floor(whole, navigable_volume(Scan(whole), PRESETS["default"])[1], 1.75)
+    assert has_floor(whole, compute_navigable_volume(Scan(whole), PRESETS["default"])[1], 1.75)
 
 
 @pytest.mark.longer
@@ -168,19 +166,19 @@ def test_a_room_is_there_without_floor_and_ceiling_where_rays_crossed_it() -> No
     stands = np.tile(np.eye(4), (2, 1, 1))
     stands[:, :3, 3] = (2.0, 2.5, 1.5), (5.5, 2.5, 1.5)
     walked = extract(PointCloud(points, poses=stands, pose_of=right.astype(np.int32)))
-    places = walked.navigable.centroids()[walked.navigable_room == room_at(walked, 5.5, 2.5)]
+    places = walked.navigable.compute_centroids()[walked.navigable_room == room_at(walked, 5.5, 2.5)]
     assert room_at(walked, 2, 2.5) != room_at(walked, 5.5, 2.5)
     assert len(places) * walked.navigable.edge**2 == pytest.approx(14, abs=2) and places[:, 0].min() > 3.8
     unknown = extract(points)  # where the camera was is not known: nothing tells that the middle of the second room is empty
-    middle = np.abs(unknown.navigable.centroids()[unknown.navigable_room >= 0][:, :2] - (5.5, 2.5)).max(axis=1) < 1
+    middle = np.abs(unknown.navigable.compute_centroids()[unknown.navigable_room >= 0][:, :2] - (5.5, 2.5)).max(axis=1) < 1
     assert not middle.any()
 
 
 def test_a_plan_without_anything_beyond_is_as_large_as_its_floor() -> None:
     scan = Scan(voxelise(scenes.two_rooms().points(0.01), 0.1))
-    scan, navigable = navigable_volume(scan, PRESETS["default"])
-    _, storey = find_storeys(navigable, floor_to_ceiling(scan.grid, navigable, 1.75))
-    plan = storey_plan(scan.grid, navigable, storey, 0)
+    scan, navigable = compute_navigable_volume(scan, PRESETS["default"])
+    _, storey = find_storeys(navigable, measure_floor_to_ceiling(scan.grid, navigable, 1.75))
+    plan = build_storey_plan(scan.grid, navigable, storey, 0)
     reach = np.ptp(navigable.cells[:, :2], axis=0) + 1
     assert (np.array(plan.wall.shape) == reach + 12).all()  # 0.6 m on all sides
 
@@ -189,9 +187,9 @@ def test_a_plan_grows_by_strides_of_the_network_at_its_beginning() -> None:
     inside = np.zeros((200, 200), bool)
     inside[100:120, 100:120] = True
     first, last, margin = np.array([94, 94]), np.array([125, 125]), 6
-    assert _box_around(inside, first, last, margin) == (slice(94, 126), slice(94, 126))
+    assert _find_box_around(inside, first, last, margin) == (slice(94, 126), slice(94, 126))
     inside[80, 100] = inside[110, 140] = True
-    assert _box_around(inside, first, last, margin) == (slice(94 - 2 * COARSEST_STRIDE, 126), slice(94, 147))
+    assert _find_box_around(inside, first, last, margin) == (slice(94 - 2 * COARSEST_STRIDE, 126), slice(94, 147))
 
 
 def test_a_wide_opening_keeps_both_readings() -> None:
@@ -212,7 +210,7 @@ def test_free_space_is_what_rays_crossed() -> None:
     cloud = PointCloud(points[~right], poses=stand[None], pose_of=np.zeros((~right).sum(), np.int32))
     free = extract(cloud).free
     assert free is not None and free.edge == pytest.approx(0.2)
-    places = free.centroids()
+    places = free.compute_centroids()
     assert places[:, 0].max() < 4.4 and (places[:, 2] > -0.1).all() and (places[:, 2] < 2.8).all()
     assert len(free) * free.edge**3 == pytest.approx(4 * 5 * 2.7, rel=0.25)
     swept = extract(points).free  # the sensor's place unknown: swept from views
@@ -232,21 +230,21 @@ def test_the_upper_side_of_a_ceiling_is_no_storey() -> None:
 
 def test_passages_measure_the_door() -> None:
     grid = voxelise(scenes.two_rooms().points(0.005), 0.1, [])
-    _, navigable = navigable_volume(Scan(grid), PRESETS["default"])
-    _, storey = find_storeys(navigable, floor_to_ceiling(grid, navigable, 1.75))
-    plan = storey_plan(grid, navigable, storey, 0)
-    clearance = clearance_of(plan)
-    probability = column_probabilities(plan)
-    region = regions_of(plan, probability)
+    _, navigable = compute_navigable_volume(Scan(grid), PRESETS["default"])
+    _, storey = find_storeys(navigable, measure_floor_to_ceiling(grid, navigable, 1.75))
+    plan = build_storey_plan(grid, navigable, storey, 0)
+    clearance = compute_clearance(plan)
+    probability = compute_column_probabilities(plan)
+    region = segment_regions(plan, probability)
     passages = find_passages(plan, clearance, region, probability)
     x = plan.origin[0] + 0.5 * grid.edge
     at_the_door = [p for p in passages.values() if abs(x + p.place[0] * grid.edge - 4.0) < 0.3]
     assert len(at_the_door) == 1
-    values = dict(zip(DOOR_FEATURES, door_features(at_the_door[0], (2.0, 1.5), (20.0, 15.0)), strict=True))
+    values = dict(zip(DOOR_FEATURES, compute_door_features(at_the_door[0], (2.0, 1.5), (20.0, 15.0)), strict=True))
     assert values["width"] == pytest.approx(scenes.DOOR[0], abs=0.11)
     assert values["lintel"] == pytest.approx(scenes.HEIGHT - scenes.DOOR[1], abs=0.15) and values["lintel_cover"] > 0.8
     assert values["jamb"] > 0.8 and values["opens"] > 1.0 and values["length"] < 0.5
-    assert door_probability(door_features(at_the_door[0], (2.0, 1.5), (20.0, 15.0))[None])[0] > 0.9
+    assert predict_door(compute_door_features(at_the_door[0], (2.0, 1.5), (20.0, 15.0))[None])[0] > 0.9
     parted = find_rooms_of_segments(region, clearance, passages, score_by_plan)
     never = find_rooms_of_segments(region, clearance, passages, lambda x, _: np.zeros(len(x)))
     always = find_rooms_of_segments(region, clearance, passages, lambda x, _: np.ones(len(x)), LeastSize(0.0, 0.0, 0.0, 0.0))
@@ -302,6 +300,6 @@ def test_a_storey_without_a_room_of_its_own_is_none() -> None:
     cells = np.concatenate([floor, stray])
     number = np.repeat([0, 1], [len(floor), len(stray)])  # of the storey; the stray cells have no room
     tables = dict(zip(FLOOR_PROPERTIES, (np.ones(len(cells), bool), number, -number, -number), strict=True))
-    _, used, of_cell = joined_floor(grid, storeys, cells, tables)
+    _, used, of_cell = join_floor(grid, storeys, cells, tables)
     assert len(used) == 1 and used["area"][0] == pytest.approx(4.0, abs=0.05)
     assert (of_cell["storey"] == 0).all() and (of_cell["room"] == 0).all()

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from topomerge.extraction.convolution import sphere
+from topomerge.extraction.convolution import build_sphere
 from topomerge.extraction.parameters import ThesisParameters
 from topomerge.extraction.views.view_rooms import (
+    build_navigable_floor,
+    cluster_markov,
     cluster_views,
-    markov_clusters,
-    modularity,
-    navigable_floor,
+    compute_modularity,
     propagate_labels,
     split_rooms,
 )
@@ -48,7 +48,7 @@ def same_partition(a, b) -> bool:
 @pytest.mark.parametrize("seed", range(4))
 def test_equals_dense_reference_on_planted_clusters(inflation, seed):
     similarity, truth = planted(seed=seed)
-    found = markov_clusters(similarity, inflation)
+    found = cluster_markov(similarity, inflation)
     assert same_partition(found, dense_mcl(similarity.toarray(), inflation))
     if inflation >= 1.6:
         assert same_partition(found, truth)
@@ -58,11 +58,11 @@ def test_order_of_nodes_does_not_matter():
     similarity, _ = planted()
     order = np.random.default_rng(1).permutation(similarity.shape[0])
     shuffled = sparse.csr_array(similarity.toarray()[np.ix_(order, order)])
-    assert same_partition(markov_clusters(similarity, 1.7)[order], markov_clusters(shuffled, 1.7))
+    assert same_partition(cluster_markov(similarity, 1.7)[order], cluster_markov(shuffled, 1.7))
 
 
 def test_nodes_without_neighbours_stay_alone():
-    assert markov_clusters(sparse.csr_array(np.eye(4)), 1.5).tolist() == [0, 1, 2, 3]
+    assert cluster_markov(sparse.csr_array(np.eye(4)), 1.5).tolist() == [0, 1, 2, 3]
     assert cluster_views(sparse.csr_array((0, 0)), (1.5,))[0].tolist() == []
 
 
@@ -71,16 +71,16 @@ def test_stored_zeros_are_no_neighbours():
     row, column = np.indices(full.shape)
     stored = sparse.csr_array((full.ravel(), (row.ravel(), column.ravel())), shape=full.shape)
     assert stored.nnz == 3600
-    assert len(set(markov_clusters(stored, 1.5).tolist())) == 60
+    assert len(set(cluster_markov(stored, 1.5).tolist())) == 60
     with pytest.raises(ValueError, match="self loops"):
-        markov_clusters(sparse.csr_array((3, 3)), 1.5)
+        cluster_markov(sparse.csr_array((3, 3)), 1.5)
 
 
 def test_distances_and_low_inflation_are_refused():
     with pytest.raises(ValueError, match="inflation"):
-        markov_clusters(sparse.csr_array(np.eye(2)), 1.0)
+        cluster_markov(sparse.csr_array(np.eye(2)), 1.0)
     with pytest.raises(ValueError, match="negative"):
-        markov_clusters(sparse.csr_array(np.array([[1.0, -0.5], [-0.5, 1.0]])), 1.5)
+        cluster_markov(sparse.csr_array(np.array([[1.0, -0.5], [-0.5, 1.0]])), 1.5)
 
 
 def test_modularity_is_its_definition():
@@ -90,9 +90,9 @@ def test_modularity_is_its_definition():
     expected = sum(
         weight[i, j] - degree[i] * degree[j] / total for i in range(len(truth)) for j in range(len(truth)) if truth[i] == truth[j]
     )
-    assert modularity(similarity, truth) == pytest.approx(expected / total)
-    assert modularity(similarity, np.zeros(len(truth), int)) == pytest.approx(0.0)
-    assert modularity(sparse.csr_array(np.eye(3)), np.arange(3)) == 0.0
+    assert compute_modularity(similarity, truth) == pytest.approx(expected / total)
+    assert compute_modularity(similarity, np.zeros(len(truth), int)) == pytest.approx(0.0)
+    assert compute_modularity(sparse.csr_array(np.eye(3)), np.arange(3)) == 0.0
 
 
 def test_inflation_of_highest_modularity():
@@ -107,14 +107,14 @@ def test_islands_are_absorbed():
     plan[4, 4], plan[15, 15] = 1, 0
     grid = VoxelGrid.from_cells(np.argwhere(np.ones((20, 20, 1), bool)).astype(np.int32))
     labels = plan[grid.cells[:, 0], grid.cells[:, 1]]
-    after = propagate_labels(grid, labels, sphere(0.2, 0.1))
+    after = propagate_labels(grid, labels, build_sphere(0.2, 0.1))
     assert (after == (grid.cells[:, 1] >= 10)).all()
 
 
 def test_propagation_ends_although_a_checkerboard_swaps_for_ever():
     grid = VoxelGrid.from_cells(np.array([(x, 0, 0) for x in range(8)], np.int32))
     labels = grid.cells[:, 0] % 2
-    after = propagate_labels(grid, labels, sphere(0.1, 0.1, with_origin=False), rounds=1000)
+    after = propagate_labels(grid, labels, build_sphere(0.1, 0.1, with_origin=False), rounds=1000)
     assert set(after.tolist()) <= {0, 1}
 
 
@@ -129,6 +129,6 @@ def test_rooms_are_connected_pieces_of_enough_volume():
 
 def test_navigable_cells_take_the_nearest_room():
     grid = VoxelGrid.from_cells(np.array([(0, 0, 0), (9, 0, 0)], np.int32), shape=(10, 1, 3))
-    line = grid.with_cells(np.array([(x, 0, z) for x in range(10) for z in range(2)], np.int32))
-    label = navigable_floor(grid, np.array([0, 1], np.int32), line, 1.75, 0.3).room
+    line = grid.replace_cells(np.array([(x, 0, z) for x in range(10) for z in range(2)], np.int32))
+    label = build_navigable_floor(grid, np.array([0, 1], np.int32), line, 1.75, 0.3).room
     assert (label == (line.cells[:, 0] >= 5)).all()

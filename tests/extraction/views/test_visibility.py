@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from topomerge.extraction.views.view_rooms import jaccard_similarity, vote
-from topomerge.extraction.views.visibility import Visibility, visible_cells
-from topomerge.kernels import raycast
-from topomerge.kernels import sets as kernel
+from topomerge.extraction.views.view_rooms import compute_jaccard_similarity, vote
+from topomerge.extraction.views.visibility import Visibility, find_visible_cells
+from topomerge.kernels import graphs as kernel
+from topomerge.kernels import rays
 from topomerge.types import VoxelGrid
 
 
@@ -49,24 +49,24 @@ def test_same_set_as_brute_force(seed, radius):
     rng = np.random.default_rng(seed + 1)
     low, high = grid.bounds
     views = rng.uniform(low - 0.3, high + 0.3, (6, 3))  # some outside the grid, some inside occupied cells
-    visibility = visible_cells(grid, views, radius)
+    visibility = find_visible_cells(grid, views, radius)
     for v, view in enumerate(views):
-        assert visibility.rows(v).tolist() == brute_force(grid, view, radius)
+        assert visibility.get_rows(v).tolist() == brute_force(grid, view, radius)
 
 
 def test_sparse_space_is_jumped_over_without_missing_anything():
     rng = np.random.default_rng(5)
     grid = VoxelGrid.from_cells(rng.integers(0, 120, (160, 3)).astype(np.int32), edge=0.1)
     views = rng.uniform(0, 12, (5, 3))
-    visibility = visible_cells(grid, views, 9.0)
+    visibility = find_visible_cells(grid, views, 9.0)
     for v, view in enumerate(views):
-        assert visibility.rows(v).tolist() == brute_force(grid, view, 9.0)
+        assert visibility.get_rows(v).tolist() == brute_force(grid, view, 9.0)
 
 
 def test_distance_field_is_chebyshev():
     grid = cluttered(3, 40, 12)
     in_window = ((grid.cells >= (1, 0, 2)) & (grid.cells < (10, 12, 12))).all(axis=1)
-    field = raycast.distance_field(grid.cells[in_window], np.array([1, 0, 2]), (9, 12, 10))
+    field = rays.compute_distance_field(grid.cells[in_window], np.array([1, 0, 2]), (9, 12, 10))
     cells = np.argwhere(np.ones((9, 12, 10), bool)) + (1, 0, 2)
     expected = np.abs(cells[:, None] - grid.cells[in_window][None]).max(axis=-1).min(axis=1)
     assert (field.ravel() == expected).all()
@@ -76,15 +76,15 @@ def test_views_far_apart_come_back_in_their_order():
     blocks = [np.argwhere(np.ones((4, 4, 2), bool)) + (x, 0, 0) for x in (0, 300, 700)]
     grid = VoxelGrid.from_cells(np.concatenate(blocks).astype(np.int32), edge=0.1)
     views = np.array([[70.23, 0.21, 0.71], [0.23, 0.21, 0.71], [30.23, 0.21, 0.71], [50.0, 0.0, 0.5], [70.27, 0.21, 0.71]])
-    visibility = visible_cells(grid, views, 3.0)
-    assert visibility.sizes().tolist() == [len(visibility.rows(v)) for v in range(5)]
-    blocks_seen = [np.unique(grid.cells[visibility.rows(v), 0] // 100).tolist() for v in range(5)]
+    visibility = find_visible_cells(grid, views, 3.0)
+    assert visibility.count_cells().tolist() == [len(visibility.get_rows(v)) for v in range(5)]
+    blocks_seen = [np.unique(grid.cells[visibility.get_rows(v), 0] // 100).tolist() for v in range(5)]
     assert blocks_seen == [[7], [0], [3], [], [7]]
 
 
 def test_no_views():
-    visibility = visible_cells(cluttered(0), np.zeros((0, 3)), 1.0)
-    assert len(visibility) == 0 and visibility.sizes().tolist() == []
+    visibility = find_visible_cells(cluttered(0), np.zeros((0, 3)), 1.0)
+    assert len(visibility) == 0 and visibility.count_cells().tolist() == []
 
 
 def sets_of(rows: list[list[int]], n: int) -> Visibility:
@@ -102,13 +102,13 @@ def sets_of(rows: list[list[int]], n: int) -> Visibility:
 @given(st.lists(st.sets(st.integers(0, 300), max_size=60), min_size=1, max_size=8), st.sampled_from([0.0, 0.2]))
 def test_jaccard_equals_sets(sets, threshold):
     visibility = sets_of([sorted(s) for s in sets], 301)
-    assert [visibility.rows(v).tolist() for v in range(len(sets))] == [sorted(s) for s in sets]
-    similarity = jaccard_similarity(visibility, threshold).toarray()
+    assert [visibility.get_rows(v).tolist() for v in range(len(sets))] == [sorted(s) for s in sets]
+    similarity = compute_jaccard_similarity(visibility, threshold).toarray()
     for i, a in enumerate(sets):
         for j, b in enumerate(sets):
             exact = 1.0 if i == j else len(a & b) / max(len(a | b), 1)
             assert similarity[i, j] == pytest.approx(exact if exact >= threshold or i == j else 0.0)
-    np.testing.assert_allclose(visibility.matrix().sum(axis=1), [len(s) for s in sets])
+    np.testing.assert_allclose(visibility.build_matrix().sum(axis=1), [len(s) for s in sets])
 
 
 @pytest.mark.longer
@@ -116,16 +116,20 @@ def test_views_of_other_heights_are_not_compared():
     rows = [[1, 2, 70], [2, 70, 90], [100, 101]]
     heights = np.arange(128) // 64
     visibility = sets_of(rows, 128)
-    assert kernel.extents(visibility.indptr, visibility.words, visibility.masks, heights).tolist() == [[0, 1], [0, 1], [1, 1]]
-    plain, quick = (jaccard_similarity(visibility, heights=h).toarray() for h in (None, heights))
+    assert kernel.compute_extents(visibility.indptr, visibility.words, visibility.masks, heights).tolist() == [
+        [0, 1],
+        [0, 1],
+        [1, 1],
+    ]
+    plain, quick = (compute_jaccard_similarity(visibility, heights=h).toarray() for h in (None, heights))
     assert (plain == quick).all()
     far = np.array([0] * 64 + [5] * 64)
-    assert jaccard_similarity(sets_of([[1, 2], [100]], 128), heights=far).toarray().tolist() == [[1, 0], [0, 1]]
+    assert compute_jaccard_similarity(sets_of([[1, 2], [100]], 128), heights=far).toarray().tolist() == [[1, 0], [0, 1]]
 
 
 def test_only_pairs_within_reach_are_compared():
     visibility = sets_of([[1, 2, 3], [1, 2, 3], [1, 2, 3]], 64)
-    similarity = jaccard_similarity(visibility, 0.3, np.array([[0, 0, 0], [1, 0, 0], [9, 0, 0]]), 2.0).toarray()
+    similarity = compute_jaccard_similarity(visibility, 0.3, np.array([[0, 0, 0], [1, 0, 0], [9, 0, 0]]), 2.0).toarray()
     assert similarity.tolist() == [[1, 1, 0], [1, 1, 0], [0, 0, 1]]
 
 

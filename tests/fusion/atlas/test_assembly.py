@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.fusion.atlas.votes import LIMIT, TRUE, WRONG, Pair, Votes, between, claim, odds
-from topomerge.fusion.atlas.link_evidence import CLOSING_GAIN, Link, across
-from topomerge.fusion.pose_graph import HEAVIEST_WALLS, Assembler, residual
+from topomerge.fusion.atlas.link_evidence import CLOSING_GAIN, Link, place_component
+from topomerge.fusion.pose_graph import HEAVIEST_WALLS, Assembler, compute_residual
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3
 
@@ -23,13 +23,13 @@ def is_right(poses: dict[int, Sim3]) -> bool:
 
 def test_a_chain_of_links_brings_maps_into_one_frame():
     assembly = built({(0, 1): claim(0, 1, 0.99), (1, 2): claim(1, 2, 0.95), (2, 3): claim(2, 3, 0.97), (0, 3): claim(0, 3, 0.5)})
-    assert is_right(assembly.of(0)) and len(assembly.components) == 1
+    assert is_right(assembly.find_component(0)) and len(assembly.components) == 1
     assert sorted(link.maps for link in assembly.links) == [(0, 1), (1, 2), (2, 3)] and not assembly.rejected
 
 
 def test_what_is_not_believed_stays_apart():
     assembly = built({(0, 1): claim(0, 1, 0.99), (1, 2): claim(1, 2, 0.8)}, count=3)
-    assert sorted(map(sorted, assembly.components)) == [[0, 1], [2]] and is_right(assembly.of(1))
+    assert sorted(map(sorted, assembly.components)) == [[0, 1], [2]] and is_right(assembly.find_component(1))
 
 
 def test_votes_of_others_let_a_weak_link_in_and_keep_a_strong_one_out():
@@ -42,7 +42,7 @@ def test_votes_of_others_let_a_weak_link_in_and_keep_a_strong_one_out():
 
 def test_a_wrong_claim_in_a_cycle_is_rejected_and_the_weakest_link_against_it_named():
     assembly = built({(0, 1): claim(0, 1, 0.999), (1, 2): claim(1, 2, 0.99), (0, 2): claim(0, 2, 0.6, WRONG)}, count=3)
-    assert is_right(assembly.of(0)) and len(assembly.of(0)) == 3
+    assert is_right(assembly.find_component(0)) and len(assembly.find_component(0)) == 3
     (rejected,) = assembly.rejected
     assert rejected.maps == (0, 2) and rejected.against == (1, 2) and rejected.log_odds == pytest.approx(-odds(0.6))
 
@@ -52,7 +52,7 @@ def test_a_wrong_link_that_was_taken_first_is_given_up():
     claims |= {tuple(sorted((k, 3))): claim(*sorted((k, 3)), 0.95) for k in (1, 2, 4)}  # type: ignore[misc]
     they_see_it = Votes(to_others=dict.fromkeys(claims, 0.0))
     assembly = built(claims, they_see_it, count=5)
-    assert len(assembly.components) == 1 and is_right(assembly.of(0))
+    assert len(assembly.components) == 1 and is_right(assembly.find_component(0))
     assert [link.maps for link in assembly.rejected] == [(0, 3)]
 
 
@@ -67,7 +67,7 @@ def test_three_maps_that_agree_come_together_though_no_pair_of_them_is_believed(
     claims = {pair: claim(*pair, 0.7) for pair in ((0, 1), (0, 2), (1, 2))}
     assembly = built(claims, count=3)
     assert odds(0.7) < LIMIT < odds(0.7) + CLOSING_GAIN
-    assert len(assembly.components) == 1 and is_right(assembly.of(0)) and len(assembly.links) == 2
+    assert len(assembly.components) == 1 and is_right(assembly.find_component(0)) and len(assembly.links) == 2
     assert all(link.log_odds == pytest.approx(odds(0.7) + CLOSING_GAIN) for link in assembly.links)
     for missing in claims:
         two = {pair: h for pair, h in claims.items() if pair != missing}
@@ -89,7 +89,7 @@ def test_components_meet_where_a_link_puts_their_maps(pair):
     """Map 1 lies in one component, map 2 in the other; each has a frame of its own."""
     here, there = Sim3(1.1, (50.0, 3.0, 1.0)), Sim3(-0.6, (-8.0, 20.0, 0.0))
     a, b = {k: here @ TRUE[k] for k in (0, 1)}, {k: there @ TRUE[k] for k in (2, 3)}
-    move = across(a, b, pair, between(*pair))
+    move = place_component(a, b, pair, between(*pair))
     assert np.allclose(move.matrix, (here @ there.inverse()).matrix)
 
 
@@ -103,7 +103,7 @@ def test_the_measurement_with_more_walls_counts_more():
     for walls in (1.0, HEAVIEST_WALLS, 1000.0):
         votes.walls = {(0, 1): 10.0, (1, 2): 10.0, (0, 2): walls}
         solved, edges = Assembler(3, {}, votes, LIMIT).settle(poses, links)  # type: ignore[arg-type]
-        gaps.append({e.maps: residual(e, solved) for e in edges})
+        gaps.append({e.maps: compute_residual(e, solved) for e in edges})
     assert gaps[0][0, 2] > 3 * gaps[0][0, 1] and gaps[1][0, 2] < gaps[1][0, 1]
     assert gaps[1] == pytest.approx(gaps[2])
 

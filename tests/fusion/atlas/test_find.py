@@ -13,22 +13,22 @@ import pytest
 import topomerge
 from tests.fusion.atlas.atlas_scenes import NAMES, office_map, stranger
 from topomerge.cli.main import main as cli
-from topomerge.embedding.turns import TurnedRows
+from topomerge.embedding.quarter_turns import TurnedRows
 from topomerge.errors import InputError
 from topomerge.fusion.atlas import find as finding
-from topomerge.fusion.atlas.find import find, laid, ranked
+from topomerge.fusion.atlas.find import find, rank_sightings, register_sightings
 from topomerge.fusion.atlas.folder import read_atlas
 from topomerge.fusion.atlas.rooms_index import ROOMS_FILE
 from topomerge.fusion.atlas.store import add, remove
 from topomerge.io import archive
-from topomerge.viz.atlas_report import atlas_html
+from topomerge.viz.atlas_report import render_atlas_html
 
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An atlas of the office's west and a stranger."""
     folder = tmp_path_factory.mktemp("atlas") / "built"
-    add(folder, [(NAMES[0], office_map(0)), ("stranger", stranger())], atlas_html)
+    add(folder, [(NAMES[0], office_map(0)), ("stranger", stranger())], render_atlas_html)
     return folder
 
 
@@ -47,23 +47,23 @@ def unit_rows(rooms: int, seed: int) -> TurnedRows:
 def test_rooms_seen_again_and_turned_lead_to_their_map() -> None:
     maps = [unit_rows(6, k) for k in range(5)]
     new = TurnedRows(np.roll(maps[3].rows[[4, 1, 5]], 2, axis=1), 3 - maps[3].places[[4, 1, 5]])
-    sightings = ranked(["a", "b", "c", "d", "e"], maps, new, 3)
+    sightings = rank_sightings(["a", "b", "c", "d", "e"], maps, new, 3)
     assert sightings[0].name == "d" and len(sightings) == 3
     assert {(i, j) for i, j, _ in sightings[0].rooms} == {(0, 4), (1, 1), (2, 5)}
-    assert sum(s.share for s in ranked(list("abcde"), maps, new, 5)) == pytest.approx(1.0)
+    assert sum(s.share for s in rank_sightings(list("abcde"), maps, new, 5)) == pytest.approx(1.0)
 
 
 def test_rooms_that_stand_to_each_other_as_those_of_the_new_map_count_more() -> None:
     here = unit_rows(5, 0)
     shuffled = TurnedRows(here.rows, here.places[[1, 2, 3, 4, 0]])  # the same rooms in another building
     new = TurnedRows(here.rows, here.places + 3.0)
-    first, second = ranked(["shuffled", "here"], [shuffled, here], new, 2)
+    first, second = rank_sightings(["shuffled", "here"], [shuffled, here], new, 2)
     assert first.name == "here" and first.share > 2 * second.share
 
 
 def test_plain_rows_and_maps_without_rooms() -> None:
     rows = [np.eye(4)[:2], np.zeros((0, 4)), np.eye(4)[2:]]
-    sightings = ranked(["a", "none", "b"], rows, np.eye(4)[[3]], 3)
+    sightings = rank_sightings(["a", "none", "b"], rows, np.eye(4)[[3]], 3)
     assert sightings[0].name == "b" and sightings[0].rooms[0][:2] == (0, 1)
     assert {s.name: s.share for s in sightings}["none"] == 0.0
 
@@ -83,14 +83,14 @@ def test_the_map_on_which_it_lies_best_comes_first(house: Path, monkeypatch: pyt
     first, second = find(house, office_map(0))
     assert first.fit is not None and second.fit is not None and first.fit > 3 > second.fit
     turned = (replace(second, fit=None), replace(first, fit=None))
-    assert laid(read_atlas(house), office_map(0), turned) == (first, second)
+    assert register_sightings(read_atlas(house), office_map(0), turned) == (first, second)
     monkeypatch.setattr(finding, "LAID_COARSELY", 1)
-    assert laid(read_atlas(house), office_map(0), turned) == (second, turned[1])
+    assert register_sightings(read_atlas(house), office_map(0), turned) == (second, turned[1])
 
 
 def test_what_the_atlas_loses_is_found_no_more(house: Path) -> None:
     find(house, office_map(0))
-    remove(house, [NAMES[0]], atlas_html)
+    remove(house, [NAMES[0]], render_atlas_html)
     assert [s.name for s in find(house, office_map(0))] == ["stranger"]
 
 

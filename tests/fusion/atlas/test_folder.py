@@ -9,18 +9,18 @@ from pathlib import Path
 import pytest
 
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.folder import changing, finished
+from topomerge.fusion.atlas.folder import change_folder, finish_change
 
 
 def state(folder: Path) -> dict[str, str]:
     """Its files after an interrupted change was finished."""
-    finished(folder)
+    finish_change(folder)
     return {p.name: p.read_text() for p in folder.rglob("*") if p.is_file() and not str(p.relative_to(folder)).startswith(".")}
 
 
 def change(folder: Path) -> None:
     gone = ["old"]
-    with changing(folder, gone) as place:
+    with change_folder(folder, gone) as place:
         (place / "maps").mkdir()
         for name in ("a", "maps/b", "new"):
             (place / name).write_text("2")
@@ -83,5 +83,5 @@ def test_one_change_at_a_time(tmp_path):
     fcntl = pytest.importorskip("fcntl")
     with (tmp_path / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        with pytest.raises(InputError, match="is being changed by another process"), changing(tmp_path, [], 0):
+        with pytest.raises(InputError, match="is being changed by another process"), change_folder(tmp_path, [], 0):
             pass

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.fusion.atlas.votes import TRUE, WRONG, Pair, Votes, between, claim, odds
-from topomerge.fusion.atlas.link_evidence import CLOSING_GAIN, Link, LinkEvidence, shares_of, weigh
+from topomerge.fusion.atlas.link_evidence import CLOSING_GAIN, Link, LinkEvidence, compute_shares, weigh
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3
 
@@ -114,10 +114,10 @@ def test_a_rival_claim_that_its_own_maps_contradict_counts_little():
 
 
 def test_shares_of_a_pair_sum_to_one_and_the_best_keeps_its_own():
-    shares, none = shares_of([PoseHypothesis(Sim3(), probability=p) for p in (0.6, 0.4, 0.4, 0.1)])
+    shares, none = compute_shares([PoseHypothesis(Sim3(), probability=p) for p in (0.6, 0.4, 0.4, 0.1)])
     assert shares[0] == 0.6 and sum(shares) + none == pytest.approx(1.0) and none == pytest.approx(0.04)
     assert shares[1] == shares[2] == pytest.approx(0.16)
-    shares, none = shares_of([PoseHypothesis(Sim3(), probability=p) for p in (0.6, 0.1)])
+    shares, none = compute_shares([PoseHypothesis(Sim3(), probability=p) for p in (0.6, 0.1)])
     assert shares == [0.6, 0.1] and none == pytest.approx(0.3)
 
 

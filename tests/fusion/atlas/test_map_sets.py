@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from topomerge.fusion.atlas.pairs import Check
-from topomerge.fusion.pose_graph import Assembler, Assembly, sets_of_maps
+from topomerge.fusion.pose_graph import Assembler, Assembly, iter_map_sets
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3
 
@@ -63,7 +63,7 @@ def told(assembly: Assembly) -> tuple:
 @given(st.integers(0, 2**32 - 1))
 def test_assembled_by_sets_it_is_what_it_is_at_once(seed: int) -> None:
     claims, says, count = drawn(seed)
-    whole = told(Assembler(count, claims, says, LIMIT)._assembled())  # type: ignore[arg-type]
+    whole = told(Assembler(count, claims, says, LIMIT)._assemble())  # type: ignore[arg-type]
     assert told(Assembler(count, claims, says, LIMIT).build()) == whole  # type: ignore[arg-type]
     growing: dict = {}
     assembler = Assembler(count, growing, says, LIMIT)  # type: ignore[arg-type]
@@ -76,8 +76,8 @@ def test_assembled_by_sets_it_is_what_it_is_at_once(seed: int) -> None:
 
 def test_only_sets_with_more_pairs_are_assembled_anew(monkeypatch) -> None:
     assembled = []
-    usual = Assembler._assembled
-    monkeypatch.setattr(Assembler, "_assembled", lambda self: assembled.append(tuple(self.maps)) or usual(self))
+    usual = Assembler._assemble
+    monkeypatch.setattr(Assembler, "_assemble", lambda self: assembled.append(tuple(self.maps)) or usual(self))
     link = (PoseHypothesis(Sim3(), probability=0.99),)
     claims = {(0, 1): link, (2, 3): link}
     assembler = Assembler(5, claims, Says([Sim3()] * 5, np.zeros((5, 5, 2))), LIMIT)  # type: ignore[arg-type]
@@ -90,7 +90,7 @@ def test_only_sets_with_more_pairs_are_assembled_anew(monkeypatch) -> None:
 
 @given(st.sets(st.tuples(st.integers(0, 11), st.integers(0, 11)), max_size=14))
 def test_sets_are_what_pairs_join(pairs: set[tuple[int, int]]) -> None:
-    sets = list(sets_of_maps(12, pairs, {pair: str(pair) for pair in pairs} | {(0, 11): "far"}))
+    sets = list(iter_map_sets(12, pairs, {pair: str(pair) for pair in pairs} | {(0, 11): "far"}))
     assert sorted(k for maps, _ in sets for k in maps) == list(range(12))
     assert all(any({i, j} <= set(maps) for maps, _ in sets) for i, j in pairs)
     reached = {0}

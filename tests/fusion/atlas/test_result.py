@@ -27,8 +27,8 @@ def atlas(*components: tuple[int, ...], **more: Any) -> AtlasResult:
 
 def test_a_component_is_as_probable_as_its_weakest_link():
     result = atlas((0, 2), (1, 3, 4), links=(link(0, 2, 0.9), link(1, 3, 0.99), link(3, 4, 0.95)))
-    assert result.probability(0) == pytest.approx(0.9) and result.probability(1) == pytest.approx(0.95)
-    assert [result.component_of(k) for k in range(5)] == [0, 1, 0, 1, 1] and atlas((0,), (1,)).probability(1) == 0.0
+    assert result.get_probability(0) == pytest.approx(0.9) and result.get_probability(1) == pytest.approx(0.95)
+    assert [result.find_component(k) for k in range(5)] == [0, 1, 0, 1, 1] and atlas((0,), (1,)).get_probability(1) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -46,12 +46,12 @@ def test_the_status_and_who_stands_alone(components, status, alone):
 
 def test_a_component_that_is_not_there_is_named():
     with pytest.raises(InputError, match="^there is no component 9: the atlas has 2 components, counted from 0"):
-        atlas((0, 1), (2,)).joined(9)
+        atlas((0, 1), (2,)).join_component(9)
 
 
 def test_words_name_who_belongs_together_who_stands_apart_and_what_was_thrown_out():
     result = atlas((0, 1), (2,), links=(link(0, 1, 0.93),), rejected=(link(0, 2, 0.88, (1, 2)), link(1, 2, 0.85)))
-    assert result.words().split("; ") == [
+    assert result.format_summary().split("; ") == [
         "2 maps belong together (west.ply, east.ply), weakest link 0.93",
         "north.ply stands apart: nothing connects it",
         "west.ply, north.ply: a match of probability 0.88 by itself was thrown out, east.ply, north.ply contradict it",
@@ -59,11 +59,11 @@ def test_words_name_who_belongs_together_who_stands_apart_and_what_was_thrown_ou
     ]
     assert (
         atlas((0, 1), (2,), (3,), links=(link(0, 1, 0.93),))
-        .words()
+        .format_summary()
         .endswith("north.ply, south.ply stand apart: nothing connects them")
     )
 
 
 def test_words_of_an_atlas_without_links():
-    assert atlas((0,), (1,)).words() == "nothing could be connected: all 2 maps stand apart"
-    assert atlas((0,)).words() == "one map, nothing to connect it with yet" and atlas().words() == "no map"
+    assert atlas((0,), (1,)).format_summary() == "nothing could be connected: all 2 maps stand apart"
+    assert atlas((0,)).format_summary() == "one map, nothing to connect it with yet" and atlas().format_summary() == "no map"

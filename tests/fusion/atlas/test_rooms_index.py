@@ -11,14 +11,22 @@ import numpy as np
 import pytest
 
 from tests.fusion.atlas.atlas_scenes import office_map
-from topomerge.embedding.turns import TurnedRows
+from topomerge.embedding.quarter_turns import TurnedRows
 from topomerge.errors import InputError
 from topomerge.fusion.atlas import find as finding
 from topomerge.fusion.atlas import rooms_index as indexing
-from topomerge.fusion.atlas.find import Sighting, find, ranked
+from topomerge.fusion.atlas.find import Sighting, find, rank_sightings
 from topomerge.fusion.atlas.folder import read_atlas
-from topomerge.fusion.atlas.partners import nearest
-from topomerge.fusion.atlas.rooms_index import INDEX_FILE, LINKS, ROOMS_FILE, RoomsIndex, check_graph, embedder_signature, signed
+from topomerge.fusion.atlas.partners import find_nearest
+from topomerge.fusion.atlas.rooms_index import (
+    INDEX_FILE,
+    LINKS,
+    ROOMS_FILE,
+    RoomsIndex,
+    check_graph,
+    compute_embedder_signature,
+    encode_signature,
+)
 from topomerge.io import archive
 from topomerge.types import Array
 
@@ -41,7 +49,7 @@ def write_atlas(folder: Path, maps: dict[str, TurnedRows]) -> Path:
     folder.mkdir(exist_ok=True)
     listed = [{"name": n, "key": f"{n:0>16}", "source": n, "rooms": len(of), "storeys": 1} for n, of in maps.items()]
     (folder / "atlas.json").write_text(json.dumps({"format": 1, "maps": listed, "settings": {}}))
-    arrays = {"embedder": signed(embedder_signature("learned"))}
+    arrays = {"embedder": encode_signature(compute_embedder_signature("learned"))}
     for name, of in maps.items():
         arrays |= {f"{name:0>16}": of.rows.astype(np.float32), f"{name:0>16}.places": of.places}
     archive.write(arrays, folder / ROOMS_FILE)
@@ -50,8 +58,8 @@ def write_atlas(folder: Path, maps: dict[str, TurnedRows]) -> Path:
 
 def look(folder: Path, new: TurnedRows, number: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Sighting, ...]:
     """`find` of a map with these rows."""
-    monkeypatch.setattr(finding, "checked", lambda describe, map: new)
-    monkeypatch.setattr(finding, "laid", lambda stored, map, sightings: sightings)
+    monkeypatch.setattr(finding, "embed_rooms", lambda describe, map: new)
+    monkeypatch.setattr(finding, "register_sightings", lambda stored, map, sightings: sightings)
     return find(folder, office_map(0), number)
 
 
@@ -87,7 +95,9 @@ def test_a_shortlist_gives_what_the_comparison_with_all_maps_gives(tmp_path: Pat
     written = (folder / ROOMS_FILE).read_bytes()
     for k in (1, 70, 143, 210):
         new = seen_again(maps, k)
-        among_all = ranked([str(m) for m in range(MAPS)], [replace(m, rows=m.rows.astype(np.float32)) for m in maps], new, 3)
+        among_all = rank_sightings(
+            [str(m) for m in range(MAPS)], [replace(m, rows=m.rows.astype(np.float32)) for m in maps], new, 3
+        )
         shown = look(folder, new, 3, monkeypatch)
         assert shown[0].name == str(k) and [s.name for s in shown] == [s.name for s in among_all]
         assert shown[0].rooms[0][:2] == among_all[0].rooms[0][:2] and shown[0].share >= among_all[0].share - 1e-9
@@ -117,8 +127,8 @@ def test_nineteen_of_twenty_neighbours_are_the_nearest() -> None:
     table, asked = (of / np.linalg.norm(of, axis=1, keepdims=True) for of in (table, asked))
     index = RoomsIndex(64)
     index.add(["a", "b"], [1000, 3000], table.astype(np.float32))
-    rooms, cosine = index.nearest(asked, 10)
-    exact, of_exact = nearest(table, asked, 10)
+    rooms, cosine = index.find_nearest(asked, 10)
+    exact, of_exact = find_nearest(table, asked, 10)
     assert np.mean([len(set(a) & set(b)) / 10 for a, b in zip(rooms.tolist(), exact.tolist(), strict=True)]) >= 0.95
     assert np.allclose(cosine, np.take_along_axis(asked @ table.T, rooms, axis=1), atol=0.02)
     assert np.allclose(cosine.mean(), of_exact.mean(), atol=0.005)
@@ -128,7 +138,7 @@ def test_fewer_rooms_than_are_asked_for() -> None:
     pytest.importorskip("usearch")
     index = RoomsIndex(4)
     index.add(["a"], [3], np.eye(4, dtype=np.float32)[:3])
-    rooms, cosine = index.nearest(np.eye(4, dtype=np.float32)[[1]], 64)
+    rooms, cosine = index.find_nearest(np.eye(4, dtype=np.float32)[[1]], 64)
     assert rooms[0, 0] == 1 and cosine[0, 0] == pytest.approx(1, abs=0.02) and (cosine[0, 3:] == -np.inf).all()
 
 
@@ -201,7 +211,7 @@ def test_a_graph_that_would_lead_the_library_astray_is_refused(indexed: Path) ->
         except (ValueError, RuntimeError):
             refused += 1
             continue
-        assert (index.nearest(np.eye(4 * SIZE, dtype=np.float32))[0] < count).all()
+        assert (index.find_nearest(np.eye(4 * SIZE, dtype=np.float32))[0] < count).all()
     assert refused > 120  # of other bytes: links that lead to another room, or places that are not in use
 
 

@@ -38,7 +38,7 @@ def turned_wrongly(result: AtlasResult, truth: list[Sim3]) -> bool:
 def test_maps_of_a_symmetric_arena_are_believed_no_more_than_a_pair(arena: Arena, count: int, tmp_path: Path) -> None:
     maps, truth = arena_maps(arena, tmp_path, count)
     registrations: RegistrationsByPair = {}
-    result = tm.atlas(maps, registrations=registrations, rigid=True)
+    result = tm.build_atlas(maps, registrations=registrations, rigid=True)
     best = max(ranked[0].probability for ranked in registrations.values() if ranked)
     assert all(link.probability <= best + 0.03 for link in result.links)
     if best < 0.75:  # no pair is believed, so that nothing is joined
@@ -50,7 +50,7 @@ def test_maps_of_a_symmetric_arena_are_believed_no_more_than_a_pair(arena: Arena
 @pytest.mark.parametrize(("arena", "count"), [(Arena(fold=1, seed=12), 4), (Arena(14.0, 9.0, fold=1, seed=11), 3)])
 def test_maps_of_an_arena_that_does_not_repeat_are_joined(arena: Arena, count: int, tmp_path: Path) -> None:
     maps, truth = arena_maps(arena, tmp_path, count)
-    result = tm.atlas(maps, rigid=True)
+    result = tm.build_atlas(maps, rigid=True)
     assert result.status == "merged" and not turned_wrongly(result, truth) and not result.contradictions
     off = [np.linalg.norm(np.subtract(result.transforms[k].translation, truth[k].translation)[:2]) for k in range(count)]
     assert max(off) < 0.2

@@ -20,10 +20,10 @@ from tests.viz.chromium import Page
 from topomerge.fusion.atlas import store as tiles_module
 from topomerge.fusion.atlas.maps import Maps
 from topomerge.fusion.atlas.result import AtlasResult
-from topomerge.fusion.atlas.store import add, nearest_rooms, remove, tile_map, tiles
+from topomerge.fusion.atlas.store import add, find_nearest_rooms, remove, select_tile, split_into_tiles
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3, TopometricMap
-from topomerge.viz.serve import serve
+from topomerge.viz.report import serve
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def large() -> TopometricMap:
 def small_tiles(monkeypatch: pytest.MonkeyPatch, large: TopometricMap) -> None:
     """A joined map shows a large building, in tiles of a few rooms."""
     monkeypatch.setattr(tiles_module, "TILE_CELLS", 60_000)
-    monkeypatch.setattr(AtlasResult, "joined", lambda *_: large)
+    monkeypatch.setattr(AtlasResult, "join_component", lambda *_: large)
 
     def hypotheses(maps: Maps, i: int, j: int, *_: object) -> tuple[PoseHypothesis, ...]:
         return (PoseHypothesis(Sim3(0.0, (20.0 * (j - i), 0.0, 0.0)), probability=0.995),)
@@ -46,21 +46,21 @@ def small_tiles(monkeypatch: pytest.MonkeyPatch, large: TopometricMap) -> None:
 
 def test_each_room_and_each_cell_is_in_one_tile(monkeypatch: pytest.MonkeyPatch, large: TopometricMap) -> None:
     monkeypatch.setattr(tiles_module, "TILE_CELLS", 60_000)
-    parts = tiles(large)
+    parts = split_into_tiles(large)
     assert len(parts) > 3 and sorted(np.concatenate(parts).tolist()) == list(range(len(large.rooms)))
-    maps = [tile_map(large, rooms) for rooms in parts]
+    maps = [select_tile(large, rooms) for rooms in parts]
     assert all(len(m.grid) <= 60_000 or len(rooms) == 1 for m, rooms in zip(maps, parts, strict=True))
     cells = np.concatenate([m.grid.cells for m in maps])
     assert len(cells) == len(large.grid) and (np.unique(cells, axis=0) == np.unique(large.grid.cells, axis=0)).all()
     for part, rooms in zip(maps, parts, strict=True):
-        rows = large.grid.rows(part.grid.cells)
+        rows = large.grid.find_rows(part.grid.cells)
         assert (part.room == large.room[rows]).all() and (part.provenance == large.provenance[rows]).all()  # type: ignore[index]
         assert set(part.navigable_room.tolist()) <= set(rooms.tolist()) and np.isin(part.edges["rooms"], rooms).any(axis=1).all()
     assert sum(len(m.navigable) for m in maps) == int((large.navigable_room >= 0).sum())
 
 
 def test_a_cell_of_no_room_goes_with_the_nearest(large: TopometricMap) -> None:
-    owner = nearest_rooms(large)
+    owner = find_nearest_rooms(large)
     inside = large.room >= 0
     assert (owner[inside] == large.room[inside]).all() and (owner >= 0).all() and not inside.all()
     cells = large.grid.cells[~inside][::97]
@@ -71,38 +71,38 @@ def test_a_cell_of_no_room_goes_with_the_nearest(large: TopometricMap) -> None:
 
 
 def test_a_small_map_and_one_without_rooms_are_one_tile(large: TopometricMap) -> None:
-    assert [part.tolist() for part in tiles(large)] == [list(range(len(large.rooms)))]
-    whole = tile_map(large, tiles(large)[0])
+    assert [part.tolist() for part in split_into_tiles(large)] == [list(range(len(large.rooms)))]
+    whole = select_tile(large, split_into_tiles(large)[0])
     assert (whole.grid.cells == large.grid.cells).all() and len(whole.edges) == len(large.edges)
     nowhere, unwalked = np.full(len(large.grid), -1, np.int32), np.full(len(large.navigable), -1, np.int32)
     bare = replace(large, room=nowhere, navigable_room=unwalked, rooms=large.rooms[:0], edges=large.edges[:0])
-    assert len(tiles(bare)) == 1 and len(tile_map(bare, tiles(bare)[0]).grid) == len(bare.grid)
+    assert len(split_into_tiles(bare)) == 1 and len(select_tile(bare, split_into_tiles(bare)[0]).grid) == len(bare.grid)
 
 
 def test_a_large_joined_map_has_a_page_for_each_tile(tmp_path: Path, small_tiles: None, large: TopometricMap) -> None:
     folder = tmp_path / "house"
-    add(folder, [("one", room(0)), ("two", room(1))], tm.atlas_html)
+    add(folder, [("one", room(0)), ("two", room(1))], tm.render_atlas_html)
     component = json.loads((folder / "atlas.json").read_text())["components"][0]
     files = component["tiles"]
-    assert component["page"] == "map_0.html" and len(files) == len(tiles(large)) > 3
+    assert component["page"] == "map_0.html" and len(files) == len(split_into_tiles(large)) > 3
     index, overview = ((folder / name).read_text(encoding="utf-8") for name in ("report.html", "map_0.html"))
     assert 'href="map_0.html"' in index and 'id="scene-data"' not in overview
     assert all(f'href="{name}"' in overview for name in files)
     for k, name in enumerate(files):
         page = (folder / name).read_text(encoding="utf-8")
-        rooms = tiles(large)[k]
+        rooms = split_into_tiles(large)[k]
         assert 'href="map_0.html"' in page and 'id="scene-data"' in page
         assert all(f'<tr data-room="{r}"' in page for r in rooms) and page.count('<tr data-room="') == len(rooms)
     before = {name: (folder / name).read_bytes() for name in files}
-    add(folder, [("three", room(2))], tm.atlas_html)
+    add(folder, [("three", room(2))], tm.render_atlas_html)
     assert sorted(p.name for p in folder.glob("*_tile_*")) == sorted(files) and before.keys() == set(files)
-    remove(folder, ["two", "three"], tm.atlas_html)
+    remove(folder, ["two", "three"], tm.render_atlas_html)
     assert not list(folder.glob("*_tile_*")) and not list(folder.glob("map_*"))
 
 
 def test_the_same_atlas_has_the_same_tiles(tmp_path: Path, small_tiles: None) -> None:
     for name in ("house", "again"):
-        add(tmp_path / name / "atlas", [("one", room(0)), ("two", room(1))], tm.atlas_html)
+        add(tmp_path / name / "atlas", [("one", room(0)), ("two", room(1))], tm.render_atlas_html)
     pages = [{p.name: p.read_bytes() for p in (tmp_path / name / "atlas").glob("map_*.html")} for name in ("house", "again")]
     assert pages[0] == pages[1] and len(pages[0]) > 4
 
@@ -110,7 +110,7 @@ def test_the_same_atlas_has_the_same_tiles(tmp_path: Path, small_tiles: None) ->
 @pytest.mark.longer
 def test_the_page_of_a_tile_shows_its_cells(tmp_path: Path, small_tiles: None) -> None:
     folder = tmp_path / "house"
-    add(folder, [("one", room(0)), ("two", room(1))], tm.atlas_html)
+    add(folder, [("one", room(0)), ("two", room(1))], tm.render_atlas_html)
     with Page(folder / "map_0_tile_1.html", tmp_path / "profile") as page:
         page.wait("document.querySelector('.scene').dataset.state === 'shown'")
         assert page.run("document.querySelectorAll('.plan-view svg').length") == 2

@@ -20,9 +20,9 @@ from tests.scenes import Scene
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.fusion.atlas.folder import read_atlas
-from topomerge.fusion.atlas.maps import Maps, map_key
+from topomerge.fusion.atlas.maps import Maps, hash_map
 from topomerge.fusion.atlas.store import add, remove
-from topomerge.fusion.atlas.watch import SOURCES_FILE, Reader, Watch, changes, read_sources, stamp_of
+from topomerge.fusion.atlas.watch import SOURCES_FILE, FolderWatcher, Reader, compute_stamp, iter_changes, read_sources
 from topomerge.io.maps import load_map
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3
@@ -69,17 +69,17 @@ class Lines:
         return load_map(path)
 
 
-def watch(folder: Path, atlas: Path, lines: Lines | None = None, **settings: object) -> Watch:
+def watch(folder: Path, atlas: Path, lines: Lines | None = None, **settings: object) -> FolderWatcher:
     lines = lines or Lines()
     reader = Reader(lines.map, "", lambda error, path: f"{path.name}: {error}" if isinstance(error, InputError) else None)
-    return Watch(folder, atlas, reader, tm.atlas_html, lines, settle=0.0, **settings)  # type: ignore[arg-type]
+    return FolderWatcher(folder, atlas, reader, tm.render_atlas_html, lines, settle=0.0, **settings)  # type: ignore[arg-type]
 
 
 def seen(folder: Path, atlas: Path, **settings: object) -> Lines:
     """Look at a folder until there is nothing to wait for."""
     lines = Lines()
     one = watch(folder, atlas, lines, **settings)
-    while one.look():
+    while one.update():
         pass
     return lines
 
@@ -134,7 +134,7 @@ def test_two_that_add_at_once_lose_nothing(apart, tmp_path):
 
     def adding(numbers: range) -> None:
         for k in numbers:
-            add(tmp_path / "house", [(f"room-{k}", rooms[k])], tm.atlas_html)
+            add(tmp_path / "house", [(f"room-{k}", rooms[k])], tm.render_atlas_html)
 
     children = [in_a_copy(lambda n=n: adding(range(n, 6, 2))) for n in range(2)]
     assert [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children] == [0, 0]
@@ -153,7 +153,7 @@ def test_each_file_is_read_once_and_a_copy_not_at_all(scans, apart, tmp_path):
     assert lines.read == [] and lines.told == [] and len(read_atlas(tmp_path / "site").entries) == 4
     sources = read_sources(tmp_path / "site")
     assert sources[str(scans / "again.tmap")].map == "2"
-    assert sources[str(scans / "1.tmap")].stamp == stamp_of(scans / "1.tmap", "")
+    assert sources[str(scans / "1.tmap")].stamp == compute_stamp(scans / "1.tmap", "")
     (tmp_path / "site" / SOURCES_FILE).unlink()  # all are read again, and only noted
     before = (tmp_path / "site" / "report_stamp.css").read_text()
     lines = seen(scans, tmp_path / "site")
@@ -163,7 +163,7 @@ def test_each_file_is_read_once_and_a_copy_not_at_all(scans, apart, tmp_path):
 
 def test_what_was_taken_out_stays_out_until_its_file_changes(scans, apart, tmp_path):
     seen(scans, tmp_path / "site")
-    remove(tmp_path / "site", ["3"], tm.atlas_html)
+    remove(tmp_path / "site", ["3"], tm.render_atlas_html)
     assert seen(scans, tmp_path / "site").read == []
     tm.save_map(room(5), scans / "3.tmap")
     assert seen(scans, tmp_path / "site").told == ["3.tmap -> 3: 1 room; stands apart"]
@@ -185,9 +185,9 @@ def test_a_bad_file_is_named_once_and_tried_again_when_it_changes(scans, apart, 
 def test_a_file_that_grows_is_waited_for(scans, apart, tmp_path):
     one = watch(scans, tmp_path / "site")
     one.settle = 3600.0
-    assert one.look() and one.look() and not (tmp_path / "site").exists()
+    assert one.update() and one.update() and not (tmp_path / "site").exists()
     one.settle = 0.0
-    assert not one.look() and len(read_atlas(tmp_path / "site").entries) == 4
+    assert not one.update() and len(read_atlas(tmp_path / "site").entries) == 4
 
 
 def test_a_file_that_changes_while_it_is_read_is_read_again(scans, apart, tmp_path):
@@ -202,9 +202,9 @@ def test_a_file_that_changes_while_it_is_read_is_read_again(scans, apart, tmp_pa
         return lines.map(path)
 
     one.reader = Reader(read, "", one.reader.failure)
-    one.look()
+    one.update()
     assert "2" not in {e.name for e in read_atlas(tmp_path / "site").entries}
-    one.look()
+    one.update()
     assert lines.read.count("2.tmap") == 2 and lines.told[-1].startswith("2.tmap -> 2: ")
 
 
@@ -245,7 +245,7 @@ def test_a_wrong_link_is_given_up_when_a_third_map_contradicts_it(tmp_path, monk
     """West and east are believed to lie side by side, 99 m apart, where nothing contradicts; north knows where both are."""
     scans = tmp_path / "scans"
     scans.mkdir()
-    places = {map_key(office_map(k)): k for k in (0, 2, 3)}
+    places = {hash_map(office_map(k)): k for k in (0, 2, 3)}
 
     def claimed(maps: Maps, i: int, j: int, *_: object) -> tuple[PoseHypothesis, ...]:
         one, two = places[maps.keys[i]], places[maps.keys[j]]
@@ -257,13 +257,13 @@ def test_a_wrong_link_is_given_up_when_a_third_map_contradicts_it(tmp_path, monk
         tm.save_map(office_map(k), scans / f"{NAMES[k]}.tmap")
     lines = seen(scans, tmp_path / "site")
     assert "; lies with west (0." in lines.told[0]
-    (east, west) = (read_atlas(tmp_path / "site").poses()[name][1] for name in ("east", "west"))
+    (east, west) = (read_atlas(tmp_path / "site").get_poses()[name][1] for name in ("east", "west"))
     assert np.linalg.norm((east.inverse() @ west @ truth(0, 2)).translation) > 50
     tm.save_map(office_map(3), scans / "north.tmap")
     lines = seen(scans, tmp_path / "site")
     assert "; lies with east, west (" in lines.told[0]
     assert lines.told[1].startswith("no longer believed: east, west: ")
-    (east, west) = (read_atlas(tmp_path / "site").poses()[name][1] for name in ("east", "west"))
+    (east, west) = (read_atlas(tmp_path / "site").get_poses()[name][1] for name in ("east", "west"))
     assert np.linalg.norm((east.inverse() @ west @ truth(0, 2)).translation) < 0.3
 
 
@@ -279,14 +279,14 @@ def test_what_is_left_to_be_registered_follows_when_nothing_new_is_there(scans, 
     monkeypatch.setattr("topomerge.fusion.atlas.watch.SECONDS_TO_ANSWER", -1.0)
     lines = Lines()
     one = watch(scans, tmp_path / "site", lines)
-    assert one.look() and not made and len(read_atlas(tmp_path / "site").entries) == 4
+    assert one.update() and not made and len(read_atlas(tmp_path / "site").entries) == 4
     assert lines.told[0] == "0.tmap -> 0: 1 room; stands apart so far, there is more to be tried"
     assert not read_atlas(tmp_path / "site").complete
-    assert not one.look() and len(made) == 6 and read_atlas(tmp_path / "site").complete
-    assert not watch(scans, tmp_path / "site").look() and len(made) == 6
+    assert not one.update() and len(made) == 6 and read_atlas(tmp_path / "site").complete
+    assert not watch(scans, tmp_path / "site").update() and len(made) == 6
 
 
 def test_words_of_what_is_taken_apart_and_joined():
     before = {"a": 0, "b": 0, "c": 1}
-    assert list(changes({"a": 0, "b": 1, "c": 0, "d": 0}, before)) == ["taken apart: a | b", "joined now: a + c"]
-    assert list(changes({"a": 0, "b": 0, "c": 1, "d": 0}, before)) == []
+    assert list(iter_changes({"a": 0, "b": 1, "c": 0, "d": 0}, before)) == ["taken apart: a | b", "joined now: a + c"]
+    assert list(iter_changes({"a": 0, "b": 0, "c": 1, "d": 0}, before)) == []

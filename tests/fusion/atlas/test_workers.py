@@ -20,8 +20,8 @@ from tests.fusion.atlas.atlas_scenes import NAMES, office_map
 from topomerge.errors import InputError
 from topomerge.fusion.atlas import maps as memory
 from topomerge.fusion.atlas import partners as workers
-from topomerge.fusion.atlas.partners import CoarseTask, lay_coarsely, register_pair
-from topomerge.fusion.atlas.registration_cache import JOURNAL_FILE, Journal
+from topomerge.fusion.atlas.partners import CoarseTask, register_pair, score_coarsely
+from topomerge.fusion.atlas.solve import JOURNAL_FILE, Journal
 from topomerge.fusion.atlas.store import add
 from topomerge.io.maps import load_map
 from topomerge.matching.poses import PoseHypothesis
@@ -41,7 +41,7 @@ def listing_of(folder: Path) -> dict:
 def alone(tmp_path_factory) -> Path:
     """The atlas as one process makes it."""
     folder = tmp_path_factory.mktemp("alone") / "house"
-    add(folder, parts(), tm.atlas_html)
+    add(folder, parts(), tm.render_atlas_html)
     return folder
 
 
@@ -73,11 +73,11 @@ def test_who_is_killed_goes_on_and_the_order_in_which_pairs_end_changes_nothing(
 
     folder = tmp_path / "house"
     with pytest.raises(KeyboardInterrupt):
-        add(folder, parts(), tm.atlas_html, failing)
+        add(folder, parts(), tm.render_atlas_html, failing)
     journal = folder / JOURNAL_FILE
     assert journal.read_text().count("hypotheses") == 1 and not (folder / "atlas.json").exists()
     journal.write_text(journal.read_text() + '{"stamp": "cut sh')  # as of a process that was killed while it wrote
-    add(folder, parts(), tm.atlas_html, going_on)
+    add(folder, parts(), tm.render_atlas_html, going_on)
     first, second = asked["register_pair"][:2]
     assert second == first - 1 and same_atlas(alone, folder)
     assert asked["lay_coarsely"] == [2]  # the first map on two, the second on one; then it is written down
@@ -101,21 +101,21 @@ def test_a_journal_is_heard_with_its_settings_only(tmp_path):
 def test_a_worker_loads_a_map_of_many_pairs_once_and_forgets_what_was_laid_at_another_scale(alone, monkeypatch):
     loaded: list[Path] = []
     monkeypatch.setattr(memory, "load_map", lambda path: loaded.append(path) or load_map(path))
-    workers._memory.cache_clear()
+    workers._get_memory.cache_clear()
     listing = listing_of(alone)
     maps = [(alone / m["file"], m["key"]) for m in listing["maps"]]
     for others in ((1, 2), (2,)):
         of = [maps[k] for k in (0, *others)]
-        odds = lay_coarsely(CoarseTask(tuple(file for file, _ in of), tuple(key for _, key in of), "fixed"))
+        odds = score_coarsely(CoarseTask(tuple(file for file, _ in of), tuple(key for _, key in of), "fixed"))
     assert len(loaded) == 3
-    free = lay_coarsely(CoarseTask((maps[0][0], maps[2][0]), (maps[0][1], maps[2][1]), "free"))
+    free = score_coarsely(CoarseTask((maps[0][0], maps[2][0]), (maps[0][1], maps[2][1]), "free"))
     assert len(loaded) == 3 and free != odds
-    workers._memory.cache_clear()
+    workers._get_memory.cache_clear()
 
 
 @pytest.mark.slow
 def test_processes_give_the_same_atlas(alone, tmp_path):
-    add(tmp_path / "house", parts(), tm.atlas_html, workers.processes(2))
+    add(tmp_path / "house", parts(), tm.render_atlas_html, workers.start_processes(2))
     assert same_atlas(alone, tmp_path / "house")
 
 
@@ -147,7 +147,7 @@ def test_a_cluster_gives_the_same_atlas_though_a_worker_is_killed(alone, tmp_pat
             address = json.loads(file.read_text())["address"]
             with distributed.Client(address, set_as_default=False) as client:
                 client.wait_for_workers(2, timeout=60)
-            real = workers.cluster(address)
+            real = workers.connect_cluster(address)
 
             def killing(work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
                 for count, numbered in enumerate(real(work, tasks)):
@@ -155,7 +155,7 @@ def test_a_cluster_gives_the_same_atlas_though_a_worker_is_killed(alone, tmp_pat
                         first.send_signal(signal.SIGKILL)
                     yield numbered
 
-            add(tmp_path / "house", parts(), tm.atlas_html, killing)
+            add(tmp_path / "house", parts(), tm.render_atlas_html, killing)
             assert first.wait(10) == -signal.SIGKILL
     assert same_atlas(alone, tmp_path / "house")
 
@@ -164,10 +164,10 @@ def test_nobody_answers(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(workers, "CONNECTING", 0.5)
     with pytest.raises(InputError, match=r"--cluster tcp://127\.0\.0\.1:9: no scheduler answers there"):
-        add(tmp_path / "house", parts(), tm.atlas_html, workers.cluster("tcp://127.0.0.1:9"))
+        add(tmp_path / "house", parts(), tm.render_atlas_html, workers.connect_cluster("tcp://127.0.0.1:9"))
 
 
 def test_dask_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"needs Dask: pip install 'topomerge\[cluster\]'"):
-        workers.cluster("tcp://127.0.0.1:9")
+        workers.connect_cluster("tcp://127.0.0.1:9")

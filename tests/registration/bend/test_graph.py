@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from topomerge.registration.bend.graph import Joints, Measurements, settle
-from topomerge.types.deformation import Deformation
+from topomerge.types.placement import Deformation
 
 COUNT, SPACING = 12, 4.0
 

@@ -6,9 +6,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topomerge.registration.evidence.crops import LOOKED, PARTS, SIDE, Crops
-from topomerge.registration.evidence.network import PLANES, place_log_odds, planes
-from topomerge.registration.evidence.places import MOST_ODDS, Places
+from topomerge.registration.evidence.places import (
+    LOOKED,
+    MOST_ODDS,
+    PARTS,
+    PLANES,
+    SIDE,
+    Crops,
+    Places,
+    compute_place_log_odds,
+    compute_planes,
+)
 from topomerge.types import Sim3
 
 BIT = {name: 1 << k for k, name in enumerate(PARTS)}
@@ -26,14 +34,14 @@ def squares(seed: int = 0, count: int = 3) -> tuple[np.ndarray, ...]:
 
 def test_which_map_is_first_changes_nothing():
     parts, ceiling, looked = squares()
-    one, other = planes(parts, ceiling, looked), planes(parts[:, ::-1], ceiling[:, ::-1], looked[:, ::-1])
+    one, other = compute_planes(parts, ceiling, looked), compute_planes(parts[:, ::-1], ceiling[:, ::-1], looked[:, ::-1])
     assert one.shape == (3, SIDE // 4, SIDE // 4, PLANES) and np.allclose(one, other, atol=1e-6)
 
 
 def test_turned_squares_give_turned_planes():
     parts, ceiling, looked = squares()
-    turned = planes(np.rot90(parts, 1, (2, 3)), np.rot90(ceiling, 1, (2, 3)), looked)
-    assert np.allclose(np.rot90(planes(parts, ceiling, looked), 1, (1, 2)), turned, atol=1e-6)
+    turned = compute_planes(np.rot90(parts, 1, (2, 3)), np.rot90(ceiling, 1, (2, 3)), looked)
+    assert np.allclose(np.rot90(compute_planes(parts, ceiling, looked), 1, (1, 2)), turned, atol=1e-6)
 
 
 def test_walls_that_meet_and_walls_on_free_floor():
@@ -41,7 +49,7 @@ def test_walls_that_meet_and_walls_on_free_floor():
     parts[0, :, 10] = BIT["wall"]  # in both
     parts[0, 0, 40] = BIT["wall"]  # in one, free in the other
     parts[0, 0, 50], parts[0, 1, 52] = BIT["wall"], BIT["wall"]  # as far apart as bent maps may be
-    seen = planes(parts, np.zeros_like(parts), np.ones((1, 2, LOOKED), np.float32))[0]
+    seen = compute_planes(parts, np.zeros_like(parts), np.ones((1, 2, LOOKED), np.float32))[0]
     assert seen[2, :, AGREE].min() > 0 and seen[2, :, CLASH].max() == 0
     assert seen[10, :, CLASH].min() > 0 and seen[10, :, AGREE].max() == 0
     assert seen[12:14, :, AGREE].max() > 0 and seen[12:14, :, CLASH].max() == 0
@@ -53,12 +61,17 @@ def test_what_a_map_did_not_look_at_is_no_contradiction():
     both, blind = np.ones((1, 2, LOOKED), np.float32), np.ones((1, 2, LOOKED), np.float32)
     blind[0, 0, 1] = blind[0, 1, 1] = 0
     low_missing = 8
-    assert planes(parts, np.zeros_like(parts), both)[..., low_missing].max() > 0
-    assert planes(parts, np.zeros_like(parts), blind)[..., low_missing].max() == 0
+    assert compute_planes(parts, np.zeros_like(parts), both)[..., low_missing].max() > 0
+    assert compute_planes(parts, np.zeros_like(parts), blind)[..., low_missing].max() == 0
 
 
 def test_no_squares_give_nothing():
-    assert place_log_odds(Crops.none()).shape == (0,) and planes(*squares(count=0)).shape == (0, SIDE // 4, SIDE // 4, PLANES)
+    assert compute_place_log_odds(Crops.none()).shape == (0,) and compute_planes(*squares(count=0)).shape == (
+        0,
+        SIDE // 4,
+        SIDE // 4,
+        PLANES,
+    )
     assert Places(Crops.none(), np.zeros(0)).features == {"place_mean": 0.0, "place_worst": 0.0, "place_area": 0.0}
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from tests.scenes import Scene
 from topomerge.extraction.extract import extract
-from topomerge.registration.surfaces import Features, described, fpfh, sampled_pose, upright
+from topomerge.registration.surfaces import Features, compute_fpfh, convert_to_upright, described, estimate_pose
 from topomerge.types import Sim3
 
 pytest.importorskip("open3d", exc_type=ImportError)
@@ -38,8 +38,8 @@ def room(frame: Sim3 | None = None) -> Features:
 
 def test_features_do_not_change_when_all_is_turned():
     points, normals = oriented()
-    there = fpfh(Sim3(1.0, (3.0, -2.0, 1.0)).apply(points), Sim3(1.0).apply(normals)).histograms.data
-    same = np.isclose(there, fpfh(points, normals).histograms.data, atol=1e-6).all(axis=0)
+    there = compute_fpfh(Sim3(1.0, (3.0, -2.0, 1.0)).apply(points), Sim3(1.0).apply(normals)).histograms.data
+    same = np.isclose(there, compute_fpfh(points, normals).histograms.data, atol=1e-6).all(axis=0)
     assert there.shape == (33, 300) and same.mean() > 0.98  # an angle on the border of two bins may fall on either side
 
 
@@ -48,23 +48,23 @@ def test_features_do_not_change_when_all_is_turned():
 def test_a_turned_room_is_brought_back(yaw):
     truth = Sim3(yaw, (4.0, -7.0, 0.5))
     here, there = room(), room(truth)
-    pose = sampled_pose(there, here)
+    pose = estimate_pose(there, here)
     middle = here.points.mean(axis=0)[None]
     assert np.linalg.norm(pose.apply(middle) - truth.apply(middle)) < 0.3
     assert abs((pose.yaw - yaw + np.pi) % (2 * np.pi) - np.pi) < np.radians(6)
-    assert sampled_pose(there, here) == pose
+    assert estimate_pose(there, here) == pose
 
 
 def test_a_room_on_its_side_gives_no_pose():
     here = room()
     side = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    assert sampled_pose(fpfh(here.points @ side, np.asarray(here.cloud.normals) @ side), here) is None
+    assert estimate_pose(compute_fpfh(here.points @ side, np.asarray(here.cloud.normals) @ side), here) is None
 
 
 def test_upright_keeps_the_turn_and_the_place():
     truth, anchor = Sim3(2.5, (3.0, -1.0, 0.2)), np.array([4.0, 5.0, 1.0])
-    pose = upright(truth.matrix, anchor)
+    pose = convert_to_upright(truth.matrix, anchor)
     assert np.allclose(pose.matrix, truth.matrix)
     tilt = np.array([[1, 0, 0, 0], [0, np.cos(0.1), -np.sin(0.1), 0], [0, np.sin(0.1), np.cos(0.1), 0], [0, 0, 0, 1]])
     tilted = truth.matrix @ tilt
-    assert np.allclose(upright(tilted, anchor).apply(anchor[None])[0], tilted[:3, :3] @ anchor + tilted[:3, 3])
+    assert np.allclose(convert_to_upright(tilted, anchor).apply(anchor[None])[0], tilted[:3, :3] @ anchor + tilted[:3, 3])

@@ -11,7 +11,7 @@ import topomerge as tm
 from tests.fusion.plans_of import MOVE, off, part
 from tests.scenes import Scene
 from topomerge.errors import InputError
-from topomerge.registration.surfaces import room_poses
+from topomerge.registration.surfaces import estimate_room_poses
 
 pytest.importorskip("open3d", exc_type=ImportError)
 
@@ -41,7 +41,7 @@ def partners(flats):
 
 @pytest.mark.longer
 def test_rooms_that_match_agree_about_the_pose(flats, partners):
-    clusters = room_poses(*flats, partners, np.ones(len(partners)))
+    clusters = estimate_room_poses(*flats, partners, np.ones(len(partners)))
     metres, degrees = off(clusters[0][0], MOVE.inverse(), tuple(MOVE.apply(np.array([[6.0, 4.0, 1.0]]))[0]))
     assert metres < 0.1 and degrees < 0.5
     assert [w for _, w in clusters] == sorted((w for _, w in clusters), reverse=True)
@@ -50,12 +50,12 @@ def test_rooms_that_match_agree_about_the_pose(flats, partners):
 @pytest.mark.longer
 def test_one_wrong_match_is_outvoted(flats, partners):
     wrong = np.array([[partners[0, 0], partners[1, 1]]])
-    clusters = room_poses(*flats, np.concatenate([wrong, partners]), np.ones(len(partners) + 1))
+    clusters = estimate_room_poses(*flats, np.concatenate([wrong, partners]), np.ones(len(partners) + 1))
     assert off(clusters[0][0], MOVE.inverse(), (0.0, 0.0, 0.0))[1] < 0.5
 
 
 def test_no_matches_give_no_pose(flats):
-    assert room_poses(*flats, np.zeros((0, 2), np.int64), np.zeros(0)) == []
+    assert estimate_room_poses(*flats, np.zeros((0, 2), np.int64), np.zeros(0)) == []
 
 
 @pytest.mark.longer
@@ -80,7 +80,7 @@ def test_merge_by_rooms_is_for_two_maps_and_by_surfaces_for_one_scale(flats):
 
 @pytest.mark.longer
 def test_the_same_maps_give_the_same_poses(flats, partners):
-    first, again = (room_poses(*flats, partners, np.ones(len(partners))) for _ in range(2))
+    first, again = (estimate_room_poses(*flats, partners, np.ones(len(partners))) for _ in range(2))
     assert again == first
 
 

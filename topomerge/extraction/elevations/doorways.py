@@ -12,7 +12,15 @@ import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.sparse.csgraph import connected_components
 
-from topomerge.extraction.elevations.elevation import ACROSS, ALONG, BANDS, PLACES, WALL_CLASSES, Elevations, place_probabilities
+from topomerge.extraction.elevations.elevation import (
+    ACROSS,
+    ALONG,
+    BANDS,
+    PLACES,
+    WALL_CLASSES,
+    Elevations,
+    compute_place_probabilities,
+)
 from topomerge.types import Array
 
 DOOR_CHANCE, LIKELY_DOOR = 0.35, 0.5  # probability of a door of every place of a doorway, and of one of them
@@ -47,8 +55,8 @@ class StoreyWalls:
 
     Args:
         elevations: their faces, unrolled.
-        classes: (n / 2, 7) of `place_classes`.
-        doors: (n / 2, 3) of `door_places`.
+        classes: (n / 2, 7) of `classify_places`.
+        doors: (n / 2, 3) of `compute_door_probabilities`.
         doorways: (D,) DOORWAY_DTYPE with the segments, or rooms, on both sides.
     """
 
@@ -58,9 +66,9 @@ class StoreyWalls:
     doorways: Array
 
 
-def place_classes(walls: Elevations) -> Array:
+def classify_places(walls: Elevations) -> Array:
     """(n / 2, 7) float32 probability of each of `WALL_CLASSES` in each place along all strips, each read from both its ends."""
-    parts = [read_both_ways(walls.strips[low:high]) for low, high in strip_bounds(walls)]
+    parts = [read_both_ways(walls.strips[low:high]) for low, high in iter_strip_bounds(walls)]
     return np.concatenate([np.zeros((0, len(WALL_CLASSES)), np.float32), *parts])
 
 
@@ -70,45 +78,45 @@ def read_both_ways(strip: Array) -> Array:
     Args:
         strip: (n, 32, 17), n even.
     """
-    one, mirrored = place_probabilities(np.stack([strip, strip[::-1]]))
+    one, mirrored = compute_place_probabilities(np.stack([strip, strip[::-1]]))
     mean: Array = (one + mirrored[::-1]) / np.float32(2)
     return mean
 
 
-def door_places(walls: Elevations, classes: Array) -> Array:
+def compute_door_probabilities(walls: Elevations, classes: Array) -> Array:
     """(n / 2, 3) float32 probability of an open, a shut and a half-open door in each place, of those of all classes."""
-    parts = [classes[low // PLACES : high // PLACES, [OPEN, SHUT, HALF_OPEN]] for low, high in strip_bounds(walls)]
+    parts = [classes[low // PLACES : high // PLACES, [OPEN, SHUT, HALF_OPEN]] for low, high in iter_strip_bounds(walls)]
     return np.concatenate([np.zeros((0, 3), np.float32), *parts])
 
 
-def strip_bounds(walls: Elevations) -> Iterator[tuple[int, int]]:
-    """The first element of each strip and that after its last."""
+def iter_strip_bounds(walls: Elevations) -> Iterator[tuple[int, int]]:
+    """Yield the first element of each strip and that after its last."""
     return zip(walls.first[:-1].tolist(), walls.first[1:].tolist(), strict=True)
 
 
-def doorways(walls: Elevations, doors: Array, before: Array | None = None) -> Array:
-    """(D,) DOORWAY_DTYPE, each once however many faces show it.
+def detect_doorways(walls: Elevations, doors: Array, before: Array | None = None) -> Array:
+    """Return (D,) DOORWAY_DTYPE, each once however many faces show it.
 
     Args:
-        doors: (n / 2, 3) of `door_places`.
+        doors: (n / 2, 3) of `compute_door_probabilities`.
         before: (n / 2, k) room on whose floor each of k spots before a place lies, -1 none: a strip goes on past its face, where
             the next room may lie before it. None: the room of the face everywhere.
     """
     rows = []
-    for face, (low, high) in zip(walls.faces, strip_bounds(walls), strict=True):
+    for face, (low, high) in zip(walls.faces, iter_strip_bounds(walls), strict=True):
         each = doors[low // PLACES : high // PLACES]
-        for start, stop in _runs(each.sum(axis=1)):
+        for start, stop in _iter_runs(each.sum(axis=1)):
             shut = 2 * each[start:stop, 1].sum() > each[start:stop].sum()
             if not _is_seen(walls.strips[low:high], start, stop) or (shut and _is_thick(walls.strips[low:high], start, stop)):
                 continue
             room = int(face["room"])
             if before is not None:
-                room = _most_common(before[low // PLACES + start : low // PLACES + stop], room)
-            rows.append(_doorway(face, room, each, start, stop))
-    return _joined(np.array(rows, DOORWAY_DTYPE))
+                room = _find_most_common(before[low // PLACES + start : low // PLACES + stop], room)
+            rows.append(_build_doorway(face, room, each, start, stop))
+    return _merge_faces(np.array(rows, DOORWAY_DTYPE))
 
 
-def _most_common(rooms: Array, otherwise: int) -> int:
+def _find_most_common(rooms: Array, otherwise: int) -> int:
     """The room that occurs most often, `otherwise` where it is one of these or there is none (-1)."""
     counts = np.bincount(rooms[rooms >= 0].astype(np.int64), minlength=otherwise + 1)
     if otherwise < 0:
@@ -116,7 +124,7 @@ def _most_common(rooms: Array, otherwise: int) -> int:
     return otherwise if counts[otherwise] == counts.max() else int(counts.argmax())
 
 
-def joined_openings(ways: Array) -> tuple[Array, Array]:
+def merge_openings(ways: Array) -> tuple[Array, Array]:
     """Doorways (D,) DOORWAY_DTYPE without those that are parts of one wide opening, and the width (D,) m of the surest part.
 
     Of an opening wider than doors are, a wall shows where it begins and where it ends: two doorways of the same two rooms that
@@ -131,11 +139,11 @@ def joined_openings(ways: Array) -> tuple[Array, Array]:
     meet &= (rooms[:, None] == rooms).all(axis=2) & (np.abs(apart[..., 2]) < DOORWAY_LEVEL)
     count, part = connected_components(meet, directed=False)
     whole = [ways[part == k] for k in range(count)]
-    out = np.array([tuple(_whole(parts)) for parts in whole], DOORWAY_DTYPE)
+    out = np.array([tuple(_join_parts(parts)) for parts in whole], DOORWAY_DTYPE)
     return out, np.array([parts["width"][parts["probability"].argmax()] for parts in whole], float)
 
 
-def _whole(parts: Array) -> Array:
+def _join_parts(parts: Array) -> Array:
     """The opening from the first end of its parts to the last one."""
     out = parts[parts["probability"].argmax()].copy()
     along = np.array([-out["out"][1], out["out"][0]])
@@ -147,7 +155,7 @@ def _whole(parts: Array) -> Array:
     return out
 
 
-def _runs(chance: Array) -> Iterator[tuple[int, int]]:
+def _iter_runs(chance: Array) -> Iterator[tuple[int, int]]:
     """First place and that after the last one of every stretch that is probably a door."""
     likely = np.flatnonzero(np.diff(np.concatenate([[0], chance > DOOR_CHANCE, [0]]).astype(np.int8)))
     for start, stop in likely.reshape(-1, 2).tolist():
@@ -171,7 +179,7 @@ def _is_thick(strip: Array, start: int, stop: int) -> bool:
     return any((b - a) * ACROSS >= THICKEST_LEAF and across[a:b].max() < EMPTY_FILL for a, b in gaps)
 
 
-def _doorway(face: Array, room: int, doors: Array, start: int, stop: int) -> tuple[object, ...]:
+def _build_doorway(face: Array, room: int, doors: Array, start: int, stop: int) -> tuple[object, ...]:
     """Row of DOORWAY_DTYPE of one stretch of a face, with the room before it."""
     step = PLACES * ALONG
     chance = doors[start:stop].sum(axis=1)
@@ -183,17 +191,17 @@ def _doorway(face: Array, room: int, doors: Array, start: int, stop: int) -> tup
     return (room, -1), place, face["out"], width, float(chance.max()), float(chance.mean()), wide + half, half, 1
 
 
-def _joined(rows: Array) -> Array:
+def _merge_faces(rows: Array) -> Array:
     """What several faces show of one doorway as one row, the likeliest first."""
     if len(rows) < 2:
         return rows
     place = np.column_stack([rows["centre"][:, :2], rows["centre"][:, 2] * (SAME_DOORWAY / DOORWAY_LEVEL)])
     of = fcluster(linkage(place, "average"), SAME_DOORWAY, "distance")
-    out = np.array([_one(rows[of == k]) for k in np.unique(of)], DOORWAY_DTYPE)
+    out = np.array([_merge_rows(rows[of == k]) for k in np.unique(of)], DOORWAY_DTYPE)
     return out[np.argsort(-out["probability"], kind="stable")]
 
 
-def _one(rows: Array) -> Array:
+def _merge_rows(rows: Array) -> Array:
     """One row of several, by their probabilities; the other room is the likeliest that sees it from the other side."""
     rows = rows[np.argsort(-rows["probability"], kind="stable")]
     out, weight = rows[0].copy(), rows["probability"]

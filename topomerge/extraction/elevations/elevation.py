@@ -13,10 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from topomerge.extraction.cleaning import cell_middles
-from topomerge.kernels.strips import fill_strips
-from topomerge.networks.network import Network, Run, load_network, load_shipped_network
-from topomerge.networks.signature import Signature, Tensor
+from topomerge.extraction.cleaning import compute_cell_means
+from topomerge.kernels.images import fill_strips
+from topomerge.networks.network import Network, Run, Signature, Tensor, load_network, load_shipped_network
 from topomerge.structure.lines import Line
 from topomerge.types import Array, VoxelGrid
 
@@ -74,20 +73,20 @@ def unroll(faces: Array, navigable: VoxelGrid, cells: VoxelGrid, crossed: VoxelG
     sizes = 2 * np.ceil(faces["length"] / ALONG / 2).astype(np.int64)
     frames = np.column_stack([faces["start"] - BEFORE * faces["out"], faces["along"], faces["out"], faces["floor"] + LOWEST])
     step = np.array([ALONG, ACROSS, UPWARDS])
-    solid = fill_strips(np.ascontiguousarray(cell_middles(cells)), frames, sizes, (DEPTHS, BANDS), step, TILE)
-    floor = navigable.centroids()
+    solid = fill_strips(np.ascontiguousarray(compute_cell_means(cells)), frames, sizes, (DEPTHS, BANDS), step, TILE)
+    floor = navigable.compute_centroids()
     standing = navigable.properties.get("standing")
     floor = floor if standing is None else floor[standing.astype(bool)]
     frames[:, 6] -= BANDS * UPWARDS / 2 + LOWEST  # one band about the floor
     walk = fill_strips(floor, frames, sizes, (DEPTHS, 1), np.array([ALONG, ACROSS, BANDS * UPWARDS]), TILE)
     flat = ALONG * UPWARDS / cells.edge**2  # cells of a wall that an element holds
-    rays = crossed_places(crossed, faces, sizes)
+    rays = measure_crossed_places(crossed, faces, sizes)
     strips = np.concatenate([solid / (FULL * flat), walk / (FULL * ALONG * ACROSS / navigable.edge**2), rays], axis=2)
     return Elevations(faces, np.concatenate([[0], np.cumsum(sizes)]), np.minimum(strips, 1.0))
 
 
-def crossed_places(crossed: VoxelGrid | None, faces: Array, sizes: Array) -> Array:
-    """(n, 32, 3) float32 share of the heights of each of `FREE_HEIGHTS` at which rays went through an element.
+def measure_crossed_places(crossed: VoxelGrid | None, faces: Array, sizes: Array) -> Array:
+    """Return (n, 32, 3) float32 share of the heights of each of `FREE_HEIGHTS` at which rays went through an element.
 
     Args:
         crossed: as of `wall_elevations`.
@@ -142,7 +141,7 @@ WALL_SIGNATURE = Signature(
 )
 
 
-def place_probabilities(strip: Array, network: Run | None = None) -> Array:
+def compute_place_probabilities(strip: Array, network: Run | None = None) -> Array:
     """Compute (n / 2, 7) float32 probability of each of `WALL_CLASSES` along a strip (n, 32, 17), or of several of one length at
     once (k, n, 32, 17); by the network that ships or another."""
     run = weights() if network is None else network

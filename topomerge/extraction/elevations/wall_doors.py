@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from topomerge.extraction.elevations.doorways import STRAIGHT, StoreyWalls, joined_openings
+from topomerge.extraction.elevations.doorways import STRAIGHT, StoreyWalls, merge_openings
 from topomerge.extraction.elevations.elevation import ALONG, BANDS, BEFORE, BEHIND, PLACES, Elevations
-from topomerge.extraction.plans.storey_plan import PLAN_SIGNS, ClassifiedStorey, plan_signs
+from topomerge.extraction.plans.storey_plan import PLAN_SIGNS, ClassifiedStorey, compute_plan_features
 from topomerge.extraction.topology import DOOR_MOST_WIDTH
-from topomerge.io.weight_files import read_weights_json
+from topomerge.io.archive import read_weights_json
 from topomerge.numpy_nn import sigmoid
 from topomerge.types import EDGE_DTYPE, Array, TopometricMap
 
@@ -61,7 +61,7 @@ class DoorCandidates:
     source: Array
 
 
-def with_wall_doors(map: TopometricMap, storeys: Sequence[ClassifiedStorey], walls: StoreyWalls | None) -> TopometricMap:
+def add_wall_doors(map: TopometricMap, storeys: Sequence[ClassifiedStorey], walls: StoreyWalls | None) -> TopometricMap:
     """The map with the doors that its plans and walls show.
 
     Args:
@@ -69,16 +69,16 @@ def with_wall_doors(map: TopometricMap, storeys: Sequence[ClassifiedStorey], wal
         walls: with the map's rooms beside them; None of a map that shows none at heights.
     """
     level = np.isin(map.edges["kind"], ("door", "opening"))
-    candidates = door_candidates(map.edges[level], map.rooms["completeness"], storeys, walls)
-    chance = door_chance(candidates)
+    candidates = build_door_candidates(map.edges[level], map.rooms["completeness"], storeys, walls)
+    chance = compute_door_probability(candidates)
     edges = candidates.edges.copy()
     edges["confidence"] = chance
-    edges = np.concatenate([edges[(chance >= 0.5) | _only_ways(candidates, chance, len(map.rooms))], map.edges[~level]])
+    edges = np.concatenate([edges[(chance >= 0.5) | _is_only_way(candidates, chance, len(map.rooms))], map.edges[~level]])
     order = np.lexsort((*edges["centre"].T[::-1], edges["rooms"][:, 1], edges["rooms"][:, 0]))
     return replace(map, edges=edges[order])
 
 
-def door_chance(candidates: DoorCandidates, models: Mapping[str, Sequence[float]] | None = None) -> Array:
+def compute_door_probability(candidates: DoorCandidates, models: Mapping[str, Sequence[float]] | None = None) -> Array:
     """(n,) probability that each is a door. Wide openings that the plan alone shows are as likely as the plan says: walls show
     doors, and without the opening two rooms between which one walks would not be joined.
 
@@ -97,7 +97,7 @@ def door_chance(candidates: DoorCandidates, models: Mapping[str, Sequence[float]
     return np.where(opening, candidates.features[:, plan], chance)
 
 
-def door_candidates(
+def build_door_candidates(
     edges: Array, complete: Array, storeys: Sequence[ClassifiedStorey], walls: StoreyWalls | None
 ) -> DoorCandidates:
     """Gather all doors and openings that plans or walls show, between rooms or between segments.
@@ -109,10 +109,10 @@ def door_candidates(
         walls: with what lies beside them numbered as in the edges; None of a map that shows none at heights.
     """
     if walls is None:
-        return _flat_candidates(complete, storeys, edges)
-    ways, shown = joined_openings(walls.doorways)
-    whole = _opening_of(edges, ways)
-    partner = _partners(edges, ways, whole)
+        return _build_flat_candidates(complete, storeys, edges)
+    ways, shown = merge_openings(walls.doorways)
+    whole = _match_openings(edges, ways)
+    partner = _match_doorways(edges, ways, whole)
     rows, features, source = [], [], []
     for edge, i in zip(edges, partner, strict=True):
         less = float(complete[edge["rooms"]].min())
@@ -120,26 +120,38 @@ def door_candidates(
             way = ways[i]
             part = whole[i] >= 0
             apart = 0.0 if part else float(np.hypot(*(way["centre"] - edge["centre"])[:2]))
-            rows.append(edge if part else _moved(edge, way))
-            features.append([*_seen(way), float(edge["confidence"]), 0, 1, *_size(shown[i], less, apart)])
+            rows.append(edge if part else _move_door(edge, way))
+            features.append(
+                [*_compute_doorway_features(way), float(edge["confidence"]), 0, 1, *_compute_size_features(shown[i], less, apart)]
+            )
         else:
-            near, covered = _near(walls.elevations, walls.doors, edge)
+            near, covered = _measure_near_doors(walls.elevations, walls.doors, edge)
             rows.append(edge)
-            features.append([0, 0, 0, 0, float(edge["confidence"]), near, covered, *_size(edge["width"], less, 0)])
+            features.append(
+                [0, 0, 0, 0, float(edge["confidence"]), near, covered, *_compute_size_features(edge["width"], less, 0)]
+            )
         source.append(SOURCES.index("both" if i >= 0 else "plan"))
     for i in np.setdiff1d(np.arange(len(ways)), partner).tolist():
         way = ways[i]
         if way["rooms"][1] >= 0 and whole[i] < 0:
-            rows.append(_edge(way))
-            features.append([*_seen(way), 0, 0, 1, *_size(shown[i], float(complete[way["rooms"]].min()), 0)])
+            rows.append(_build_edge(way))
+            features.append(
+                [
+                    *_compute_doorway_features(way),
+                    0,
+                    0,
+                    1,
+                    *_compute_size_features(shown[i], float(complete[way["rooms"]].min()), 0),
+                ]
+            )
             source.append(SOURCES.index("wall"))
     table = np.array(rows, EDGE_DTYPE) if rows else np.zeros(0, EDGE_DTYPE)
     seen = walls.elevations.strips[..., :BANDS] > 0
     fill = float(np.log(LEAST_FILL + (seen.mean() if seen.size else 0.0)))
-    return _candidates(table, features, fill, storeys, np.array(source, np.int8))
+    return _build_candidates(table, features, fill, storeys, np.array(source, np.int8))
 
 
-def _only_ways(candidates: DoorCandidates, chance: Array, rooms: int) -> Array:
+def _is_only_way(candidates: DoorCandidates, chance: Array, rooms: int) -> Array:
     """(n,) bool: passages of a map without walls by which alone one walks from some rooms to others, the likeliest: what parts a
     room wrongly must not part the graph."""
     ways, group = np.zeros(len(chance), bool), np.arange(rooms)
@@ -151,37 +163,37 @@ def _only_ways(candidates: DoorCandidates, chance: Array, rooms: int) -> Array:
     return ways
 
 
-def _flat_candidates(complete: Array, storeys: Sequence[ClassifiedStorey], edges: Array) -> DoorCandidates:
+def _build_flat_candidates(complete: Array, storeys: Sequence[ClassifiedStorey], edges: Array) -> DoorCandidates:
     """The doors of the plans of a map without walls."""
     less = complete[edges["rooms"]].min(axis=1).tolist()
-    sizes = [_size(width, c, 0) for width, c in zip(edges["width"], less, strict=True)]
+    sizes = [_compute_size_features(width, c, 0) for width, c in zip(edges["width"], less, strict=True)]
     features = [[0, 0, 0, 0, float(e["confidence"]), 0, 0, *size] for e, size in zip(edges, sizes, strict=True)]
-    return _candidates(edges, features, 0.0, storeys, np.full(len(edges), SOURCES.index("flat"), np.int8))
+    return _build_candidates(edges, features, 0.0, storeys, np.full(len(edges), SOURCES.index("flat"), np.int8))
 
 
-def _candidates(
+def _build_candidates(
     edges: Array, features: Sequence[Sequence[float]], fill: float, storeys: Sequence[ClassifiedStorey], source: Array
 ) -> DoorCandidates:
     """Put the signs of the plan beside what was measured; where walls alone show a door the plan is not asked."""
     measured = np.array(features, float).reshape(len(edges), len(WALL_DOOR_FEATURES) - len(PLAN_SIGNS) - 1)
     measured = np.column_stack([measured, np.full(len(edges), fill)])
     unasked = source == SOURCES.index("wall")
-    signs = np.where(unasked[:, None], 0.0, plan_signs(storeys, edges["centre"]))
+    signs = np.where(unasked[:, None], 0.0, compute_plan_features(storeys, edges["centre"]))
     return DoorCandidates(edges, np.hstack([measured, signs]), source)
 
 
-def _seen(way: Array) -> list[float]:
+def _compute_doorway_features(way: Array) -> list[float]:
     chances = np.clip([way["probability"], way["mean"]], SUREST, 1 - SUREST)
     return [*np.log(chances / (1 - chances)).tolist(), float(way["faces"] > 1), 1 - float(way["open"])]
 
 
-def _size(width: float, complete: float, apart: float) -> tuple[float, ...]:
+def _compute_size_features(width: float, complete: float, apart: float) -> tuple[float, ...]:
     """The four of `WALL_DOOR_FEATURES` before the last ones, which are not of a door alone."""
     odd = abs(float(np.log(max(float(width), 0.1) / 0.9)))
     return odd, complete, apart, float(width > DOOR_MOST_WIDTH)
 
 
-def _opening_of(edges: Array, ways: Array) -> Array:
+def _match_openings(edges: Array, ways: Array) -> Array:
     """(W,) the opening of the plan, wider than doors are, of which each doorway is a part, -1 none: walls show where it begins
     and where it ends. A doorway on one side only may be a door in a wall that the plan lacks, of glass for example."""
     out = np.full(len(ways), -1)
@@ -198,7 +210,7 @@ def _opening_of(edges: Array, ways: Array) -> Array:
     return out
 
 
-def _partners(edges: Array, ways: Array, whole: Array) -> Array:
+def _match_doorways(edges: Array, ways: Array, whole: Array) -> Array:
     """(E,) the doorway that each door of the plan is, -1 none: the nearest first, each once. A part of an opening is no other."""
     partner = np.full(len(edges), -1)
     if not len(edges) or not len(ways):
@@ -216,11 +228,11 @@ def _partners(edges: Array, ways: Array, whole: Array) -> Array:
     return partner
 
 
-def _moved(edge: Array, way: Array) -> Array:
+def _move_door(edge: Array, way: Array) -> Array:
     """A door of the plan where the wall shows it."""
     out = edge.copy()
     out["centre"] = (*way["centre"][:2], edge["centre"][2])
-    out["width"], out["direction"], out["half"] = way["width"], _normal(way), _is_half_open(way) and edge["open"]
+    out["width"], out["direction"], out["half"] = way["width"], _compute_normal(way), _is_half_open(way) and edge["open"]
     out["kind"] = "door" if way["width"] <= DOOR_MOST_WIDTH else "opening"
     out["lower"] = out["upper"] = out["centre"]
     return out
@@ -231,21 +243,21 @@ def _is_half_open(way: Array) -> bool:
     return bool(way["half"] >= HALF_SHARE)
 
 
-def _edge(way: Array) -> Array:
+def _build_edge(way: Array) -> Array:
     """A door that the plan does not show."""
     out = np.zeros((), EDGE_DTYPE)
     out["rooms"], out["centre"], out["width"] = np.sort(way["rooms"]), way["centre"], way["width"]
-    out["direction"], out["open"], out["half"] = _normal(way), way["open"] >= 0.5, _is_half_open(way)
+    out["direction"], out["open"], out["half"] = _compute_normal(way), way["open"] >= 0.5, _is_half_open(way)
     out["kind"] = "door" if way["width"] <= DOOR_MOST_WIDTH else "opening"
     out["lower"] = out["upper"] = out["centre"]
     return out
 
 
-def _normal(way: Array) -> float:
+def _compute_normal(way: Array) -> float:
     return float(np.arctan2(way["out"][1], way["out"][0]) % np.pi)
 
 
-def _near(walls: Elevations, doors: Array, edge: Array) -> tuple[float, float]:
+def _measure_near_doors(walls: Elevations, doors: Array, edge: Array) -> tuple[float, float]:
     """The highest probability of a door that walls show around a door of the plan, and is any wall seen there?"""
     best, covered = 0.0, 0.0
     at = edge["centre"][:2] - walls.faces["start"]

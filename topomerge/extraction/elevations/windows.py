@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from topomerge.extraction.elevations.doorways import HALF_WALL, STOOD, strip_bounds
+from topomerge.extraction.elevations.doorways import HALF_WALL, STOOD, iter_strip_bounds
 from topomerge.extraction.elevations.elevation import (
     ACROSS,
     ALONG,
@@ -25,7 +25,7 @@ from topomerge.extraction.elevations.elevation import (
     Elevations,
 )
 from topomerge.types import WINDOW_DTYPE, Array, TopometricMap
-from topomerge.types.arrays import within_turn
+from topomerge.types.grid import wrap_to_turn
 
 # Stretches of walls that show one thing, a window for example: where they begin and end, and whether two show the same one.
 
@@ -39,7 +39,7 @@ BESIDE_BANDS, ABOVE_BANDS = slice(5, 12), slice(11, 13)  # in which walls show b
 LEAST_FILL = 0.15  # of the elements of a surface: in emptier ones nothing shows where it begins or ends
 
 
-def likely_stretches(chance: Array, likely: float, least: float) -> Iterator[tuple[int, int]]:
+def iter_likely_stretches(chance: Array, likely: float, least: float) -> Iterator[tuple[int, int]]:
     """First place and that after the last one of every stretch that probably shows one thing.
 
     Args:
@@ -52,12 +52,12 @@ def likely_stretches(chance: Array, likely: float, least: float) -> Iterator[tup
             yield start, stop
 
 
-def wall_depth(strip: Array, start: int, stop: int) -> int:
-    """Element across the strip in which most of the wall of a stretch lies (`wall_profile`)."""
-    return int(wall_profile(strip, start, stop).argmax())
+def find_wall_depth(strip: Array, start: int, stop: int) -> int:
+    """Element across the strip in which most of the wall of a stretch lies (`compute_wall_profile`)."""
+    return int(compute_wall_profile(strip, start, stop).argmax())
 
 
-def wall_profile(strip: Array, start: int, stop: int) -> Array:
+def compute_wall_profile(strip: Array, start: int, stop: int) -> Array:
     """(32,) how much lies in each element across the strip beside a stretch and above it: its wall. A cupboard has a face, too,
     and its strip shows the wall, or a window, behind it."""
     left, right = strip[max(start - BESIDE, 0) * PLACES : start * PLACES], strip[stop * PLACES : (stop + BESIDE) * PLACES]
@@ -66,7 +66,7 @@ def wall_profile(strip: Array, start: int, stop: int) -> Array:
     return profile
 
 
-def face_cover(strip: Array, start: int, stop: int, depth: int) -> Array | None:
+def measure_face_cover(strip: Array, start: int, stop: int, depth: int) -> Array | None:
     """(13,) 0..1 share of the surface at a depth that is there in each band of a stretch, of what is there in most bands around
     it; None where hardly anything is."""
     inner = slice((start + 1) * PLACES, (stop - 1) * PLACES)
@@ -76,7 +76,7 @@ def face_cover(strip: Array, start: int, stop: int, depth: int) -> Array | None:
     return None if full < LEAST_FILL else np.minimum(face[inner].mean(axis=0) / full, 1.0)
 
 
-def ends_upwards(profile: Array) -> tuple[float, float]:
+def measure_vertical_extent(profile: Array) -> tuple[float, float]:
     """m above the floor between which most bands of (13,) 0..1 are above a half, and as much of those below and above them as is;
     nan where the end of the strip is one of them, or none is above."""
     runs = np.flatnonzero(np.diff(np.concatenate([[0], profile > 0.5, [0]]))).reshape(-1, 2)
@@ -88,8 +88,8 @@ def ends_upwards(profile: Array) -> tuple[float, float]:
     return float(LOWEST + UPWARDS * bottom), float(LOWEST + UPWARDS * top)
 
 
-def one_each(rows: Array, same: Callable[[Array, Array], Array]) -> Iterator[Array]:
-    """Rows that show one thing, as indices, the likeliest first; the likeliest things first.
+def iter_distinct_rows(rows: Array, same: Callable[[Array, Array], Array]) -> Iterator[Array]:
+    """Yield rows that show one thing, as indices, the likeliest first; the likeliest things first.
 
     Args:
         rows: with `confidence`.
@@ -103,10 +103,10 @@ def one_each(rows: Array, same: Callable[[Array, Array], Array]) -> Iterator[Arr
             yield near[np.argsort(-rows["confidence"][near], kind="stable")]
 
 
-def in_place(row: Array, centres: Array, widths: Array, across_reach: float = SAME_WALL) -> Array:
+def is_in_place(row: Array, centres: Array, widths: Array, across_reach: float = SAME_WALL) -> Array:
     """(n,) bool: does something so wide share most of its width, or of the row's, with a row that has `centre`, `width` and
     `direction`?"""
-    apart, along = centres - row["centre"], _along(row)
+    apart, along = centres - row["centre"], _compute_along(row)
     place, across = apart[:, :2] @ along, np.abs(apart[:, 0] * along[1] - apart[:, 1] * along[0])
     shared = (widths + row["width"]) / 2 - np.abs(place)
     level = np.abs(apart[:, 2]) < STRETCH_LEVEL
@@ -114,27 +114,27 @@ def in_place(row: Array, centres: Array, widths: Array, across_reach: float = SA
     return fits
 
 
-def at_any(rows: Array, others: Array) -> Array:
-    """(n,) bool: is one of the others, doors or windows, there?"""
-    return np.array([bool(in_place(row, others["centre"], others["width"]).any()) for row in rows], bool)
+def is_at_any(rows: Array, others: Array) -> Array:
+    """Return (n,) bool: is one of the others, doors or windows, there?"""
+    return np.array([bool(is_in_place(row, others["centre"], others["width"]).any()) for row in rows], bool)
 
 
-def doors_of(map: TopometricMap) -> Array:
-    """(D,) EDGE_DTYPE, the doors and openings of a map."""
+def select_doors(map: TopometricMap) -> Array:
+    """Return (D,) EDGE_DTYPE, the doors and openings of a map."""
     doors: Array = map.edges[np.isin(map.edges["kind"], ("door", "opening"))]
     return doors
 
 
-def rooms_beside(map: TopometricMap, rows: Array) -> Array:
+def find_adjacent_rooms(map: TopometricMap, rows: Array) -> Array:
     """(n, 2) the rooms whose floors are the nearest before rows and behind them, along their `direction`; -1 none."""
     inside = map.navigable_room >= 0
     flat = np.array([1, 1, STOOD / STRETCH_LEVEL])
-    floor, room = map.navigable.centroids(map.navigable.cells[inside]) * flat, map.navigable_room[inside]
+    floor, room = map.navigable.compute_centroids(map.navigable.cells[inside]) * flat, map.navigable_room[inside]
     steps = np.arange(SIDES[0], SIDES[1] + 0.05, 0.1)[:, None] * np.array([-1.0, 1.0])
     shift = rows["width"][:, None] / 4 * np.array([0.0, -1.0, 1.0])
     out = np.stack([np.cos(rows["direction"]), np.sin(rows["direction"])], axis=-1)
     places = np.zeros((len(rows), len(steps), 3, 2, 3))
-    places[..., :2] = shift[:, None, :, None, None] * _along(rows)[:, None, None, None]
+    places[..., :2] = shift[:, None, :, None, None] * _compute_along(rows)[:, None, None, None]
     places[..., :2] += steps[None, :, None, :, None] * out[:, None, None, None]
     places += rows["centre"][:, None, None, None]
     far, row = cKDTree(floor).query(places * flat, distance_upper_bound=STOOD)
@@ -144,7 +144,7 @@ def rooms_beside(map: TopometricMap, rows: Array) -> Array:
     return sides
 
 
-def _along(rows: Array) -> Array:
+def _compute_along(rows: Array) -> Array:
     """(n, 2) unit, the ways along the walls that rows are in."""
     return np.stack([-np.sin(rows["direction"]), np.cos(rows["direction"])], axis=-1)
 
@@ -155,33 +155,33 @@ WINDOW = WALL_CLASSES.index("window")
 TURNED_AWAY = 0.26  # sine of the angle between two walls that are not one
 
 
-def with_windows(map: TopometricMap, walls: Elevations, classes: Array) -> TopometricMap:
-    """The map with the windows that its walls show.
+def add_windows(map: TopometricMap, walls: Elevations, classes: Array) -> TopometricMap:
+    """Return the map with the windows that its walls show.
 
     Args:
-        classes: (n / 2, 7) of `place_classes`.
+        classes: (n / 2, 7) of `classify_places`.
     """
-    rows = windows_on_walls(walls, classes[:, WINDOW])
-    return replace(map, windows=in_map(map, rows))
+    rows = detect_windows(walls, classes[:, WINDOW])
+    return replace(map, windows=select_windows(map, rows))
 
 
-def windows_on_walls(walls: Elevations, chance: Array) -> Array:
+def detect_windows(walls: Elevations, chance: Array) -> Array:
     """(W,) WINDOW_DTYPE, each once however many faces show it, the likeliest first; `rooms` are those of the faces.
 
     Args:
         chance: (n / 2,) probability of a window in each place along the strips.
     """
     rows, outs = [], []
-    for face, (low, high) in zip(walls.faces, strip_bounds(walls), strict=True):
+    for face, (low, high) in zip(walls.faces, iter_strip_bounds(walls), strict=True):
         each, strip = chance[low // PLACES : high // PLACES], walls.strips[low:high]
-        for start, stop in likely_stretches(each, LIKELY_WINDOW, LEAST_WINDOW):
-            rows.append(_window(face, each, strip, start, stop))
+        for start, stop in iter_likely_stretches(each, LIKELY_WINDOW, LEAST_WINDOW):
+            rows.append(_build_window(face, each, strip, start, stop))
             outs.append(face["out"])
     table, out = np.array(rows, WINDOW_DTYPE), np.array(outs, float).reshape(-1, 2)
-    return np.array([_one(table[group], out[group]) for group in same_windows(table)], WINDOW_DTYPE)
+    return np.array([_merge_windows(table[group], out[group]) for group in iter_same_windows(table)], WINDOW_DTYPE)
 
 
-def in_map(map: TopometricMap, rows: Array) -> Array:
+def select_windows(map: TopometricMap, rows: Array) -> Array:
     """(W,) WINDOW_DTYPE of the windows with the rooms on their two sides, in the order of these; without those where a door is.
 
     A floor that goes on behind a window, seen through it, is often taken for one with the room: then there is no second room.
@@ -192,40 +192,47 @@ def in_map(map: TopometricMap, rows: Array) -> Array:
     if not len(rows) or not len(map.rooms):
         return np.zeros(0, WINDOW_DTYPE)
     rows = rows.copy()
-    sides = rooms_beside(map, rows)
+    sides = find_adjacent_rooms(map, rows)
     unseen = (sides < 0).all(axis=1)
     sides[unseen] = rows["rooms"][unseen]
     sides[sides[:, 0] == sides[:, 1], 1] = -1
     both = np.asarray((sides >= 0).all(axis=1))
     rows["rooms"] = np.where(both[:, None], np.sort(sides, axis=1), -np.sort(-sides, axis=1))
-    rows = rows[(rows["rooms"][:, 0] >= 0) & ~at_any(rows, doors_of(map))]
+    rows = rows[(rows["rooms"][:, 0] >= 0) & ~is_at_any(rows, select_doors(map))]
     return rows[np.lexsort((*rows["centre"].T[::-1], *rows["rooms"].T[::-1]))]
 
 
-def same_windows(rows: Array) -> Iterator[Array]:
-    """Rows of WINDOW_DTYPE that are one window, as indices, the likeliest first; the likeliest windows first."""
-    return one_each(rows, _overlapping)
+def iter_same_windows(rows: Array) -> Iterator[Array]:
+    """Yield rows of WINDOW_DTYPE that are one window, as indices, the likeliest first; the likeliest windows first."""
+    return iter_distinct_rows(rows, _is_overlapping)
 
 
-def _window(face: Array, chance: Array, strip: Array, start: int, stop: int) -> tuple[object, ...]:
+def _build_window(face: Array, chance: Array, strip: Array, start: int, stop: int) -> tuple[object, ...]:
     """Row of WINDOW_DTYPE of one stretch of a face."""
-    depth = wall_depth(strip, start, stop)
+    depth = find_wall_depth(strip, start, stop)
     off = (depth + 0.5) * ACROSS - BEFORE + HALF_WALL
     middle = face["start"] + (start + stop) / 2 * PLACE * face["along"] + off * face["out"]
-    direction = float(within_turn(np.arctan2(face["out"][1], face["out"][0]), np.pi))
+    direction = float(wrap_to_turn(np.arctan2(face["out"][1], face["out"][0]), np.pi))
     centre = (*middle.tolist(), float(face["floor"]))
     likely = float(chance[start:stop].mean())
-    return (int(face["room"]), -1), centre, (stop - start) * PLACE, *_heights(strip, start, stop, depth), direction, likely
+    return (
+        (int(face["room"]), -1),
+        centre,
+        (stop - start) * PLACE,
+        *_measure_heights(strip, start, stop, depth),
+        direction,
+        likely,
+    )
 
 
-def _heights(strip: Array, start: int, stop: int, depth: int) -> tuple[float, float]:
+def _measure_heights(strip: Array, start: int, stop: int, depth: int) -> tuple[float, float]:
     """m above the floor of sill and head of a stretch, nan where they do not show: the bands of the face that are mostly empty,
     and as much of those below and above them as is."""
-    cover = face_cover(strip, start, stop, depth)
-    return (np.nan, np.nan) if cover is None else ends_upwards(1 - cover)
+    cover = measure_face_cover(strip, start, stop, depth)
+    return (np.nan, np.nan) if cover is None else measure_vertical_extent(1 - cover)
 
 
-def _one(rows: Array, out: Array) -> Array:
+def _merge_windows(rows: Array, out: Array) -> Array:
     """One window of what faces show of it, (k, 2) `out` away from their rooms: the likeliest, or what lies between the two
     that are the likeliest on both sides of the wall."""
     window = rows[0].copy()
@@ -243,7 +250,7 @@ def _one(rows: Array, out: Array) -> Array:
     return window
 
 
-def _overlapping(window: Array, rows: Array) -> Array:
+def _is_overlapping(window: Array, rows: Array) -> Array:
     """(W,) bool: in one wall with a window, and sharing most of the narrower of the two."""
     parallel = np.abs(np.sin(rows["direction"] - window["direction"])) < TURNED_AWAY
-    return parallel & in_place(window, rows["centre"], rows["width"])
+    return parallel & is_in_place(window, rows["centre"], rows["width"])

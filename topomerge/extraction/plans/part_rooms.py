@@ -42,19 +42,19 @@ class PartRooms:
     area: float
 
 
-class LaidRooms(NamedTuple):
+class PlacedRooms(NamedTuple):
     """A part's rooms in the columns of a storey, (nx, ny), -1 none, and of each room (R,) 0..1 how sure the part is of it."""
 
     room: Array
     certainty: Array
 
 
-def laid_rooms(plan: StoreyPlan, parts: Sequence[PartRooms]) -> list[LaidRooms]:
-    """The rooms of parts in the columns of a storey."""
-    return [LaidRooms(_room_of_columns(plan, part), np.where(part.entered < 0.5, GLIMPSED, 1.0)) for part in parts]
+def rasterise_part_rooms(plan: StoreyPlan, parts: Sequence[PartRooms]) -> list[PlacedRooms]:
+    """Return the rooms of parts in the columns of a storey."""
+    return [PlacedRooms(_find_column_rooms(plan, part), np.where(part.entered < 0.5, GLIMPSED, 1.0)) for part in parts]
 
 
-def parted_columns(rooms: Sequence[LaidRooms]) -> Array:
+def find_boundary_columns(rooms: Sequence[PlacedRooms]) -> Array:
     """(nx, ny) bool: where rooms of a part meet that somebody was in. Regions end there even if the cells show nothing."""
     out = np.zeros(rooms[0].room.shape, bool)
     for room, certainty in rooms:
@@ -64,7 +64,9 @@ def parted_columns(rooms: Sequence[LaidRooms]) -> Array:
     return out
 
 
-def door_log_odds(region: Array, edge: float, passages: Mapping[Pair, Passage], rooms: Sequence[LaidRooms]) -> dict[Pair, float]:
+def compute_door_log_odds(
+    region: Array, edge: float, passages: Mapping[Pair, Passage], rooms: Sequence[PlacedRooms]
+) -> dict[Pair, float]:
     """Log odds of a door in each passage by all parts: below 0, they have one room on both sides; 0 where none knows both sides.
 
     Args:
@@ -78,11 +80,11 @@ def door_log_odds(region: Array, edge: float, passages: Mapping[Pair, Passage], 
         x, y = passage.place
         box = slice(max(x - reach, 0), x + reach + 1), slice(max(y - reach, 0), y + reach + 1)
         sides = region[box] == a, region[box] == b
-        out[a, b] = LOG_ODDS * sum(_parted(room[box], certainty, sides) for room, certainty in rooms)
+        out[a, b] = LOG_ODDS * sum(_score_separation(room[box], certainty, sides) for room, certainty in rooms)
     return out
 
 
-def _parted(room: Array, certainty: Array, sides: tuple[Array, Array]) -> float:
+def _score_separation(room: Array, certainty: Array, sides: tuple[Array, Array]) -> float:
     """-1..1: does a part have one room on both sides, or two?
 
     Args:
@@ -102,7 +104,7 @@ def _parted(room: Array, certainty: Array, sides: tuple[Array, Array]) -> float:
     return sure * (1 - 2 * float(shares[0] @ shares[1]))
 
 
-def _room_of_columns(plan: StoreyPlan, part: PartRooms) -> Array:
+def _find_column_rooms(plan: StoreyPlan, part: PartRooms) -> Array:
     """(nx, ny) room of a part in each column of a storey, -1 none."""
     at = np.floor((part.places[:, :2] - plan.origin) / plan.edge).astype(np.int64)
     here = np.flatnonzero(((at >= 0) & (at < plan.wall.shape)).all(axis=1))

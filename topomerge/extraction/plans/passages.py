@@ -19,10 +19,10 @@ from scipy import ndimage
 
 from topomerge.errors import InputError
 from topomerge.extraction.plans.storey_plan import DOORWAY_CLASS, SHUT_CLASS, WALL_CLASS, StoreyPlan
-from topomerge.io.weight_files import weights_file
-from topomerge.kernels import crossing
-from topomerge.kernels.watershed import contacts, watershed
-from topomerge.numpy_nn import perceptron, sigmoid
+from topomerge.io.archive import find_weights_file
+from topomerge.kernels import rays
+from topomerge.kernels.rasters import compute_watershed, find_contacts
+from topomerge.numpy_nn import apply_mlp, sigmoid
 from topomerge.types import Array
 
 PEAK_PROMINENCE = 0.1  # m: lower peaks of the clearance are noise of the walls
@@ -72,13 +72,13 @@ def joined(one: Passage, other: Passage) -> Passage:
     return replace(wider, evidence=tuple(np.maximum(one.evidence, other.evidence).tolist()))
 
 
-def clearance_of(plan: StoreyPlan) -> Array:
-    """(nx, ny) m from each open column to the next wall or to the end of what is known; 0 elsewhere."""
+def compute_clearance(plan: StoreyPlan) -> Array:
+    """Return (nx, ny) m from each open column to the next wall or to the end of what is known; 0 elsewhere."""
     return np.asarray(edt.edt(plan.inside.view(np.uint8), black_border=True, parallel=1), np.float64) * plan.edge
 
 
-def regions_of(plan: StoreyPlan, probability: Array, parted: Array | None = None) -> Array:
-    """(nx, ny) int64 basin of each open column, -1 elsewhere.
+def segment_regions(plan: StoreyPlan, probability: Array, parted: Array | None = None) -> Array:
+    """Return (nx, ny) int64 basin of each open column, -1 elsewhere.
 
     What the network takes for a wall or a doorway parts basins as walls do: openings as wide as the room have no narrowing, and
     sparse scans have holes in their walls. Its columns then go to the nearest basin.
@@ -92,7 +92,7 @@ def regions_of(plan: StoreyPlan, probability: Array, parted: Array | None = None
     clearance = edt.edt((plan.inside & ~barrier).view(np.uint8), black_border=True, parallel=1) * plan.edge
     order = np.argsort(-clearance, axis=None, kind="stable")
     order = order[clearance.ravel()[order] > 0]
-    region = np.asarray(watershed(np.asarray(clearance, np.float64), order, PEAK_PROMINENCE))
+    region = np.asarray(compute_watershed(np.asarray(clearance, np.float64), order, PEAK_PROMINENCE))
     if not barrier.any() or not (region >= 0).any():
         return region
     nearest = ndimage.distance_transform_edt(region < 0, return_distances=False, return_indices=True)
@@ -100,14 +100,14 @@ def regions_of(plan: StoreyPlan, probability: Array, parted: Array | None = None
 
 
 def find_passages(plan: StoreyPlan, clearance: Array, region: Array, probability: Array) -> dict[tuple[int, int], Passage]:
-    """The widest connection of each pair of neighbouring regions.
+    """Return the widest connection of each pair of neighbouring regions.
 
     Args:
         clearance: (nx, ny) m, of each column to the next wall.
         region: (nx, ny) of each column, -1 none.
         probability: (nx, ny, 5) what probably stands in each column, see `COLUMN_CLASSES`.
     """
-    meet = contacts(region, clearance)
+    meet = find_contacts(region, clearance)
     if not len(meet):
         return {}
     width = clearance.ravel()[meet[:, 2]]
@@ -115,11 +115,11 @@ def find_passages(plan: StoreyPlan, clearance: Array, region: Array, probability
     meet = meet[order]
     first = np.ones(len(meet), bool)
     first[1:] = (meet[1:, :2] != meet[:-1, :2]).any(axis=1)
-    measure = _Measure(plan, clearance, region, probability)
-    return {(int(a), int(b)): measure.passage(int(a), int(b), int(at)) for a, b, at in meet[first]}
+    measure = _PassageMeasurer(plan, clearance, region, probability)
+    return {(int(a), int(b)): measure.measure_passage(int(a), int(b), int(at)) for a, b, at in meet[first]}
 
 
-class _Measure:
+class _PassageMeasurer:
     """Measures passages of one plan."""
 
     def __init__(self, plan: StoreyPlan, clearance: Array, region: Array, probability: Array) -> None:
@@ -133,32 +133,32 @@ class _Measure:
         )
         self.layers = low, doorway, boundary
 
-    def passage(self, a: int, b: int, at: int) -> Passage:
-        """The passage between two regions at a flat index of the plan."""
+    def measure_passage(self, a: int, b: int, at: int) -> Passage:
+        """Return the passage between two regions at a flat index of the plan."""
         x, y = divmod(at, self.plan.wall.shape[1])
         inside, e = self.plan.inside, self.plan.edge
         wall = self.nearest_wall[:, x, y] - (x, y)
         dx, dy = (wall / max(float(np.hypot(*wall)), 1e-9)).tolist()
         limit = 3.0 / e
-        ahead, behind = crossing.run(inside, x, y, dx, dy, limit), crossing.run(inside, x, y, -dx, -dy, limit)
+        ahead, behind = rays.measure_run(inside, x, y, dx, dy, limit), rays.measure_run(inside, x, y, -dx, -dy, limit)
         mx, my, half = x + dx * (ahead - behind) / 2, y + dy * (ahead - behind) / 2, (ahead + behind) / 2
         jambs = sorted(
-            crossing.run(self.thick_wall, mx + s * (half + 1) * dx, my + s * (half + 1) * dy, s * dx, s * dy, 1.0 / e) * e
+            rays.measure_run(self.thick_wall, mx + s * (half + 1) * dx, my + s * (half + 1) * dy, s * dx, s * dy, 1.0 / e) * e
             for s in (1, -1)
         )
         steps = int(0.6 / e)
-        across = crossing.widths(inside, mx, my, dx, dy, steps, limit) * e
+        across = rays.measure_widths(inside, mx, my, dx, dy, steps, limit) * e
         narrow = max(float(across[steps]), e)
         opens = sorted(max(float(side.max(initial=narrow)), narrow) - narrow for side in (across[:steps], across[steps + 1 :]))
         length = float(((across > 0) & (across <= narrow + 0.15)).sum()) * e
-        lintel, seen, step, growth = self._above(a, b, x, y)
+        lintel, seen, step, growth = self._measure_above(a, b, x, y)
         cover, doorway, boundary = (
-            float(crossing.cover(layer, mx, my, dx, dy, half, half, int(0.3 / e))) for layer in self.layers
+            float(rays.measure_cover(layer, mx, my, dx, dy, half, half, int(0.3 / e))) for layer in self.layers
         )
         width = min((2 * half + 1) * e, 2 * float(self.clearance[x, y]) + 2 * e)
         return Passage((x, y), width, (dx, dy), (growth, *opens, length, lintel, cover, seen, step, *jambs, doorway, boundary))
 
-    def _above(self, a: int, b: int, x: int, y: int) -> tuple[float, float, float, float]:
+    def _measure_above(self, a: int, b: int, x: int, y: int) -> tuple[float, float, float, float]:
         """Depth of a lintel below both ceilings, was it seen, step between the ceilings, and growth of the clearance."""
         plan, clearance = self.plan, self.clearance
         reach = int(np.ceil(LINTEL_REACH / plan.edge))
@@ -180,8 +180,8 @@ class _Measure:
         return min(ceilings) - float(np.quantile(strip, 0.2)), 1.0, abs(ceilings[0] - ceilings[1]), min(growth)
 
 
-def door_features(passage: Passage, peaks: Sequence[float] | Array, areas: Sequence[float] | Array) -> Array:
-    """(17,) what speaks for a door, see `DOOR_FEATURES`.
+def compute_door_features(passage: Passage, peaks: Sequence[float] | Array, areas: Sequence[float] | Array) -> Array:
+    """Return (17,) what speaks for a door, see `DOOR_FEATURES`.
 
     Args:
         passage: between two sides.
@@ -194,7 +194,7 @@ def door_features(passage: Passage, peaks: Sequence[float] | Array, areas: Seque
     return np.array([passage.width, *sides, *passage.measured, small, large])
 
 
-def pair_of(a: int, b: int) -> Pair:
+def sort_pair(a: int, b: int) -> Pair:
     """Two rooms, the smaller number first."""
     return (a, b) if a < b else (b, a)
 
@@ -207,11 +207,11 @@ def pair_of(a: int, b: int) -> Pair:
 DOOR_CLASSIFIER_FILE = "door_classifier.json"
 
 
-def door_probability(x: Array) -> Array:
-    """(n,) probability that a door parts the two sides of each narrowing, from its (n, 17) features."""
-    weights = read_classifier(weights_file("topomerge.extraction.plans", DOOR_CLASSIFIER_FILE))
+def predict_door(x: Array) -> Array:
+    """Return (n,) probability that a door parts the two sides of each narrowing, from its (n, 17) features."""
+    weights = read_classifier(find_weights_file("topomerge.extraction.plans", DOOR_CLASSIFIER_FILE))
     h = (np.clip(x, weights["low"], weights["high"]) - weights["mean"]) / weights["scale"]
-    return sigmoid(perceptron(h, weights["layers"])[:, 0])
+    return sigmoid(apply_mlp(h, weights["layers"])[:, 0])
 
 
 @lru_cache(maxsize=4)

@@ -16,15 +16,14 @@ from topomerge.extraction.plans.storey_plan import (
     HeightBands,
     StoreyPlan,
     WallRule,
-    band_stack,
-    first_above,
-    observed_bands,
-    wall_columns,
+    build_band_stack,
+    detect_wall_columns,
+    find_first_above,
+    is_observed_band,
 )
-from topomerge.extraction.slices import SIGHT_DIRECTIONS, enclosed_columns, walled_directions
-from topomerge.extraction.storeys import CARRIED, HIGHEST_CEILING, NOWHERE, STOREY_LEAST_HEIGHT, lowest_of_column
-from topomerge.kernels.columns import first_occupied, hollow_below
-from topomerge.kernels.profile import PROFILE_BELOW, PROFILE_LEVELS, profiles
+from topomerge.extraction.slices import SIGHT_DIRECTIONS, count_walled_directions, find_enclosed_columns
+from topomerge.extraction.storeys import CARRIED, HIGHEST_CEILING, NOWHERE, STOREY_LEAST_HEIGHT, select_lowest_of_column
+from topomerge.kernels.rasters import PROFILE_BELOW, PROFILE_LEVELS, fill_profiles, find_first_occupied, is_hollow_below
 from topomerge.types import Array, VoxelGrid
 
 ROOM_WALLS = WallRule(lacking=2, neighbours=8, least_bands=3)  # fewer bands show the upper side of a ceiling, beside higher ones
@@ -47,15 +46,17 @@ PLAN_MARGIN = 0.6  # m
 LEAST_SLAB = 0.1  # m at least, between a ceiling and the floor above it
 
 
-def columns_of(plan: StoreyPlan, grid: VoxelGrid) -> tuple[Array, Array]:
+def locate_columns(plan: StoreyPlan, grid: VoxelGrid) -> tuple[Array, Array]:
     """Where a plan lies in the grid that it was made of: (2,) int64 column that is element (0, 0), and (nx, ny) int64 level of
     the floor."""
     low = np.rint((plan.origin - grid.origin[:2]) / plan.edge).astype(np.int64)
     return low, np.rint((plan.floor - grid.origin[2]) / plan.edge - 0.5).astype(np.int64)
 
 
-def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, crossed: VoxelGrid | None = None) -> StoreyPlan:
-    """The plan of storey `k`.
+def build_storey_plan(
+    grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, crossed: VoxelGrid | None = None
+) -> StoreyPlan:
+    """Return the plan of storey `k`.
 
     Args:
         grid: occupied cells.
@@ -65,47 +66,49 @@ def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, cr
             ceiling was seen.
     """
     e = grid.edge
-    floor = lowest_of_column(navigable)
+    floor = select_lowest_of_column(navigable)
     cells = navigable.cells[floor].astype(np.int64)
     mine = cells[storey[floor] == k]
-    margin, steps = int(np.ceil(PLAN_MARGIN / e)), int(np.lcm(COARSEST_STRIDE, _tile(e)))
+    margin, steps = int(np.ceil(PLAN_MARGIN / e)), int(np.lcm(COARSEST_STRIDE, _compute_tile_size(e)))
     far_off = -(-(round(COVERED_REACH / e) + margin) // steps) * steps
     first, last = mine[:, :2].min(axis=0) - margin, mine[:, :2].max(axis=0) + margin
     low, high = first - far_off, last + far_off
     size = high + 1 - low
-    base, seen, far = _heights(mine, low, size)
+    base, seen, far = _interpolate_heights(mine, low, size)
     above = cells[storey[floor] == k + 1]
     top = base + PROFILE_LEVELS
     if len(above):
         nominal = int(np.median(above[:, 2]))
-        upper, _, near = _heights(above[_within(above[:, :2] - low, size)], low, size, nominal)
+        upper, _, near = _interpolate_heights(above[_is_within(above[:, :2] - low, size)], low, size, nominal)
         upper = np.where(near * e < 1.0, upper, nominal)
         ends = (near * e < 1.0) | ((upper - base) * e >= STOREY_LEAST_HEIGHT)  # not so over half levels
         top = np.where(ends, np.minimum(top, upper - int(np.ceil(LEAST_SLAB / e))), top)
     profile = np.zeros(size, np.uint64)
-    profiles(grid.cells, low, base, top, profile)
-    bands = profile_bands(e)
-    wall_like = _filled_like_walls(profile, bands)
-    clear = first_above(profile, bands)
-    ceiling = _ceiling(np.where(wall_like, np.nan, clear), e)
-    wall = wall_like & ~_below_ceiling(profile, ceiling, e)
-    wall = _without_clutter(ndimage.binary_closing(wall, np.ones((3, 3)), border_value=0) | wall, e)
-    on_floor = (profile & np.uint64(bands.mask(-0.3, 0.3))) != 0
-    reach = np.where(_open_below(grid, cells[storey[floor] == k - 1], low, base), FLOOR_REACH, COVERED_REACH)
+    fill_profiles(grid.cells, low, base, top, profile)
+    bands = build_profile_bands(e)
+    wall_like = _is_filled_like_wall(profile, bands)
+    clear = find_first_above(profile, bands)
+    ceiling = _estimate_ceiling(np.where(wall_like, np.nan, clear), e)
+    wall = wall_like & ~_is_below_ceiling(profile, ceiling, e)
+    wall = _remove_clutter(ndimage.binary_closing(wall, np.ones((3, 3)), border_value=0) | wall, e)
+    on_floor = (profile & np.uint64(bands.build_mask(-0.3, 0.3))) != 0
+    reach = np.where(_is_open_below(grid, cells[storey[floor] == k - 1], low, base), FLOOR_REACH, COVERED_REACH)
     covered = ~np.isnan(clear)
     if covered[seen].sum() < ROOFLESS_SHARE * seen.sum():  # the scan ends below the ceiling, but furniture stands on floor
-        covered |= ((profile & np.uint64(bands.mask(*FURNITURE_HEIGHTS))) != 0) & enclosed_columns(wall, e)
+        covered |= ((profile & np.uint64(bands.build_mask(*FURNITURE_HEIGHTS))) != 0) & find_enclosed_columns(wall, e)
     if crossed is not None:
-        covered |= _looked_through(crossed, grid, low, base) & enclosed_columns(wall, e)  # what lies before windows is no room
+        covered |= _is_seen_through(crossed, grid, low, base) & find_enclosed_columns(
+            wall, e
+        )  # what lies before windows is no room
     inside = seen | (on_floor & (far * e <= FLOOR_REACH)) | (covered & (far * e <= reach))
-    inside = _filled(inside, wall, on_floor & (far * e <= FLOOR_REACH), covered, e) & (far * e <= COVERED_REACH)
-    box = _box_around(inside, first - low, last - low, margin)
+    inside = _fill_holes(inside, wall, on_floor & (far * e <= FLOOR_REACH), covered, e) & (far * e <= COVERED_REACH)
+    box = _find_box_around(inside, first - low, last - low, margin)
     origin = grid.origin[:2] + (low + [side.start for side in box]) * e
     floor, height = grid.origin[2] + (base[box] + 0.5) * e, (top - base)[box] * e
     return StoreyPlan(origin, e, wall[box], inside[box], profile[box], bands, floor, ceiling[box], height)
 
 
-def _box_around(inside: Array, first: Array, last: Array, margin: int) -> tuple[slice, slice]:
+def _find_box_around(inside: Array, first: Array, last: Array, margin: int) -> tuple[slice, slice]:
     """The part of a raster from columns `first` to `last`, and `margin` columns beyond where what is inside reaches further.
 
     At its beginning it grows by whole strides of the plan network, which so sees all else as it would without.
@@ -122,11 +125,11 @@ def _box_around(inside: Array, first: Array, last: Array, margin: int) -> tuple[
     return box[0], box[1]
 
 
-def _within(at: Array, size: Array) -> Array:
+def _is_within(at: Array, size: Array) -> Array:
     return np.asarray(((at >= 0) & (at < size)).all(axis=1))
 
 
-def _heights(cells: Array, low: Array, size: Array, nominal: int = 0) -> tuple[Array, Array, Array]:
+def _interpolate_heights(cells: Array, low: Array, size: Array, nominal: int = 0) -> tuple[Array, Array, Array]:
     """Level of the nearest of the given floor cells, where there is one, and how many columns away it is."""
     if not len(cells):
         return np.full(size, nominal), np.zeros(size, bool), np.full(size, 1e9)
@@ -140,18 +143,18 @@ def _heights(cells: Array, low: Array, size: Array, nominal: int = 0) -> tuple[A
     return base[tuple(nearest)], seen, far
 
 
-def _open_below(grid: VoxelGrid, lower: Array, low: Array, base: Array) -> Array:
+def _is_open_below(grid: VoxelGrid, lower: Array, low: Array, base: Array) -> Array:
     """(nx, ny) bool: does the floor of the storey below, (n, 3) cells, see past the level of this one's? A hall through both."""
     out = np.zeros(base.shape, bool)
-    lower = np.ascontiguousarray(lower[_within(lower[:, :2] - low, np.array(base.shape))])
+    lower = np.ascontiguousarray(lower[_is_within(lower[:, :2] - low, np.array(base.shape))])
     at = tuple((lower[:, :2] - low).T)
     upright, highest = round(STOREY_LEAST_HEIGHT / grid.edge), round(HIGHEST_CEILING / grid.edge)
-    free = first_occupied(*grid._bricks, lower, upright, 1, highest)
+    free = find_first_occupied(*grid._bricks, lower, upright, 1, highest)
     out[at] = (free == 0) | (lower[:, 2] + free > base[at] + round(OVER_LEVEL / grid.edge))
     return out
 
 
-def _looked_through(crossed: VoxelGrid, grid: VoxelGrid, low: Array, base: Array) -> Array:
+def _is_seen_through(crossed: VoxelGrid, grid: VoxelGrid, low: Array, base: Array) -> Array:
     """(nx, ny) bool: did rays cross two free cells or more of a column at the height of a body?"""
     count = np.zeros(base.size, np.int64)
     if crossed.edge > LONGEST_CROSSED:
@@ -160,53 +163,53 @@ def _looked_through(crossed: VoxelGrid, grid: VoxelGrid, low: Array, base: Array
     height = (crossed.cells[:, 2] + 0.5) * (crossed.edge / grid.edge)
     for part in np.argwhere(np.ones((parts, parts), bool)):
         at = np.floor((crossed.cells[:, :2] + (part + 0.5) / parts) * (crossed.edge / grid.edge)).astype(np.int64) - low
-        within = _within(at, np.array(base.shape))
+        within = _is_within(at, np.array(base.shape))
         column = at[within, 0] * base.shape[1] + at[within, 1]
         above = (height[within] - base.ravel()[column]) * grid.edge
         count += np.bincount(column[(above > LOOKED_THROUGH[0]) & (above < LOOKED_THROUGH[1])], minlength=base.size)
     return count.reshape(base.shape) >= 2
 
 
-def profile_bands(edge: float) -> HeightBands:
-    """What the bits of a profile (`kernels.profile`) mean: a band is as high as a cell, m."""
+def build_profile_bands(edge: float) -> HeightBands:
+    """Build the height bands of the bits of a profile (`kernels.profile`): each is as high as a cell, m."""
     return HeightBands(edge, PROFILE_BELOW, PROFILE_LEVELS)
 
 
-def _filled_like_walls(profile: Array, bands: HeightBands) -> Array:
+def _is_filled_like_wall(profile: Array, bands: HeightBands) -> Array:
     """Is the column filled like a wall, at the heights at which the sensor looked? Worktops and tables fill whole areas at their
     height: beside what stands upright they would make the heights above them seem unseen, and themselves walls."""
-    filled = band_stack(profile, bands)
+    filled = build_band_stack(profile, bands)
     upright = filled.sum(axis=0) >= UPRIGHT_BANDS
-    filled = filled[observed_bands(filled) | observed_bands(filled & upright)]
-    like = wall_columns(filled, ROOM_WALLS)
+    filled = filled[is_observed_band(filled) | is_observed_band(filled & upright)]
+    like = detect_wall_columns(filled, ROOM_WALLS)
     if len(filled) < ROOM_WALLS.least_bands:
         return like
     # flying points hang in every height of a doorway, but few of them
-    levels = np.bitwise_count(profile & np.uint64(bands.mask(WALL_HEIGHTS[0], WALL_HEIGHTS[-1])))
-    full = filled.sum(axis=0) >= ROOM_WALLS.least_of(len(filled))
+    levels = np.bitwise_count(profile & np.uint64(bands.build_mask(WALL_HEIGHTS[0], WALL_HEIGHTS[-1])))
+    full = filled.sum(axis=0) >= ROOM_WALLS.count_least_bands(len(filled))
     usual = np.median(levels[full]) if full.any() else 0
     return np.asarray(like & (levels >= THIN * usual))
 
 
-def _ceiling(clear: Array, edge: float) -> Array:
+def _estimate_ceiling(clear: Array, edge: float) -> Array:
     """Ceiling of each column: the median of a few tiles around it, which lamps and lintels don't reach."""
-    tile = _tile(edge)
+    tile = _compute_tile_size(edge)
     nx, ny = (-(-s // tile) for s in clear.shape)
     padded = np.full((nx * tile, ny * tile), np.nan)
     padded[: clear.shape[0], : clear.shape[1]] = clear
     blocks = padded.reshape(nx, tile, ny, tile).transpose(0, 2, 1, 3).reshape(nx, ny, -1)
-    middle = _nanmedian(blocks)
+    middle = _compute_nanmedian(blocks)
     around = np.pad(middle, 2, constant_values=np.nan)
-    smooth = _nanmedian(np.stack([around[i : i + nx, j : j + ny] for i in range(5) for j in range(5)], axis=-1))
+    smooth = _compute_nanmedian(np.stack([around[i : i + nx, j : j + ny] for i in range(5) for j in range(5)], axis=-1))
     return np.repeat(np.repeat(smooth, tile, 0), tile, 1)[: clear.shape[0], : clear.shape[1]]
 
 
-def _tile(edge: float) -> int:
+def _compute_tile_size(edge: float) -> int:
     """Columns a side of the tiles on which ceilings are measured."""
     return max(round(BLOCK / edge), 1)
 
 
-def _nanmedian(values: Array) -> Array:
+def _compute_nanmedian(values: Array) -> Array:
     """Median along the last axis of what is a number; nan where fewer than a tenth are."""
     ordered = np.sort(values, axis=-1)  # nan last
     count = (~np.isnan(ordered)).sum(axis=-1)
@@ -214,21 +217,21 @@ def _nanmedian(values: Array) -> Array:
     return np.where(count * 10 >= values.shape[-1], middle, np.nan)
 
 
-def _below_ceiling(profile: Array, ceiling: Array, edge: float) -> Array:
+def _is_below_ceiling(profile: Array, ceiling: Array, edge: float) -> Array:
     """Columns over which the ceiling was seen with empty space below it: what stands there is no wall."""
     height = np.where(np.isnan(ceiling), 0.0, ceiling)
-    out, bands = np.zeros(profile.shape, bool), profile_bands(edge)
+    out, bands = np.zeros(profile.shape, bool), build_profile_bands(edge)
     for level in np.unique(np.round(height / edge)):
         top = level * edge
         if top < OVER_FURNITURE + 0.25:
             continue
         here = np.round(height / edge) == level
-        empty = (profile & np.uint64(bands.mask(OVER_FURNITURE, max(top - 0.25, OVER_FURNITURE + 0.1)))) == 0
-        out |= here & empty & ((profile & np.uint64(bands.mask(top - 0.15, top + 0.35))) != 0)
+        empty = (profile & np.uint64(bands.build_mask(OVER_FURNITURE, max(top - 0.25, OVER_FURNITURE + 0.1)))) == 0
+        out |= here & empty & ((profile & np.uint64(bands.build_mask(top - 0.15, top + 0.35))) != 0)
     return out
 
 
-def _without_clutter(wall: Array, edge: float) -> Array:
+def _remove_clutter(wall: Array, edge: float) -> Array:
     """The walls without short pieces that stand free."""
     piece, count = ndimage.label(wall, np.ones((3, 3)))
     boxes = ndimage.find_objects(piece)
@@ -240,7 +243,7 @@ def _without_clutter(wall: Array, edge: float) -> Array:
     return keep[piece]
 
 
-def _filled(inside: Array, wall: Array, seen: Array, covered: Array, edge: float) -> Array:
+def _fill_holes(inside: Array, wall: Array, seen: Array, covered: Array, edge: float) -> Array:
     """What is known, without small holes and without parts of which neither a floor was seen nor walls around what has a ceiling
     or was looked through (`covered`)."""
     reach = max(round(0.2 / edge), 1)
@@ -277,7 +280,7 @@ LEAST_FLOOR_SHARE = 0.1  # of a region in which a floor was seen
 OPEN_SHARE = 0.25  # of the outline with walls, and of the floor with a ceiling: less, and a floor may be a ceiling
 
 
-def without_upper_sides(grid: VoxelGrid, plan: StoreyPlan, region: Array, places: Array = NOWHERE) -> Array:
+def remove_upper_sides(grid: VoxelGrid, plan: StoreyPlan, region: Array, places: Array = NOWHERE) -> Array:
     """The regions of an upper storey less those that are the upper side of a ceiling: nothing above, and either no walls around
     or so thin that nobody is carried, with a storey right below. The flat roof of low rooms beside a hall has walls on one side:
     those of the hall, which so becomes no storey of its own.
@@ -297,7 +300,7 @@ def without_upper_sides(grid: VoxelGrid, plan: StoreyPlan, region: Array, places
     length = np.maximum(np.bincount(region[outline], minlength=count), 1)
     beside_walls = np.bincount(region[outline], walled[outline], minlength=count) / length
     suspect = covered < OPEN_SHARE
-    low, base = columns_of(plan, grid)
+    low, base = locate_columns(plan, grid)
     at = np.floor((places[np.isfinite(places).all(axis=1)] - grid.origin) / grid.edge).astype(np.int64) - (*low, 0)
     at = at[((at[:, :2] >= 0) & (at[:, :2] < region.shape)).all(axis=1)]
     above, of = (at[:, 2] - base[tuple(at[:, :2].T)]) * grid.edge, region[tuple(at[:, :2].T)]
@@ -307,12 +310,12 @@ def without_upper_sides(grid: VoxelGrid, plan: StoreyPlan, region: Array, places
     at = np.argwhere(in_region & suspect[np.where(in_region, region, 0)])
     cells = np.ascontiguousarray(np.column_stack([at + low, base[tuple(at.T)]]))  # each layout is compiled by itself
     heights = (round(height / grid.edge) for height in (SHEET_THICKNESS, *STOREY_BELOW))
-    hollow = hollow_below(*grid._bricks, cells, 1, *heights)
+    hollow = is_hollow_below(*grid._bricks, cells, 1, *heights)
     thin = np.bincount(region[tuple(at.T)], hollow, minlength=count) > 0.5 * size
-    directions = walled_directions(plan.wall, plan.edge) / SIGHT_DIRECTIONS
+    directions = count_walled_directions(plan.wall, plan.edge) / SIGHT_DIRECTIONS
     walls_around = np.bincount(region[in_region], directions[in_region], minlength=count) / size
     ceiling = suspect & (thin | (beside_walls < OPEN_SHARE) | (walls_around < ONE_SIDED_SHARE))
     if ceiling.any():  # what the hall beside a roof adds to that has no floor
-        on_floor = (plan.profile & plan.profile.dtype.type(plan.bands.mask(*FLOOR_HEIGHTS))) != 0
+        on_floor = (plan.profile & plan.profile.dtype.type(plan.bands.build_mask(*FLOOR_HEIGHTS))) != 0
         ceiling |= np.bincount(region[in_region], on_floor[in_region], minlength=count) < LEAST_FLOOR_SHARE * size
     return np.where(in_region & ceiling[np.where(in_region, region, 0)], -1, region)

@@ -14,8 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES, INSIDE_CLASS, StoreyPlan
-from topomerge.networks.network import Network, Run, load_network, load_shipped_network
-from topomerge.networks.signature import Signature, Tensor
+from topomerge.networks.network import Network, Run, Signature, Tensor, load_network, load_shipped_network
 from topomerge.types import Array
 
 PLAN_NETWORK_FILE = "plan_network.onnx"
@@ -44,55 +43,55 @@ PLAN_SIGNATURE = Signature(
 )
 
 
-def evidence(plan: StoreyPlan) -> Array:
+def compute_evidence(plan: StoreyPlan) -> Array:
     """(nx, ny, 11) float32 of what was seen in each column: known, wall, how full four bands of heights are, floor, lintel,
     ceiling and its height, and how large a column is."""
     levels = []
     for low, high in EVIDENCE_HEIGHTS:
-        mask = np.uint64(plan.bands.mask(low, high))
+        mask = np.uint64(plan.bands.build_mask(low, high))
         levels.append(np.bitwise_count(plan.profile & mask) / float(np.bitwise_count(mask)))
     seen = ~np.isnan(plan.clear)
     lintel = plan.clear < plan.ceiling - 0.2  # nan: no
     height = np.where(seen, np.clip(plan.clear, 1.9, 4.5) - 2.5, 0.0)
-    floor = plan.occupied(-0.3, 0.3)
+    floor = plan.is_occupied(-0.3, 0.3)
     size = np.full(plan.wall.shape, 5 * plan.edge)
     return np.stack(
         [plan.inside, plan.wall, *levels, floor, lintel, seen, height, size], axis=-1, dtype=np.float32, casting="unsafe"
     )
 
 
-def column_probabilities(plan: StoreyPlan, network: Run | None = None) -> Array:
+def compute_column_probabilities(plan: StoreyPlan, network: Run | None = None) -> Array:
     """(nx, ny, 5) float32 probability of each of `COLUMN_CLASSES` in each column, by the weights that ship or by others.
 
     The mean over the plan turned by quarters: what the network says of a door hangs on how its walls lie on the columns, and
     where they do by chance, four looks err less than one (docs/adr/0005).
     """
-    x, margin = np.moveaxis(evidence(plan), -1, 0), COARSEST_STRIDE
+    x, margin = np.moveaxis(compute_evidence(plan), -1, 0), COARSEST_STRIDE
     nx, ny = plan.wall.shape
     x = np.pad(x, ((0, 0), (margin, -nx % margin + margin), (margin, -ny % margin + margin)))
-    w = weights() if network is None else network
-    parts = _separate_parts(np.asarray(x[:SIZE_CHANNEL].any(axis=0)))
+    w = load_weights() if network is None else network
+    parts = _split_parts(np.asarray(x[:SIZE_CHANNEL].any(axis=0)))
     if parts is None:
-        mean = _mean_of_turns(x, w)
+        mean = _average_turns(x, w)
     else:
         side = (2 * NETWORK_REACH + 1) * COARSEST_STRIDE
         nothing = np.zeros((EVIDENCE_CHANNELS, side, side), np.float32)
         nothing[SIZE_CHANNEL] = 5 * plan.edge
         mean = np.empty((*x.shape[1:], len(COLUMN_CLASSES)), np.float32)
-        mean[:] = _mean_of_turns(nothing, w)[side // 2, side // 2]
+        mean[:] = _average_turns(nothing, w)[side // 2, side // 2]
         for box, mask in parts:
-            mean[box][mask] = _mean_of_turns(x[:, *box], w)[mask]
+            mean[box][mask] = _average_turns(x[:, *box], w)[mask]
     return np.ascontiguousarray(mean[margin : margin + nx, margin : margin + ny])
 
 
-def _mean_of_turns(x: Array, network: Run) -> Array:
+def _average_turns(x: Array, network: Run) -> Array:
     """(nx, ny, 5) mean probability over (11, nx, ny) evidence turned by quarters."""
-    turned = (forward(np.rot90(x, k, (1, 2)), network) for k in range(4))
+    turned = (run_network(np.rot90(x, k, (1, 2)), network) for k in range(4))
     mean: Array = np.mean([np.rot90(probability, -k, (1, 2)) for k, probability in enumerate(turned)], axis=0)
     return np.moveaxis(mean, 0, -1)
 
 
-def _separate_parts(known: Array) -> list[tuple[tuple[slice, slice], Array]] | None:
+def _split_parts(known: Array) -> list[tuple[tuple[slice, slice], Array]] | None:
     """Parts of a plan between which the network sees nothing: a box, and which of its columns the network sees anything from.
 
     A plan of buildings far apart, or of a long bent corridor, so costs what is in it, not the rectangle around it.
@@ -118,7 +117,7 @@ def _separate_parts(known: Array) -> list[tuple[tuple[slice, slice], Array]] | N
     return parts if size < WORTH_PARTING * seen.size else None
 
 
-def without_furniture(plan: StoreyPlan, probability: Array) -> StoreyPlan:
+def remove_furniture(plan: StoreyPlan, probability: Array) -> StoreyPlan:
     """The plan without the walls that are probably furniture: the legs of tables in slices and grid maps, cupboards.
 
     Where a ceiling was seen, most cupboards differ from walls already (`plan`). What touches a wall stays: a blurred wall
@@ -132,13 +131,13 @@ def without_furniture(plan: StoreyPlan, probability: Array) -> StoreyPlan:
     return replace(plan, wall=plan.wall & ~furniture, inside=plan.inside | furniture)
 
 
-def forward(x: Array, network: Run) -> Array:
+def run_network(x: Array, network: Run) -> Array:
     """Compute (5, nx, ny) float32 probabilities from (11, nx, ny) evidence; both sides are multiples of 16."""
     (probability,) = network(evidence=x[None])
     return np.asarray(probability[0])
 
 
-def weights(raised: bool = False) -> Network:
+def load_weights(raised: bool = False) -> Network:
     """Load the network that ships, or the one in its place (`io.weight_files`).
 
     Args:

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
-from topomerge.extraction.completeness import outline_seen
+from topomerge.extraction.completeness import measure_seen_outline
 from topomerge.extraction.morphology import spread_labels
-from topomerge.extraction.partition import PartitionedStorey
 from topomerge.extraction.plans.passages import Pair
-from topomerge.extraction.plans.plan import columns_of
+from topomerge.extraction.plans.plan import locate_columns
 from topomerge.extraction.plans.storey_plan import Floor, StoreyPlan
-from topomerge.extraction.storeys import lowest_of_column
+from topomerge.extraction.segment import PartitionedStorey
+from topomerge.extraction.storeys import select_lowest_of_column
 from topomerge.types import Array, VoxelGrid
 
 WALL_REACH = 0.5  # m: so far into walls and what stands before them the cells of a room go
@@ -23,10 +23,10 @@ DOORWAY_REACH = 0.5  # m: so far the navigable volume goes on into what looks li
 FLOOR_PROPERTIES = ("standing", "storey", "room", "area")
 
 
-def floor_of_storeys(
+def build_floor(
     grid: VoxelGrid, navigable: VoxelGrid, storey: Array, storeys: Array, cut: Sequence[PartitionedStorey], factor: int
 ) -> Floor:
-    """The floor of all storeys, its rooms and areas numbered from storey to storey.
+    """Return the floor of all storeys, its rooms and areas numbered from storey to storey.
 
     Args:
         grid: occupied cells.
@@ -44,18 +44,18 @@ def floor_of_storeys(
         room = np.where(part.room >= 0, part.room + rooms, -1)
         area = np.where(part.area >= 0, part.area + areas, -1)
         _label_cells(label, grid, part.plan, room, factor)
-        places, at, standing = _floor_cells(part, navigable, storey == part.number, factor)
+        places, at, standing = _select_floor_cells(part, navigable, storey == part.number, factor)
         cells.append(places)
         properties.append((standing, np.full(len(places), part.number), room[tuple(at.T)], area[tuple(at.T)]))
         probability |= {(a + rooms, b + rooms): p for (a, b), p in part.door_probability.items()}
         room_of_area.append(part.room_of_area + rooms)
-        seen.append(outline_seen(part.room, part.plan.inside, part.plan.wall, part.plan.edge))
+        seen.append(measure_seen_outline(part.room, part.plan.inside, part.plan.wall, part.plan.edge))
         rooms, areas = rooms + int(part.room.max(initial=-1)) + 1, areas + len(part.room_of_area)
     if not cut:
         empty = np.zeros(0, np.int32)
-        return Floor(grid.with_cells(np.zeros((0, 3), np.int32)), storeys, empty, empty, empty, empty, label)
+        return Floor(grid.replace_cells(np.zeros((0, 3), np.int32)), storeys, empty, empty, empty, empty, label)
     tables = dict(zip(FLOOR_PROPERTIES, map(np.concatenate, zip(*properties, strict=True)), strict=True))
-    floor, storeys, of_cell = joined_floor(grid, storeys, np.concatenate(cells), tables)
+    floor, storeys, of_cell = join_floor(grid, storeys, np.concatenate(cells), tables)
     return Floor(
         floor,
         storeys,
@@ -85,7 +85,7 @@ def find_cells_of_storey(grid: VoxelGrid, plan: StoreyPlan, room: Array, factor:
     Args:
         factor: how many times longer the columns are than the cells.
     """
-    low, base = columns_of(plan, grid)
+    low, base = locate_columns(plan, grid)
     at = (grid.cells // factor if factor > 1 else grid.cells)[:, :2].astype(np.int64) - low
     rows = np.flatnonzero(((at >= 0) & (at < room.shape)).all(axis=1))
     at = at[rows]
@@ -96,13 +96,15 @@ def find_cells_of_storey(grid: VoxelGrid, plan: StoreyPlan, room: Array, factor:
     return rows[in_storey], at[in_storey]
 
 
-def _floor_cells(part: PartitionedStorey, navigable: VoxelGrid, in_storey: Array, factor: int) -> tuple[Array, Array, Array]:
+def _select_floor_cells(
+    part: PartitionedStorey, navigable: VoxelGrid, in_storey: Array, factor: int
+) -> tuple[Array, Array, Array]:
     """Cells of a storey's floor, the column of the plan in which each lies, and whether somebody can stand there.
 
     These are its navigable cells, and below furniture all cells of a column of the plan at the level of its floor.
     """
     room = part.room
-    low, base = columns_of(part.plan, navigable)
+    low, base = locate_columns(part.plan, navigable)
     cells = navigable.cells[in_storey]
     at = (cells // factor)[:, :2].astype(np.int64) - low
     in_plan = ((at >= 0) & (at < room.shape)).all(axis=1)
@@ -118,10 +120,10 @@ def _floor_cells(part: PartitionedStorey, navigable: VoxelGrid, in_storey: Array
     return cells, np.concatenate([at, np.repeat(hidden, len(steps), axis=0)]), standing
 
 
-def joined_floor(
+def join_floor(
     grid: VoxelGrid, storeys: Array, cells: Array, tables: dict[str, Array]
 ) -> tuple[VoxelGrid, Array, dict[str, Array]]:
-    """The floor cells of all storeys as one grid; rooms go on into doorways that look like wall.
+    """Return the floor cells of all storeys as one grid; rooms go on into doorways that look like wall.
 
     Args:
         storeys: (S,) STOREY_DTYPE; the areas are written.
@@ -132,15 +134,15 @@ def joined_floor(
         The cells with the property `standing`, the storeys that have a room, and storey, room and area of each cell.
     """
     in_grid = ((cells >= 0) & (cells < grid.shape)).all(axis=1)
-    floor = grid.with_cells(cells[in_grid], {name: values[in_grid] for name, values in tables.items()})
+    floor = grid.replace_cells(cells[in_grid], {name: values[in_grid] for name, values in tables.items()})
     of_cell = {name: values.astype(np.int32) for name, values in floor.properties.items()}
     in_a_room = of_cell["room"] >= 0
     for name in ("room", "area"):
         of_cell[name] = spread_labels(floor, of_cell[name], round(DOORWAY_REACH / grid.edge)).astype(np.int32)
     of_rooms = (of_cell["room"] >= 0) & (in_a_room | of_cell["standing"].astype(bool))
     of_cell = {name: values[of_rooms] for name, values in of_cell.items()}
-    floor = grid.with_cells(floor.cells[of_rooms], {"standing": of_cell["standing"].astype(bool)})
-    storeys["area"] = np.bincount(of_cell["storey"][lowest_of_column(floor)], minlength=len(storeys)) * floor.edge**2
+    floor = grid.replace_cells(floor.cells[of_rooms], {"standing": of_cell["standing"].astype(bool)})
+    storeys["area"] = np.bincount(of_cell["storey"][select_lowest_of_column(floor)], minlength=len(storeys)) * floor.edge**2
     # What has no room of its own is no storey: the upper side of a ceiling, or stray cells that a room below reaches.
     used = np.bincount(of_cell["storey"][in_a_room[of_rooms]], minlength=len(storeys)) > 0
     of_cell["storey"] = np.maximum(np.cumsum(used) - 1, 0)[of_cell["storey"]].astype(np.int32)

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from topomerge.kernels.profile import lowest_bit
+from topomerge.kernels.rasters import find_lowest_bit
 from topomerge.types import Array, VoxelGrid
 
 # A storey seen from above: the one type for it, and the one rule for which of its columns are walls (beyond the thesis).
@@ -33,7 +33,7 @@ class HeightBands:
     below: int
     count: int
 
-    def mask(self, low: float, high: float) -> int:
+    def build_mask(self, low: float, high: float) -> int:
         """Bits of the bands from `low` up to, not including, `high` m; of one at least, where any is as high."""
         first = min(max(round(low / self.step) + self.below, 0), self.count)
         last = min(max(round(high / self.step) + self.below, first + 1), self.count)
@@ -78,7 +78,7 @@ class StoreyPlan:
     @cached_property
     def standing(self) -> Array:
         """(nx, ny) bool: something is at the height of a body."""
-        return self.occupied(*BODY_HEIGHTS)
+        return self.is_occupied(*BODY_HEIGHTS)
 
     @cached_property
     def clutter(self) -> Array:
@@ -98,7 +98,7 @@ class StoreyPlan:
     @cached_property
     def clear(self) -> Array:
         """(nx, ny) float64 m above the local floor, lower side of the first thing above 1.9 m; nan where nothing was seen."""
-        return first_above(self.profile, self.bands)
+        return find_first_above(self.profile, self.bands)
 
     @cached_property
     def floor_height(self) -> Array:
@@ -116,13 +116,13 @@ class StoreyPlan:
         floor, ceiling = self.levels
         return floor if np.isfinite(floor) else ceiling - USUAL_HEIGHT
 
-    def occupied(self, low: float, high: float) -> Array:
-        """(nx, ny) bool: is anything between two heights above the floor, m?"""
-        out: Array = (self.profile & self.profile.dtype.type(self.bands.mask(low, high))) != 0
+    def is_occupied(self, low: float, high: float) -> Array:
+        """Return (nx, ny) bool: is anything between two heights above the floor, m?"""
+        out: Array = (self.profile & self.profile.dtype.type(self.bands.build_mask(low, high))) != 0
         return out
 
-    def points(self, mask: Array) -> Array:
-        """(n, 2) float64 middles of masked columns, m."""
+    def compute_points(self, mask: Array) -> Array:
+        """Return (n, 2) float64 middles of masked columns, m."""
         return self.origin + (np.argwhere(mask) + 0.5) * self.edge
 
 
@@ -142,44 +142,44 @@ class WallRule:
     neighbours: int = 4
     least_bands: int = 1
 
-    def least_of(self, observed: int) -> int:
-        """How many of the observed bands a wall fills."""
+    def count_least_bands(self, observed: int) -> int:
+        """Count how many of the observed bands a wall fills."""
         return max(int(np.ceil(self.share * observed - 1e-6)), 1)
 
 
 WALL_RULE = WallRule()  # of the plans that poses are judged by
 
 
-def first_above(profile: Array, bands: HeightBands, height: float = UPRIGHT) -> Array:
+def find_first_above(profile: Array, bands: HeightBands, height: float = UPRIGHT) -> Array:
     """(nx, ny) float64 m above the local floor, lower side of the first thing above a height; nan where there is none."""
-    bit = lowest_bit(profile.ravel(), round(height / bands.step) + bands.below).reshape(profile.shape)
+    bit = find_lowest_bit(profile.ravel(), round(height / bands.step) + bands.below).reshape(profile.shape)
     return np.where(bit >= 0, (bit - bands.below) * bands.step, np.nan)
 
 
-def band_stack(profile: Array, bands: HeightBands, heights: Array = WALL_HEIGHTS) -> Array:
-    """(B, nx, ny) bool: is anything between each two of B + 1 heights, m, of a profile (nx, ny)?"""
-    masks = [profile.dtype.type(bands.mask(low, high)) for low, high in pairwise(heights)]
+def build_band_stack(profile: Array, bands: HeightBands, heights: Array = WALL_HEIGHTS) -> Array:
+    """Return (B, nx, ny) bool: is anything between each two of B + 1 heights, m, of a profile (nx, ny)?"""
+    masks = [profile.dtype.type(bands.build_mask(low, high)) for low, high in pairwise(heights)]
     return np.stack([(profile & mask) != 0 for mask in masks])
 
 
-def observed_bands(filled: Array) -> Array:
-    """(B,) bool: does a band (B, nx, ny) hold enough to say that the map looked there?"""
+def is_observed_band(filled: Array) -> Array:
+    """Return (B,) bool: does a band (B, nx, ny) hold enough to say that the map looked there?"""
     count = filled.sum(axis=(1, 2))
     return np.asarray(count >= OBSERVED_SHARE * max(int(count.max()), 1)) & (count.max() > 0)
 
 
-def wall_columns(filled: Array, rule: WallRule) -> Array:
-    """(nx, ny) bool: which columns are walls, by the observed bands of heights (B, nx, ny) that they fill."""
+def detect_wall_columns(filled: Array, rule: WallRule) -> Array:
+    """Return (nx, ny) bool: which columns are walls, by the observed bands of heights (B, nx, ny) that they fill."""
     if len(filled) < rule.least_bands:
         return np.zeros(filled.shape[1:], bool)
-    need = rule.least_of(len(filled))
+    need = rule.count_least_bands(len(filled))
     nearly = max(need - rule.lacking, -(-need // 2))
     own = filled.sum(axis=0)
-    around = _spread(filled, rule.neighbours).sum(axis=0)
+    around = _spread_bands(filled, rule.neighbours).sum(axis=0)
     return np.asarray((own >= need) | ((own >= nearly) & (around > need)))
 
 
-def _spread(filled: Array, neighbours: int) -> Array:
+def _spread_bands(filled: Array, neighbours: int) -> Array:
     """Bands that each column or any neighbour fills: a noisy wall is spread over columns."""
     out = filled.copy()
     out[:, 1:] |= filled[:, :-1]
@@ -222,11 +222,11 @@ class ClassifiedStorey:
     height: float
 
 
-def leads_through_wall(storeys: Sequence[ClassifiedStorey], centre: Array) -> bool:
+def is_through_wall(storeys: Sequence[ClassifiedStorey], centre: Array) -> bool:
     """Does a passage at `centre` (3,) m lead through a wall: none of its columns is of a door, and some are of a wall?"""
     if not storeys:
         return False
-    near = _around(_nearest(storeys, centre), centre, PASSAGE_REACH)
+    near = _crop_around(_find_nearest_storey(storeys, centre), centre, PASSAGE_REACH)
     if not near.size:
         return False
     return bool(
@@ -234,23 +234,23 @@ def leads_through_wall(storeys: Sequence[ClassifiedStorey], centre: Array) -> bo
     )
 
 
-def plan_signs(storeys: Sequence[ClassifiedStorey], centres: Array) -> Array:
-    """(n, 4) `PLAN_SIGNS` at passages (n, 3) m; zeros where no plan is."""
+def compute_plan_features(storeys: Sequence[ClassifiedStorey], centres: Array) -> Array:
+    """Return (n, 4) `PLAN_SIGNS` at passages (n, 3) m; zeros where no plan is."""
     signs = np.zeros((len(centres), len(PLAN_SIGNS)))
     for row, centre in zip(signs, centres if storeys else (), strict=False):
-        storey = _nearest(storeys, centre)
-        near, wider = (_around(storey, centre, reach) for reach in (PASSAGE_REACH, SIGNS_REACH))
+        storey = _find_nearest_storey(storeys, centre)
+        near, wider = (_crop_around(storey, centre, reach) for reach in (PASSAGE_REACH, SIGNS_REACH))
         if near.size:
             doorway = near[..., DOORWAY_CLASS]
             row[:] = doorway.mean(), doorway.max(), wider[..., WALL_CLASS].mean(), wider[..., SHUT_CLASS].max()
     return signs
 
 
-def _nearest(storeys: Sequence[ClassifiedStorey], centre: Array) -> ClassifiedStorey:
+def _find_nearest_storey(storeys: Sequence[ClassifiedStorey], centre: Array) -> ClassifiedStorey:
     return min(storeys, key=lambda s: abs(s.height - float(centre[2])))
 
 
-def _around(storey: ClassifiedStorey, centre: Array, reach: float) -> Array:
+def _crop_around(storey: ClassifiedStorey, centre: Array, reach: float) -> Array:
     """(a, b, 5) of the columns at most `reach` m from a place, along each axis."""
     columns = max(int(reach / storey.edge), 1)
     low = np.floor((np.asarray(centre)[:2] - storey.origin) / storey.edge).astype(np.int64) - columns

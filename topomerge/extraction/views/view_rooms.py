@@ -12,15 +12,15 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
-from topomerge.extraction.convolution import Kernel, convolve, moore, sphere
-from topomerge.extraction.morphology import connected_components, horizontal_distance_field, spread_labels
+from topomerge.extraction.convolution import Kernel, build_moore, build_sphere, convolve
+from topomerge.extraction.morphology import compute_horizontal_distance_field, label_components, spread_labels
 from topomerge.extraction.parameters import ThesisParameters
 from topomerge.extraction.plans.storey_plan import Floor
 from topomerge.extraction.stopwatch import Stopwatch
-from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
-from topomerge.extraction.views.visibility import SparseVoxelOctree, Visibility, visible_cells
-from topomerge.kernels import mcl as kernel
-from topomerge.kernels import sets
+from topomerge.extraction.storeys import find_storeys, measure_floor_to_ceiling
+from topomerge.extraction.views.visibility import SparseVoxelOctree, Visibility, find_visible_cells
+from topomerge.kernels import graphs
+from topomerge.kernels import graphs as kernel
 from topomerge.types import Array, VoxelGrid
 
 # Where to look from: local maxima of the horizontal distance field, raised to eye height (seeds 2.4).
@@ -28,19 +28,19 @@ from topomerge.types import Array, VoxelGrid
 CELLS_AT_ONCE = 8192  # whose neighbours are held at a time: some hundred each
 
 
-def optimal_views(navigable: VoxelGrid, radius: float, height: float) -> Array:
-    """(V, 3) positions, m, from which the map is seen best (seeds 2.4).
+def select_optimal_views(navigable: VoxelGrid, radius: float, height: float) -> Array:
+    """Return (V, 3) positions, m, from which the map is seen best (seeds 2.4).
 
     Args:
         navigable: the navigable volume.
         radius: m; larger ones give fewer views.
         height: m above the floor.
     """
-    distance = horizontal_distance_field(navigable)
-    return raise_views(navigable, navigable.cells[local_maxima(navigable, distance, radius)], height)
+    distance = compute_horizontal_distance_field(navigable)
+    return raise_views(navigable, navigable.cells[find_local_maxima(navigable, distance, radius)], height)
 
 
-def local_maxima(grid: VoxelGrid, distance: Array, radius: float) -> Array:
+def find_local_maxima(grid: VoxelGrid, distance: Array, radius: float) -> Array:
     """Ascending rows of cells whose distance is not below that of any cell within `radius` m (seeds 2.4.1, HDF_max).
 
     The octree answers radius(v, r) (seeds 2.2.1).
@@ -49,14 +49,14 @@ def local_maxima(grid: VoxelGrid, distance: Array, radius: float) -> Array:
     highest = np.empty(len(grid), np.asarray(distance).dtype)
     for begin in range(0, len(grid), CELLS_AT_ONCE):
         block = slice(begin, begin + CELLS_AT_ONCE)
-        indptr, rows = octree.radius_many(grid.cells[block], radius)
+        indptr, rows = octree.find_in_radius_many(grid.cells[block], radius)
         highest[block] = np.maximum.reduceat(distance[rows], indptr[:-1])  # a cell is near itself: none is without neighbours
     return np.flatnonzero(distance >= highest)
 
 
 def raise_views(navigable: VoxelGrid, cells: Array, height: float) -> Array:
     """(v, 3) float64 centroids of (v, 3) cells raised by `height` m: out of the floor, to where one looks from (seeds 2.4.1)."""
-    views = navigable.centroids(cells)
+    views = navigable.compute_centroids(cells)
     views[:, 2] += height
     return views
 
@@ -64,14 +64,14 @@ def raise_views(navigable: VoxelGrid, cells: Array, height: float) -> Array:
 # How alike two views' visibilities are: the Jaccard index (seeds 2.6).
 
 
-def jaccard_similarity(
+def compute_jaccard_similarity(
     visibility: Visibility,
     threshold: float = 0.0,
     views: Array | None = None,
     reach: float | None = None,
     heights: Array | None = None,
 ) -> sparse.csr_array:
-    """(V, V) symmetric matrix of |A and B| / |A or B| of the seen sets, 1 on the diagonal (seeds 2.6).
+    """Return (V, V) symmetric matrix of |A and B| / |A or B| of the seen sets, 1 on the diagonal (seeds 2.6).
 
     Args:
         threshold: smaller similarities are left out (0).
@@ -79,7 +79,7 @@ def jaccard_similarity(
         reach: twice the range of the visibility: views farther apart can't see the same cell.
         heights: (n,) integer height of each cell; views that see other heights, as on two storeys, need no comparison.
     """
-    sizes = visibility.sizes()
+    sizes = visibility.count_cells()
     if views is not None and reach is not None:
         pairs = cKDTree(views).query_pairs(reach, output_type="ndarray")
         first, second = pairs[:, 0].astype(np.int64), pairs[:, 1].astype(np.int64)
@@ -89,10 +89,10 @@ def jaccard_similarity(
     smaller, larger = np.minimum(sizes[first], sizes[second]), np.maximum(sizes[first], sizes[second])
     possible = (smaller > 0) & (smaller >= threshold * larger)
     if heights is not None:
-        low, high = sets.extents(visibility.indptr, visibility.words, visibility.masks, heights).T
+        low, high = graphs.compute_extents(visibility.indptr, visibility.words, visibility.masks, heights).T
         possible &= (low[first] <= high[second]) & (low[second] <= high[first])
     first, second = first[possible], second[possible]
-    both = sets.intersections(visibility.indptr, visibility.words, visibility.masks, first, second)
+    both = graphs.count_intersections(visibility.indptr, visibility.words, visibility.masks, first, second)
     value = both / (sizes[first] + sizes[second] - both)
     similar = (value >= threshold) & (both > 0)
     first, second, value = first[similar], second[similar], value[similar]
@@ -105,7 +105,7 @@ def jaccard_similarity(
 # Clusters of similar views: the Markov cluster algorithm, its inflation chosen by modularity (seeds 2.6; van Dongen 2000).
 
 
-def markov_clusters(
+def cluster_markov(
     similarity: sparse.csr_array, inflation: float, threshold: float = 1e-4, most: int = 64, rounds: int = 100
 ) -> Array:
     """Cluster of each node of a weighted graph.
@@ -137,15 +137,15 @@ def markov_clusters(
     indptr, indices = flow.indptr.astype(np.int64), flow.indices.astype(np.int32)
     values = flow.data / np.repeat(sums, np.diff(indptr))
     for _ in range(rounds):
-        indptr, indices, values, chaos = kernel.step(indptr, indices, values, inflation, threshold, most)
+        indptr, indices, values, chaos = kernel.run_mcl_step(indptr, indices, values, inflation, threshold, most)
         if chaos < 1e-6:
             break
     n = similarity.shape[0]
     settled = sparse.csc_array((values > 1e-3, indices, indptr), shape=(n, n))
-    return _by_first(csgraph.connected_components(settled, directed=False)[1])
+    return _renumber_by_first(csgraph.connected_components(settled, directed=False)[1])
 
 
-def modularity(similarity: sparse.csr_array, cluster: Array) -> float:
+def compute_modularity(similarity: sparse.csr_array, cluster: Array) -> float:
     """Share of the weight inside clusters beyond what random edges would put there (Newman 2004); self loops left out."""
     graph = sparse.coo_array(similarity)
     off = graph.row != graph.col
@@ -168,13 +168,13 @@ def cluster_views(similarity: sparse.csr_array, inflations: Sequence[float]) -> 
     if not similarity.shape[0]:
         return np.zeros(0, np.int64), float(inflations[0])
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:  # the compiled step lets go of the interpreter
-        clusters = list(pool.map(lambda inflation: markov_clusters(similarity, inflation), inflations))
-    quality = np.round([modularity(similarity, cluster) for cluster in clusters], 9)
+        clusters = list(pool.map(lambda inflation: cluster_markov(similarity, inflation), inflations))
+    quality = np.round([compute_modularity(similarity, cluster) for cluster in clusters], 9)
     best = int(np.argmax(quality))
     return clusters[best], float(inflations[best])
 
 
-def _by_first(labels: Array) -> Array:
+def _renumber_by_first(labels: Array) -> Array:
     """Labels numbered in the order in which they first occur."""
     _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int64)
@@ -189,7 +189,7 @@ def vote(visibility: Visibility, cluster: Array) -> Array:
     """(n,) int32: for each cell the cluster of which the most views see it; of equals the smallest number, -1 if none does."""
     winner = np.full(visibility.cells, -1, np.int32)
     order = np.argsort(cluster, kind="stable")
-    sets.most_votes(visibility.indptr, visibility.words, visibility.masks, order, np.asarray(cluster, np.int64), winner)
+    graphs.find_most_voted(visibility.indptr, visibility.words, visibility.masks, order, np.asarray(cluster, np.int64), winner)
     return winner
 
 
@@ -230,7 +230,7 @@ def split_rooms(grid: VoxelGrid, labels: Array, least_volume: float) -> Array:
     Returns:
         (n,) int32, numbered from 0 in Morton order, -1 for none.
     """
-    piece = connected_components(grid, moore(), labels)
+    piece = label_components(grid, build_moore(), labels)
     size = np.bincount(piece[piece >= 0])
     large = size * grid.edge**3 >= least_volume - 1e-9
     number = np.where(large, np.cumsum(large) - 1, -1)
@@ -241,8 +241,8 @@ def split_rooms(grid: VoxelGrid, labels: Array, least_volume: float) -> Array:
 # Rooms on the floor: which room the navigable cells belong to (seeds 2.7).
 
 
-def navigable_floor(grid: VoxelGrid, room: Array, navigable: VoxelGrid, body_height: float, body_width: float) -> Floor:
-    """The navigable volume as the floor of rooms that are sets of occupied cells (seeds 2.7).
+def build_navigable_floor(grid: VoxelGrid, room: Array, navigable: VoxelGrid, body_height: float, body_width: float) -> Floor:
+    """Return the navigable volume as the floor of rooms that are sets of occupied cells (seeds 2.7).
 
     A navigable cell has the room of the occupied cell in its place, otherwise that of the nearest navigable cell.
 
@@ -250,10 +250,10 @@ def navigable_floor(grid: VoxelGrid, room: Array, navigable: VoxelGrid, body_hei
         room: (n,) room of each occupied cell.
         body_height, body_width: of the body that the navigable volume was made for, m.
     """
-    row = grid.rows(navigable.cells)
+    row = grid.find_rows(navigable.cells)
     label = np.where(row >= 0, room[np.maximum(row, 0)], -1)
     label = spread_labels(navigable, label).astype(np.int32)
-    storeys, storey = find_storeys(navigable, floor_to_ceiling(grid, navigable, body_height))
+    storeys, storey = find_storeys(navigable, measure_floor_to_ceiling(grid, navigable, body_height))
     none = np.full(len(navigable), -1, np.int32)
     return Floor(navigable, storeys, storey, label, none, np.zeros(0, np.int32), room, body_width)
 
@@ -261,8 +261,8 @@ def navigable_floor(grid: VoxelGrid, room: Array, navigable: VoxelGrid, body_hei
 # Rooms of views: clusters of views that see the same cells (seeds 2.4 to 2.6).
 
 
-def rooms_of_views(grid: VoxelGrid, navigable: VoxelGrid, p: ThesisParameters, watch: Stopwatch) -> Floor:
-    """The floor cut into rooms as the thesis does; the inflation that it chose is among the floor's parameters.
+def segment_views(grid: VoxelGrid, navigable: VoxelGrid, p: ThesisParameters, watch: Stopwatch) -> Floor:
+    """Cut the floor into rooms as the thesis does; the chosen inflation is among the floor's parameters.
 
     Args:
         grid: occupied cells.
@@ -271,16 +271,16 @@ def rooms_of_views(grid: VoxelGrid, navigable: VoxelGrid, p: ThesisParameters, w
         watch: measures each step.
     """
     watch.begin("views", 0.4)
-    views = optimal_views(navigable, p.view_radius, p.view_height)  # 2.4
+    views = select_optimal_views(navigable, p.view_radius, p.view_height)  # 2.4
     watch.begin("visibility", 0.45)
-    visibility = visible_cells(grid, views, p.range, watch.part(0.45, 0.65))  # 2.5
+    visibility = find_visible_cells(grid, views, p.range, watch.build_part_progress(0.45, 0.65))  # 2.5
     watch.begin("similarity", 0.65)
-    similarity = jaccard_similarity(visibility, p.least_similarity, views, 2 * p.range, grid.cells[:, 2])  # 2.6
+    similarity = compute_jaccard_similarity(visibility, p.least_similarity, views, 2 * p.range, grid.cells[:, 2])  # 2.6
     watch.begin("clusters", 0.75)
     cluster, inflation = cluster_views(similarity, p.inflations)
     watch.begin("rooms", 0.85)
     labels = vote(visibility, cluster)
-    labels = propagate_labels(grid, labels, sphere(p.propagation_cells, 1.0), p.propagation_rounds)
+    labels = propagate_labels(grid, labels, build_sphere(p.propagation_cells, 1.0), p.propagation_rounds)
     room = split_rooms(grid, labels, p.least_volume)
-    floor = navigable_floor(grid, room, navigable, p.standing_height, p.body_width)
+    floor = build_navigable_floor(grid, room, navigable, p.standing_height, p.body_width)
     return replace(floor, chosen_parameters={"inflation": inflation})

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import sparse
 
-from topomerge.kernels import morton, octree, raycast
+from topomerge.kernels import octree, rays, voxels
 from topomerge.types import Array, VoxelGrid
 
 # Sparse voxel octree: range, radius and level-of-detail queries on a voxel grid (seeds 2.2.1).
@@ -38,28 +38,28 @@ class SparseVoxelOctree:
         """Levels above the leaves; the last one holds only the root. 0 for an empty grid."""
         return len(self._nodes.first) - 1
 
-    def codes(self, level: int) -> Array:
+    def compute_codes(self, level: int) -> Array:
         """(m,) uint64 Morton codes of a level's octants, 0 <= level <= depth: a parent's is a child's without its 3 low bits."""
         if not 0 <= level <= self.depth:
             raise ValueError(f"the octree has levels 0..{self.depth}, not {level}")
         first = self._nodes.first
         return self._nodes.codes[first[level - 1] : first[level]] if level else self.grid.codes
 
-    def range(self, low: Array, high: Array) -> Array:
-        """(m,) int64 rows of the cells of a box, low <= cell < high along each axis; both (3,) integers."""
+    def find_in_box(self, low: Array, high: Array) -> Array:
+        """Return (m,) int64 rows of the cells of a box, low <= cell < high along each axis; both (3,) integers."""
         low, high = np.asarray(low, np.int64), np.asarray(high, np.int64)
         if low.shape != (3,) or high.shape != (3,):
             raise ValueError(f"a box needs two cells (3,), not {low.shape} and {high.shape}")
-        return octree.in_box(self.grid.cells, self._nodes, low, high)
+        return octree.find_in_box(self.grid.cells, self._nodes, low, high)
 
-    def radius(self, centre: Array, r: float) -> Array:
-        """(m,) int64 rows of the cells whose centroids lie within r m of a centre (see `radius_many`)."""
+    def find_in_radius(self, centre: Array, r: float) -> Array:
+        """Return (m,) int64 rows of the cells whose centroids lie within r m of a centre (see `radius_many`)."""
         centre = np.asarray(centre)
         if centre.shape != (3,):
             raise ValueError(f"a centre must be (3,), not {centre.shape}")
-        return self.radius_many(centre[None], r)[1]
+        return self.find_in_radius_many(centre[None], r)[1]
 
-    def radius_many(self, centres: Array, r: float) -> tuple[Array, Array]:
+    def find_in_radius_many(self, centres: Array, r: float) -> tuple[Array, Array]:
         """Radius queries around many centres at once, on all cores; up to 64 stay on the core that asks.
 
         Args:
@@ -81,15 +81,15 @@ class SparseVoxelOctree:
         if not np.issubdtype(centres.dtype, np.integer):
             centres = (centres.astype(np.float64) - self.grid.origin) / self.grid.edge - 0.5
         in_cells, table = np.ascontiguousarray(centres, np.float64), self.grid._bricks[0]
-        return octree.in_balls(self.grid.cells, self._nodes, table, in_cells, r / self.grid.edge + RADIUS_SLACK)
+        return octree.find_in_balls(self.grid.cells, self._nodes, table, in_cells, r / self.grid.edge + RADIUS_SLACK)
 
-    def level_of_detail(self, k: int) -> VoxelGrid:
+    def build_level_of_detail(self, k: int) -> VoxelGrid:
         """The grid k levels up, edge * 2**k, with the property ``count``: occupied cells in each octant; k in 0..21.
 
         Above the root, of which there is but one, the octants grow until they hold the whole volume.
         """
-        if not 0 <= k <= morton.BITS:
-            raise ValueError(f"a level of detail must lie in 0..{morton.BITS}, not {k}")
+        if not 0 <= k <= voxels.BITS:
+            raise ValueError(f"a level of detail must lie in 0..{voxels.BITS}, not {k}")
         if k == 0 or not len(self.grid):
             codes, count = self.grid.codes, np.ones(len(self.grid), np.int64)
         elif k < self.depth:
@@ -98,7 +98,7 @@ class SparseVoxelOctree:
         else:
             codes, count = self.grid.codes[:1] >> np.uint64(3 * k), np.array([len(self.grid)])
         x, y, z = (-(-s >> k) for s in self.grid.shape)
-        cells = morton.decode(codes)
+        cells = voxels.decode(codes)
         return VoxelGrid(cells, self.grid.origin, self.grid.edge * 2**k, (x, y, z), {"count": count})
 
 
@@ -123,27 +123,27 @@ class Visibility:
     def __len__(self) -> int:
         return len(self.indptr) - 1
 
-    def rows(self, view: int) -> Array:
-        """Ascending rows of the cells that one view sees."""
+    def get_rows(self, view: int) -> Array:
+        """Return ascending rows of the cells that one view sees."""
         part = slice(self.indptr[view], self.indptr[view + 1])
         bits = np.unpackbits(self.masks[part].astype("<u8").view(np.uint8).reshape(-1, 8), axis=1, bitorder="little")
         word, bit = np.nonzero(bits)
         return self.words[part][word].astype(np.int64) * 64 + bit
 
-    def sizes(self) -> Array:
-        """(V,) int64 number of cells that each view sees."""
+    def count_cells(self) -> Array:
+        """Return (V,) int64 number of cells that each view sees."""
         running = np.concatenate([[0], np.cumsum(np.bitwise_count(self.masks), dtype=np.int64)])
         return np.diff(running[self.indptr])
 
-    def matrix(self) -> sparse.csr_array:
-        """(V, n) sparse matrix of ones where a view sees a cell."""
-        rows = [self.rows(v) for v in range(len(self))]
+    def build_matrix(self) -> sparse.csr_array:
+        """Return (V, n) sparse matrix of ones where a view sees a cell."""
+        rows = [self.get_rows(v) for v in range(len(self))]
         indptr = np.concatenate([[0], np.cumsum([len(r) for r in rows])])
         indices = np.concatenate(rows) if rows else np.zeros(0, np.int64)
         return sparse.csr_array((np.ones(len(indices), np.int64), indices, indptr), shape=(len(self), self.cells))
 
 
-def visible_cells(
+def find_visible_cells(
     grid: VoxelGrid, views: Array, radius: float, progress: Callable[[float, str], None] | None = None
 ) -> Visibility:
     """Cast a ray from every view to the centroid of every occupied cell within `radius` m (seeds 2.5).
@@ -171,7 +171,7 @@ def visible_cells(
             done += len(group)
             if progress is not None:
                 progress(done / len(views), "visibility")
-    return _joined(parts, len(views), len(grid))
+    return _join_tiles(parts, len(views), len(grid))
 
 
 def _cast_tile(octree: SparseVoxelOctree, views: Array, radius: float) -> tuple[Array, Array, Array]:
@@ -181,19 +181,19 @@ def _cast_tile(octree: SparseVoxelOctree, views: Array, radius: float) -> tuple[
     margin = int(np.ceil(reach)) + 1
     view_cells = np.floor(at).astype(np.int64)
     low, high = view_cells.min(axis=0) - margin, view_cells.max(axis=0) + margin + 1
-    window = grid.cells[octree.range(low, high)]
+    window = grid.cells[octree.find_in_box(low, high)]
     if len(window):  # it need not be higher or wider than what is in it
         low = np.maximum(low, np.minimum(window.min(axis=0), view_cells.min(axis=0)))
         high = np.minimum(high, np.maximum(window.max(axis=0), view_cells.max(axis=0)) + 1)
-    field = raycast.distance_field(window, low, (int(high[0] - low[0]), int(high[1] - low[1]), int(high[2] - low[2])))
+    field = rays.compute_distance_field(window, low, (int(high[0] - low[0]), int(high[1] - low[1]), int(high[2] - low[2])))
     counts, words, masks = [], [], []
     for begin in range(0, len(at), VIEWS_AT_ONCE):
         block = slice(begin, begin + VIEWS_AT_ONCE)
-        near, rows = octree.radius_many(views[block], radius)
-        room = raycast.words_of(near, rows)
+        near, rows = octree.find_in_radius_many(views[block], radius)
+        room = rays.count_words(near, rows)
         indptr = np.concatenate([[0], np.cumsum(room)])
         word, mask = np.empty(indptr[-1], np.int32), np.empty(indptr[-1], np.uint64)
-        count = raycast.cast(field, low, at[block], reach, grid.cells, near, rows, indptr, word, mask)
+        count = rays.cast(field, low, at[block], reach, grid.cells, near, rows, indptr, word, mask)
         used = np.arange(indptr[-1]) < np.repeat(indptr[:-1] + count, room)
         counts.append(count)
         words.append(word[used])
@@ -201,7 +201,7 @@ def _cast_tile(octree: SparseVoxelOctree, views: Array, radius: float) -> tuple[
     return np.concatenate(counts), np.concatenate(words), np.concatenate(masks)
 
 
-def _joined(parts: list[tuple[Array, Array, Array, Array]], views: int, cells: int) -> Visibility:
+def _join_tiles(parts: list[tuple[Array, Array, Array, Array]], views: int, cells: int) -> Visibility:
     """Tiles' results in the order of the views."""
     counts = np.zeros(views, np.int64)
     for group, count, _, _ in parts:

@@ -7,7 +7,7 @@ votes that its rooms got: it says where to look first, not whether the place is 
 The first `LAID_COARSELY` are ordered by how well their walls fit: rooms of small maps look like those of many others.
 
 Of an atlas of more than `SHORTLIST` maps only so many are compared that closely: those for which the nearest neighbours of the
-new map's rooms speak, by exact search or an index (`rooms_index`).
+new map's rooms speak, by exact search or an index (`prepare_rooms_index`).
 """
 
 from __future__ import annotations
@@ -18,15 +18,22 @@ from pathlib import Path
 
 import numpy as np
 
-from topomerge.embedding.embedders import DEFAULT
-from topomerge.embedding.embedders import embedder as make_embedder
-from topomerge.embedding.turns import Rows, TurnedRows, moved_alike, way_between
+from topomerge.embedding.learned import DEFAULT
+from topomerge.embedding.learned import build_embedder as make_embedder
+from topomerge.embedding.quarter_turns import Rows, TurnedRows, estimate_relative_position, score_common_motion
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.folder import Stored, read_atlas
+from topomerge.fusion.atlas.folder import StoredAtlas, read_atlas
 from topomerge.fusion.atlas.maps import Maps
-from topomerge.fusion.atlas.partners import VOTE_SHARPNESS, coarse_log_odds, nearest, owners, queries, votes
-from topomerge.fusion.atlas.rooms_index import RoomRows, embedder_signature, rooms_index
-from topomerge.matching.match import checked
+from topomerge.fusion.atlas.partners import (
+    VOTE_SHARPNESS,
+    compute_coarse_log_odds,
+    compute_queries,
+    count_votes,
+    find_nearest,
+    list_owners,
+)
+from topomerge.fusion.atlas.rooms_index import RoomRows, compute_embedder_signature, prepare_rooms_index
+from topomerge.matching.match import embed_rooms
 from topomerge.types import Array, TopometricMap
 
 SHORTLIST = 50  # maps that are compared room by room
@@ -54,7 +61,7 @@ class Sighting:
 
 
 def find(folder: str | Path, map: TopometricMap, number: int = 5) -> tuple[Sighting, ...]:
-    """The maps of an atlas that a new one most likely shows, best first.
+    """Return the maps of an atlas that a new one most likely shows, best first.
 
     Args:
         number: of maps, at most.
@@ -75,53 +82,55 @@ def find(folder: str | Path, map: TopometricMap, number: int = 5) -> tuple[Sight
         raise InputError(f"{map.source or 'the map'}: no rooms in it, nothing can be looked for")
     embedder = str(stored.settings.get("embedder") or DEFAULT)
     describe = make_embedder(embedder)
-    new, signature = checked(describe, map), embedder_signature(embedder)
+    new, signature = embed_rooms(describe, map), compute_embedder_signature(embedder)
     rows = RoomRows(stored, describe, signature, new)
     maps = list(range(len(stored.entries)))
     if len(maps) > max(SHORTLIST, number):
-        maps = shortlist(_scores(stored, rows, signature, new), max(SHORTLIST, number))
-    sightings = ranked([stored.entries[k].name for k in maps], rows.of(maps), new, max(number, LAID_COARSELY))
-    return laid(stored, map, sightings)[:number]
+        maps = select_shortlist(_score_maps(stored, rows, signature, new), max(SHORTLIST, number))
+    sightings = rank_sightings([stored.entries[k].name for k in maps], rows.get_rows(maps), new, max(number, LAID_COARSELY))
+    return register_sightings(stored, map, sightings)[:number]
 
 
-def laid(stored: Stored, map: TopometricMap, sightings: Sequence[Sighting]) -> tuple[Sighting, ...]:
+def register_sightings(stored: StoredAtlas, map: TopometricMap, sightings: Sequence[Sighting]) -> tuple[Sighting, ...]:
     """The first of the sightings with how well the map fits there, in that order, then the others as they were."""
     files = {e.name: stored.folder / e.file for e in stored.entries}
     first = sightings[:LAID_COARSELY]
     both = Maps([map, *(files[s.name] for s in first)])
     scale = str(stored.settings.get("scale") or "fixed")
-    fitted = [replace(s, fit=coarse_log_odds(both, 0, k, scale)) for k, s in enumerate(first, 1)]
+    fitted = [replace(s, fit=compute_coarse_log_odds(both, 0, k, scale)) for k, s in enumerate(first, 1)]
     return *sorted(fitted, key=lambda s: -(s.fit or 0.0)), *sightings[LAID_COARSELY:]
 
 
-def _scores(stored: Stored, rows: RoomRows, signature: str, new: Rows) -> Array:
+def _score_maps(stored: StoredAtlas, rows: RoomRows, signature: str, new: Rows) -> Array:
     """Votes for each map of an atlas, of the neighbours of the new map's rooms."""
     counts = [e.rooms for e in stored.entries]
-    asked = queries(new)
+    asked = compute_queries(new)
     flat = asked.reshape(-1, asked.shape[2])
-    index = rooms_index(stored, rows, signature, asked.shape[2])
+    index = prepare_rooms_index(stored, rows, signature, asked.shape[2])
     if index is not None:
-        return votes(*index.nearest(flat), len(asked), index.owner, len(counts))
-    return votes(*nearest(rows.vectors(range(len(counts))), flat), len(asked), owners(counts), len(counts))
+        return count_votes(*index.find_nearest(flat), len(asked), index.owner, len(counts))
+    return count_votes(
+        *find_nearest(rows.compute_vectors(range(len(counts))), flat), len(asked), list_owners(counts), len(counts)
+    )
 
 
-def shortlist(scores: Array, number: int) -> list[int]:
-    """Maps with the most votes, as many as asked for, by their numbers."""
+def select_shortlist(scores: Array, number: int) -> list[int]:
+    """Return maps with the most votes, as many as asked for, by their numbers."""
     return sorted(np.argsort(-scores, kind="stable")[:number].tolist())
 
 
-def ranked(names: Sequence[str], rows: Sequence[Rows], new: Rows, number: int) -> tuple[Sighting, ...]:
+def rank_sightings(names: Sequence[str], rows: Sequence[Rows], new: Rows, number: int) -> tuple[Sighting, ...]:
     """`find` with rows of length 1 of each map and of the new one."""
-    both = [_alike(new, of) for of in rows]
+    both = [_compute_similarity(new, of) for of in rows]
     alike, weight = [cosine for cosine, _ in both], [np.exp(VOTE_SHARPNESS * (cosine - 1)) * there for cosine, there in both]
     total = np.maximum(np.sum([w.sum(axis=1) for w in weight], axis=0), 1e-300)
     sightings = []
     for name, w, cosine in zip(names, weight, alike, strict=True):
-        sightings.append(Sighting(name, float((w / total[:, None]).sum() / len(new)), _mutual(cosine)))
+        sightings.append(Sighting(name, float((w / total[:, None]).sum() / len(new)), _find_mutual_pairs(cosine)))
     return tuple(sorted(sightings, key=lambda s: -s.share)[:number])
 
 
-def _mutual(cosine: Array) -> tuple[tuple[int, int, float], ...]:
+def _find_mutual_pairs(cosine: Array) -> tuple[tuple[int, int, float], ...]:
     """Rooms (R_new, R) that are each other's most alike one, and how alike; most alike first."""
     if not cosine.size:
         return ()
@@ -130,16 +139,16 @@ def _mutual(cosine: Array) -> tuple[tuple[int, int, float], ...]:
     return tuple(sorted(pairs, key=lambda pair: -pair[2]))
 
 
-def _alike(new: Rows, rows: Rows) -> tuple[Array, Array]:
+def _compute_similarity(new: Rows, rows: Rows) -> tuple[Array, Array]:
     """(R_new, R) how alike rooms are, and by how much their vote counts: less where they are not moved as most are."""
     if not isinstance(new, TurnedRows) or not isinstance(rows, TurnedRows):
-        cosine = _units(np.asarray(new)) @ _units(np.asarray(rows)).T
+        cosine = _normalise_rows(np.asarray(new)) @ _normalise_rows(np.asarray(rows)).T
         return cosine, np.ones_like(cosine)
-    quarters, way = way_between(new, rows)
-    there = ELSEWHERE + (1 - ELSEWHERE) * moved_alike(new, rows, quarters, way)
-    return _units(new.flat()) @ _units(rows.flat(quarters)).T, there
+    quarters, way = estimate_relative_position(new, rows)
+    there = ELSEWHERE + (1 - ELSEWHERE) * score_common_motion(new, rows, quarters, way)
+    return _normalise_rows(new.flatten()) @ _normalise_rows(rows.flatten(quarters)).T, there
 
 
-def _units(rows: Array) -> Array:
+def _normalise_rows(rows: Array) -> Array:
     out: Array = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
     return out

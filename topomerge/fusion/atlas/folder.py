@@ -22,7 +22,7 @@ from filelock import FileLock, Timeout
 
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.solve import AtlasSettings
-from topomerge.types import Array, Sim3, between_maps, levelling_of
+from topomerge.types import Array, Sim3, convert_pose_to_maps, read_levelling
 
 NEW, NEXT, LOCK, GONE = ".new", ".next", ".lock", "gone.json"
 LOCK_POLL = 0.1  # s between two looks at a lock that another process holds
@@ -31,7 +31,7 @@ ATLAS_FORMAT = 1
 
 
 @contextmanager
-def changing(folder: Path, gone: list[str], patience: float | None = None) -> Iterator[Path]:
+def change_folder(folder: Path, gone: list[str], patience: float | None = None) -> Iterator[Path]:
     """Yield an empty folder for files that replace those of the same names if all goes well; on any error nothing changes.
 
     No other process changes the folder meanwhile: what is read of it within stays so.
@@ -47,7 +47,7 @@ def changing(folder: Path, gone: list[str], patience: float | None = None) -> It
     created = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with _locked(folder, patience):
+        with _lock_folder(folder, patience):
             try:
                 _finish(folder)
                 shutil.rmtree(folder / NEW, ignore_errors=True)
@@ -57,16 +57,16 @@ def changing(folder: Path, gone: list[str], patience: float | None = None) -> It
                 (folder / NEW).replace(folder / NEXT)
             except BaseException:
                 shutil.rmtree(folder / NEW, ignore_errors=True)
-                _leave_as_found(folder, created)
+                _restore_folder(folder, created)
                 raise
             _finish(folder)
     except OSError as error:
-        _leave_as_found(folder, created)
+        _restore_folder(folder, created)
         reason = error.strerror or error
         raise InputError(f"{folder}: can't be written ({reason}); make room there, or give another folder") from error
 
 
-def _leave_as_found(folder: Path, created: bool) -> None:
+def _restore_folder(folder: Path, created: bool) -> None:
     """Take away the lock of a folder that did not become an atlas, and the folder if it is new."""
     with suppress(OSError):  # what stays is in nobody's way
         if {p.name for p in folder.iterdir()} <= {LOCK}:
@@ -75,7 +75,7 @@ def _leave_as_found(folder: Path, created: bool) -> None:
                 folder.rmdir()
 
 
-def finished(folder: Path) -> None:
+def finish_change(folder: Path) -> None:
     """Finish a change that was interrupted after it began to count, if there is one.
 
     Raises:
@@ -83,13 +83,13 @@ def finished(folder: Path) -> None:
     """
     if (folder / NEXT).is_dir():
         try:
-            with _locked(folder, None):
+            with _lock_folder(folder, None):
                 _finish(folder)
         except OSError as error:
             raise InputError(f"{folder}: can't be locked ({error.strerror or error}); is it writable?") from error
 
 
-def _inside(folder: Path, name: str) -> Path:
+def _resolve_inside(folder: Path, name: str) -> Path:
     """A file of the atlas; an atlas of a stranger must not reach for files elsewhere, by its names or by links."""
     path = folder / name
     if not path.parent.resolve().is_relative_to(folder.resolve()):
@@ -106,18 +106,18 @@ def _finish(folder: Path) -> None:
         listed = source / GONE
         gone: Sequence[str] = json.loads(listed.read_text(encoding="utf-8")) if listed.exists() else []
         for path in sorted(p for p in source.rglob("*") if p.is_file() and p != listed):
-            target = _inside(folder, str(path.relative_to(source)))
+            target = _resolve_inside(folder, str(path.relative_to(source)))
             target.parent.mkdir(parents=True, exist_ok=True)
             path.replace(target)
         for name in gone:
-            _inside(folder, name).unlink(missing_ok=True)
+            _resolve_inside(folder, name).unlink(missing_ok=True)
         shutil.rmtree(source)
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise InputError(f"{folder}: a change that was interrupted can't be finished ({error}); is it writable?") from error
 
 
 @contextmanager
-def _locked(folder: Path, patience: float | None) -> Iterator[None]:
+def _lock_folder(folder: Path, patience: float | None) -> Iterator[None]:
     """One change at a time; the others wait."""
     lock, waits = FileLock(folder / LOCK, poll_interval=LOCK_POLL), False
     while not lock.is_locked:
@@ -137,7 +137,7 @@ def _locked(folder: Path, patience: float | None) -> Iterator[None]:
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """The same file under another name."""
+    """Give a file another name, by a link or as a copy."""
     try:
         os.link(source, target)
     except OSError:
@@ -149,10 +149,10 @@ class Entry:
     """A map of the atlas.
 
     Args:
-        key: hash of its content (`map_key`).
+        key: hash of its content (`hash_map`).
         source: the file that it came from.
         frame: its pose in the frame of the map that it replaced, for good.
-        levelling: (4, 4) that takes points of its file into its frame (`levelling_of`).
+        levelling: (4, 4) that takes points of its file into its frame (`read_levelling`).
     """
 
     name: str
@@ -170,7 +170,7 @@ class Entry:
 
 
 @dataclass(frozen=True, eq=False)
-class Stored:
+class StoredAtlas:
     """What atlas.json says.
 
     Args:
@@ -182,13 +182,13 @@ class Stored:
     settings: Mapping[str, Any] = field(default_factory=lambda: asdict(AtlasSettings()))
     listing: Mapping[str, Any] | None = None
 
-    def files(self) -> list[str]:
-        """All that belongs to the atlas but atlas.json."""
+    def list_files(self) -> list[str]:
+        """Return all that belongs to the atlas but atlas.json."""
         kinds, components = ("map", "ply", "page", "tiles"), (self.listing or {}).get("components", [])
         return [e.file for e in self.entries] + [name for component in components for name in files_of(component, kinds)]
 
-    def named(self, key: str) -> str | None:
-        """The name of the map with this content, None if there is none."""
+    def find_name(self, key: str) -> str | None:
+        """Return the name of the map with this content, None if there is none."""
         return next((e.name for e in self.entries if e.key == key), None)
 
     @property
@@ -197,8 +197,8 @@ class Stored:
         registered = (self.listing or {}).get("registered")
         return not isinstance(registered, dict) or registered.get("complete", True) is not False
 
-    def linked(self) -> list[tuple[int, int]]:
-        """Pairs of maps, by their numbers, that hold the components together.
+    def list_linked_pairs(self) -> list[tuple[int, int]]:
+        """Return pairs of maps, by their numbers, that hold the components together.
 
         Raises:
             InputError: atlas.json is damaged.
@@ -208,24 +208,24 @@ class Stored:
             if any(not 0 <= k < len(self.entries) for pair in pairs for k in pair):
                 raise IndexError(pairs)
         except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
-            raise self._damaged() from error
+            raise self._build_error() from error
         return pairs
 
-    def lying(self) -> dict[tuple[str, str], Sim3]:
+    def compute_relative_poses(self) -> dict[tuple[str, str], Sim3]:
         """T_ij of the pairs that hold the components together, as they lie now, by the keys of both maps.
 
         Raises:
             InputError: atlas.json is damaged.
         """
-        poses = self.poses()
-        pairs = ((self.entries[i], self.entries[j]) for i, j in self.linked())
+        poses = self.get_poses()
+        pairs = ((self.entries[i], self.entries[j]) for i, j in self.list_linked_pairs())
         there = ((a, b) for a, b in pairs if a.name in poses and b.name in poses)
         return {(a.key, b.key): poses[a.name][1].inverse() @ poses[b.name][1] for a, b in there}
 
-    def _damaged(self) -> InputError:
+    def _build_error(self) -> InputError:
         return InputError(f"{self.folder / 'atlas.json'}: damaged; make the atlas again from its maps")
 
-    def poses(self) -> dict[str, tuple[int, Sim3]]:
+    def get_poses(self) -> dict[str, tuple[int, Sim3]]:
         """Name of each map -> its component and its pose there.
 
         Raises:
@@ -239,15 +239,15 @@ class Stored:
                 into = self.entries[component["maps"][0]].levelling
                 for k in component["maps"]:
                     entry = self.entries[k]
-                    lying = between_maps(matrices[k], entry.levelling, into) if k in matrices else None
+                    lying = convert_pose_to_maps(matrices[k], entry.levelling, into) if k in matrices else None
                     out[entry.name] = (n, Sim3() if lying is None else Sim3.from_matrix(lying))
         except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
-            raise self._damaged() from error
+            raise self._build_error() from error
         return out
 
 
-def read_atlas(folder: str | Path) -> Stored:
-    """What an atlas holds; a change that was interrupted is finished first.
+def read_atlas(folder: str | Path) -> StoredAtlas:
+    """Read an atlas; a change that was interrupted is finished first.
 
     Raises:
         InputError: no such folder, no atlas, or damaged.
@@ -255,11 +255,11 @@ def read_atlas(folder: str | Path) -> Stored:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; make an atlas with `topomerge atlas add {folder} MAP ...`")
-    finished(folder)
+    finish_change(folder)
     return read_finished(folder)
 
 
-def read_finished(folder: Path) -> Stored:
+def read_finished(folder: Path) -> StoredAtlas:
     """As `read_atlas`, of a folder in which no change was interrupted.
 
     Raises:
@@ -277,8 +277,8 @@ def read_finished(folder: Path) -> Stored:
         settings = {name: listing["settings"].get(name, usual) for name, usual in asdict(AtlasSettings()).items()}
         if any(Path(e.file).parent != Path("maps") or not isinstance(e.key, str) for e in entries):
             raise ValueError("a map lies elsewhere")
-        stored = Stored(folder, entries, settings, listing)
-        if any(Path(name).is_absolute() or ".." in Path(name).parts for name in stored.files()):
+        stored = StoredAtlas(folder, entries, settings, listing)
+        if any(Path(name).is_absolute() or ".." in Path(name).parts for name in stored.list_files()):
             raise ValueError("a file lies elsewhere")
     except InputError:
         raise
@@ -290,7 +290,7 @@ def read_finished(folder: Path) -> Stored:
 
 def _entry(listed: Mapping[str, Any]) -> Entry:
     frame = Sim3.from_matrix(np.array(listed["frame"], np.float64)) if "frame" in listed else Sim3()
-    levelling = levelling_of(listed)
+    levelling = read_levelling(listed)
     return Entry(listed["name"], listed["key"], listed["source"], int(listed["rooms"]), int(listed["storeys"]), frame, levelling)
 
 
@@ -300,8 +300,8 @@ def files_of(component: Mapping[str, Any], kinds: Sequence[str]) -> list[str]:
     return [name for one in named for name in ([one] if isinstance(one, str) else one)]
 
 
-def check_folder(folder: str | Path) -> Stored:
-    """What an atlas holds, of a new one nothing.
+def read_folder(folder: str | Path) -> StoredAtlas:
+    """Read the atlas in a folder; a new one is empty.
 
     Raises:
         InputError: a file, or a folder with other things in it.
@@ -310,15 +310,15 @@ def check_folder(folder: str | Path) -> Stored:
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file; give the name of a folder")
     if folder.is_dir():
-        finished(folder)
-    return held_by(folder)
+        finish_change(folder)
+    return read_finished_folder(folder)
 
 
-def held_by(folder: Path) -> Stored:
-    """As `check_folder`, of a folder in which no change was interrupted.
+def read_finished_folder(folder: Path) -> StoredAtlas:
+    """Read the atlas in a folder in which no change was interrupted; a new one is empty.
 
     Raises:
         InputError: a folder with other things in it.
     """
     there = folder.is_dir() and any(not p.name.startswith(".") for p in folder.iterdir())
-    return read_finished(folder) if there else Stored(folder)
+    return read_finished(folder) if there else StoredAtlas(folder)

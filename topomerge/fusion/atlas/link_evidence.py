@@ -21,7 +21,7 @@ from itertools import product
 
 import numpy as np
 
-from topomerge.fusion.atlas.pairs import DRIFT_LIMITS, Check, Checks, alike, sum_places
+from topomerge.fusion.atlas.pairs import DRIFT_LIMITS, Check, Checks, is_same_pose, sum_places
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Array, Sim3
 
@@ -60,7 +60,7 @@ class Link:
         return float(1 / (1 + np.exp(-np.clip(self.log_odds, -30, 30))))
 
 
-def shares_of(hypotheses: Sequence[PoseHypothesis]) -> tuple[list[float], float]:
+def compute_shares(hypotheses: Sequence[PoseHypothesis]) -> tuple[list[float], float]:
     """Probabilities of ranked hypotheses of a pair and of none of them; they sum to 1, and the first one keeps its own."""
     best = float(np.clip(hypotheses[0].probability, LEAST_SHARE, 1 - LEAST_SHARE))
     others = sum(h.probability for h in hypotheses[1:])
@@ -70,13 +70,13 @@ def shares_of(hypotheses: Sequence[PoseHypothesis]) -> tuple[list[float], float]
     return shares, max(1 - sum(shares), (1 - best) * NOT_NAMED)
 
 
-def support_of(log_odds: float) -> float:
-    """What a registration that gives the same place says for a pose, by its own log odds; 0 to 3."""
+def compute_support(log_odds: float) -> float:
+    """Compute the support for a pose by a registration of the same place, from its own log odds; 0 to 3."""
     return float(np.clip(log_odds + PRIOR_SAME_PLACE, 0.0, 3.0))
 
 
-def across(a: Poses, b: Poses, pair: tuple[int, int], pose: Sim3) -> Sim3:
-    """Where component b lies in component a, if map j of the one lies at T_ij in map i of the other; in any order."""
+def place_component(a: Poses, b: Poses, pair: tuple[int, int], pose: Sim3) -> Sim3:
+    """Compute the pose of component b in component a if map j of b lies at T_ij in map i of a; in any order."""
     i, j = pair
     if i not in a:
         i, j, pose = j, i, pose.inverse()
@@ -120,7 +120,7 @@ class LinkEvidence:
         move: Sim3 | None = None,
         least: float = -np.inf,
     ) -> Link:
-        """A link between two components, with what all their maps show of it.
+        """Return a link between two components, with what all their maps show of it.
 
         Args:
             pair: i and j of the link, one in each component.
@@ -128,54 +128,54 @@ class LinkEvidence:
             move: where component b lies in a; by the hypothesis if None.
             least: log odds below which it does not matter how low they are.
         """
-        return _Weighing(self, a, b, pair, h, across(a, b, pair, h.transform) if move is None else move).link(least)
+        return _LinkScorer(self, a, b, pair, h, place_component(a, b, pair, h.transform) if move is None else move).score(least)
 
-    def greatest_log_odds(self, pair: tuple[int, int], h: PoseHypothesis) -> float:
+    def bound_log_odds(self, pair: tuple[int, int], h: PoseHypothesis) -> float:
         """Log odds of a hypothesis of a pair where everything else speaks for it and all its rivals are ruled out."""
-        shares, none = shares_of(self.hypotheses[pair])
+        shares, none = compute_shares(self.hypotheses[pair])
         named = next((s for s, other in zip(shares, self.hypotheses[pair], strict=True) if other is h), LEAST_SHARE)
         return float(np.log(named / none)) + CLOSING_GAIN
 
-    def agrees(self, i: int, j: int, p: Sim3, q: Sim3, limits: tuple[float, float, float] = DRIFT_LIMITS) -> bool:
+    def is_same_pose(self, i: int, j: int, p: Sim3, q: Sim3, limits: tuple[float, float, float] = DRIFT_LIMITS) -> bool:
         """Are two poses T_ij one, where the maps overlap?"""
-        return alike(p, q, self.checks.place(i, j, p).mean(axis=0), limits)
+        return is_same_pose(p, q, self.checks.locate_place(i, j, p).mean(axis=0), limits)
 
-    def source(self, i: int, j: int) -> Source:
-        """What the registration of maps i < j names; nothing where there is none."""
+    def get_source(self, i: int, j: int) -> Source:
+        """Return the placements that the registration of maps i < j names; none where there is none."""
         ranked = self.hypotheses.get((i, j), ())
         if not ranked:
             return Source((i, j), (), 1.0)
-        shares, none = shares_of(ranked)
+        shares, none = compute_shares(ranked)
         return Source((i, j), tuple((h.transform, share) for h, share in zip(ranked, shares, strict=True)), none)
 
-    def source_by_way_of(self, i: int, j: int, k: int) -> Source | None:
+    def get_composed_source(self, i: int, j: int, k: int) -> Source | None:
         """Placements of maps i < j by the registrations of both with map k: each pose of the one with each of the other."""
         of = tuple(self.hypotheses.get((min(m, k), max(m, k))) for m in (i, j))
         if (i, j, k) not in self._ways or any(p is not q for p, q in zip(self._ways[i, j, k][0], of, strict=True)):
-            self._ways[i, j, k] = (of[0], of[1]), self._composed(i, j, k)
+            self._ways[i, j, k] = (of[0], of[1]), self._compose_source(i, j, k)
         return self._ways[i, j, k][1]
 
-    def _composed(self, i: int, j: int, k: int) -> Source | None:
-        first, second = self._poses(i, k), self._poses(k, j)
+    def _compose_source(self, i: int, j: int, k: int) -> Source | None:
+        first, second = self._list_poses(i, k), self._list_poses(k, j)
         if not first or not second:
             return None
         merged: list[tuple[Sim3, float]] = []
         for (p, share), (q, other) in product(first, second):
             pose = p @ q
-            same = next((n for n, (named, _) in enumerate(merged) if self.agrees(i, j, named, pose)), None)
+            same = next((n for n, (named, _) in enumerate(merged) if self.is_same_pose(i, j, named, pose)), None)
             if same is None:
                 merged.append((pose, share * other))
             else:
                 merged[same] = (merged[same][0], merged[same][1] + share * other)
         return Source((i, j), tuple(merged), max(1 - sum(share for _, share in merged), LEAST_SHARE), direct=False)
 
-    def _poses(self, i: int, j: int) -> list[tuple[Sim3, float]]:
+    def _list_poses(self, i: int, j: int) -> list[tuple[Sim3, float]]:
         """T_ij of maps in any order, with their shares."""
-        named = self.source(min(i, j), max(i, j)).named
+        named = self.get_source(min(i, j), max(i, j)).named
         return [(pose if i < j else pose.inverse(), share) for pose, share in named]
 
 
-class _Weighing:
+class _LinkScorer:
     """One link while it is weighed."""
 
     def __init__(self, evidence: LinkEvidence, a: Poses, b: Poses, pair: tuple[int, int], h: PoseHypothesis, move: Sim3) -> None:
@@ -184,27 +184,27 @@ class _Weighing:
         self._poses: dict[tuple[tuple[int, int], Sim3], Sim3] = {}
         self._checks: dict[tuple[tuple[int, int], Sim3], Check] = {}
         self._shares: dict[Source, float | None] = {}  # of the placement of the link
-        self.sources = [evidence.source(min(i, j), max(i, j)) for i in a for j in b]
+        self.sources = [evidence.get_source(min(i, j), max(i, j)) for i in a for j in b]
         i, j = min(pair), max(pair)
-        ways = (evidence.source_by_way_of(i, j, k) for k in evidence.maps if k not in a and k not in b)
+        ways = (evidence.get_composed_source(i, j, k) for k in evidence.maps if k not in a and k not in b)
         self.ways = [way for way in ways if way is not None]
 
-    def link(self, least: float) -> Link:
-        """The link with its log odds, or some below the least ones, and the pair that spoke most against it."""
-        costs = self._contradictions(self.move)
+    def score(self, least: float) -> Link:
+        """Return the link with its log odds, or some below the least ones, and the pair that spoke most against it."""
+        costs = self._sum_contradictions(self.move)
         costly: list[tuple[float, tuple[int, int] | None]] = [(-cost, pair) for pair, cost in costs[1].items()]
         against = min(costly, default=(0.0, None), key=lambda entry: entry[0])
-        log_odds = [self._odds_of_any() - costs[0]]
-        for rival in self._rivals() if log_odds[0] >= least else ():
+        log_odds = [self._compute_any_log_odds() - costs[0]]
+        for rival in self._list_rivals() if log_odds[0] >= least else ():
             if log_odds[-1] < least:
                 break
-            ahead, loudest = self._ahead_of(rival)
-            log_odds.append(ahead - costs[0] + self._contradictions(rival)[0])
+            ahead, loudest = self._compute_lead(rival)
+            log_odds.append(ahead - costs[0] + self._sum_contradictions(rival)[0])
             against = min(against, loudest, key=lambda entry: entry[0])
         left = np.logaddexp.reduce(-np.array(log_odds))
         return Link(self.pair, self.h, -float(left), against[1])
 
-    def _pose(self, pair: tuple[int, int], move: Sim3) -> Sim3:
+    def _compute_pose(self, pair: tuple[int, int], move: Sim3) -> Sim3:
         """T_ij of a pair (i < j) across, if component b lies so in a."""
         if (pair, move) not in self._poses:
             i, j = pair
@@ -213,50 +213,54 @@ class _Weighing:
             self._poses[pair, move] = pose if one == i else pose.inverse()
         return self._poses[pair, move]
 
-    def _share(self, source: Source) -> float | None:
+    def _compute_share(self, source: Source) -> float | None:
         """What a source gives to the placement of the link; None where it does not name it."""
         if source not in self._shares:
-            pose, named = self._pose(source.pair, self.move), None
+            pose, named = self._compute_pose(source.pair, self.move), None
             if source.direct and source.pair == self.pair:  # the link itself, even if others moved it a little
                 pose = self.h.transform
                 named = next((share for p, share in source.named if p is pose), None)
-            self._shares[source] = self._nearest(source, pose) if named is None else named
+            self._shares[source] = self._find_nearest_share(source, pose) if named is None else named
         return self._shares[source]
 
-    def _nearest(self, source: Source, pose: Sim3, limits: tuple[float, float, float] = DRIFT_LIMITS) -> float | None:
-        return next((share for p, share in source.named if self.evidence.agrees(*source.pair, p, pose, limits)), None)
+    def _find_nearest_share(self, source: Source, pose: Sim3, limits: tuple[float, float, float] = DRIFT_LIMITS) -> float | None:
+        return next((share for p, share in source.named if self.evidence.is_same_pose(*source.pair, p, pose, limits)), None)
 
-    def _rival_share(self, source: Source, rival: Sim3) -> float | None:
+    def _compute_rival_share(self, source: Source, rival: Sim3) -> float | None:
         """What a source gives to a rival placement or to a poor fit near it, but for what it gives to the link itself."""
-        own, pose = self._pose(source.pair, self.move), self._pose(source.pair, rival)
-        others = [(p, share) for p, share in source.named if not self.evidence.agrees(*source.pair, p, own)]
-        near = [share for p, share in others if self.evidence.agrees(*source.pair, p, pose, LOOK_ALIKE_LIMITS)]
+        own, pose = self._compute_pose(source.pair, self.move), self._compute_pose(source.pair, rival)
+        others = [(p, share) for p, share in source.named if not self.evidence.is_same_pose(*source.pair, p, own)]
+        near = [share for p, share in others if self.evidence.is_same_pose(*source.pair, p, pose, LOOK_ALIKE_LIMITS)]
         return max(near, default=None)
 
     def _check(self, pair: tuple[int, int], move: Sim3) -> Check:
         if (pair, move) not in self._checks:
-            self._checks[pair, move] = self.evidence.checks(*pair, self._pose(pair, move))
+            self._checks[pair, move] = self.evidence.checks(*pair, self._compute_pose(pair, move))
         return self._checks[pair, move]
 
-    def _odds_of_any(self) -> float:
+    def _compute_any_log_odds(self) -> float:
         """Log odds of the placement against none at all: of the surest registration that names it, and what others add."""
         odds, supports = [], []
         for source in (*self.sources, *self.ways):
-            share = self._share(source)
-            support = 0.0 if share is None else support_of(float(np.log(share / max(1 - share, LEAST_SHARE))))
+            share = self._compute_share(source)
+            support = 0.0 if share is None else compute_support(float(np.log(share / max(1 - share, LEAST_SHARE))))
             if source.direct and source.pair != self.pair:
                 support = max(support, self._check(source.pair, self.move).log_odds)
             supports.append(max(support, 0.0) if source.pair != self.pair or not source.direct else 0.0)
             odds += [float(np.log(share / source.none))] if share is not None and source.direct else []
         return max(odds, default=0.0) + min(sum(supports), CLOSING_GAIN)
 
-    def _contradictions(self, move: Sim3) -> tuple[float, dict[tuple[int, int], float]]:
+    def _sum_contradictions(self, move: Sim3) -> tuple[float, dict[tuple[int, int], float]]:
         """What walls on free floor say against a placement, each place once; and the cost of each pair by itself."""
         costs: dict[tuple[int, int], float] = {}
         places: list[tuple[Array, float]] = []
         for source in self.sources:
             check = self._check(source.pair, move)
-            named = self._share(source) if move is self.move else self._nearest(source, self._pose(source.pair, move))
+            named = (
+                self._compute_share(source)
+                if move is self.move
+                else self._find_nearest_share(source, self._compute_pose(source.pair, move))
+            )
             if check.log_odds >= (WEIGHED_ALREADY if named is not None else 0.0):
                 continue
             costs[source.pair] = -check.log_odds
@@ -266,38 +270,40 @@ class _Weighing:
             places += [(frame.apply(m[None])[0], -check.log_odds / len(middles)) for m in middles]
         return sum_places(places), costs
 
-    def _rivals(self) -> list[Sim3]:
+    def _list_rivals(self) -> list[Sim3]:
         """Other placements that sources name, those with the largest shares."""
         named = [
             (share, source, pose)
             for source in (*self.sources, *self.ways)
             for pose, share in source.named
-            if share >= (self._share(source) or source.none) * LEAST_RIVAL
+            if share >= (self._compute_share(source) or source.none) * LEAST_RIVAL
         ]
         rivals: list[Sim3] = []
         for _, source, pose in sorted(named, key=lambda entry: (-entry[0], entry[1].pair)):
             i, j = source.pair
             if len(rivals) == MOST_RIVALS or (source.direct and source.pair == self.pair and pose is self.h.transform):
                 continue
-            known = (self._pose(source.pair, move) for move in (self.move, *rivals))
-            if not any(self.evidence.agrees(i, j, pose, other) for other in known):
-                rivals.append(across(self.a, self.b, source.pair, pose))
+            known = (self._compute_pose(source.pair, move) for move in (self.move, *rivals))
+            if not any(self.evidence.is_same_pose(i, j, pose, other) for other in known):
+                rivals.append(place_component(self.a, self.b, source.pair, pose))
         return rivals
 
-    def _ahead_of(self, rival: Sim3) -> tuple[float, tuple[float, tuple[int, int] | None]]:
+    def _compute_lead(self, rival: Sim3) -> tuple[float, tuple[float, tuple[int, int] | None]]:
         """Log odds of the placement against a rival one by what sources name; and the most that a pair says for the rival."""
         named: list[tuple[float, bool, bool]] = []  # log odds, is the placement that loses named, too, is it seen
         loudest: tuple[float, tuple[int, int] | None] = (0.0, None)
-        doubtful = any(source.pair == self.pair and self._rival_share(source, rival) is not None for source in self.sources)
+        doubtful = any(
+            source.pair == self.pair and self._compute_rival_share(source, rival) is not None for source in self.sources
+        )
         for source in (*self.sources, *self.ways):
-            shares = self._share(source), self._rival_share(source, rival)
+            shares = self._compute_share(source), self._compute_rival_share(source, rival)
             if doubtful and not source.direct and shares[1] is None:
                 continue  # a rival that the pair itself names may be among what is composed, too far off to be known again
             seen = [not source.direct or self._check(source.pair, move).overlap for move in (self.move, rival)]
             if source.named:
                 odds = float(np.log((shares[0] or source.none) / (shares[1] or source.none)))
                 if shares[0] is not None and shares[1] is None:
-                    least = min(support_of(float(np.log(shares[0] / max(1 - shares[0], LEAST_SHARE)))), CLOSING_GAIN)
+                    least = min(compute_support(float(np.log(shares[0] / max(1 - shares[0], LEAST_SHARE)))), CLOSING_GAIN)
                     if odds < least:  # what is left to none is spread over all that is not named, and is not this rival's
                         odds, seen = least, [False, False]
             else:
@@ -312,7 +318,7 @@ class _Weighing:
 
 
 def weigh(sources: Iterable[tuple[float, bool, bool]]) -> float:
-    """What sources say together for a placement and against another one.
+    """Sum the log odds of all sources for a placement against another one.
 
     Args:
         sources: log odds (those of 0 and less are left out); does the source name the other placement, too; does it see it?
@@ -326,8 +332,8 @@ def weigh(sources: Iterable[tuple[float, bool, bool]]) -> float:
     return independent + (dependent[0][0] if dependent else 0.0) + min(unseen, CLOSING_GAIN)
 
 
-def parted(component: Poses, links: Iterable[Link], link: Link) -> tuple[dict[int, Sim3], dict[int, Sim3]]:
-    """The two components that a link holds together: that of its first map, and the other one."""
+def split_component(component: Poses, links: Iterable[Link], link: Link) -> tuple[dict[int, Sim3], dict[int, Sim3]]:
+    """Return the two components that a link holds together: that of its first map, and the other one."""
     side, left = {link.maps[0]}, [other.maps for other in links if other is not link]
     grown = True
     while grown:

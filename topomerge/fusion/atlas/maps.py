@@ -13,16 +13,15 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from topomerge.embedding.embedders import DEFAULT
-from topomerge.embedding.embedders import embedder as make_embedder
-from topomerge.embedding.room_cells import Descriptor
-from topomerge.embedding.turns import Rows
+from topomerge.embedding.learned import DEFAULT
+from topomerge.embedding.learned import build_embedder as make_embedder
+from topomerge.embedding.quarter_turns import Descriptor, Rows
 from topomerge.fusion.inputs import Extent
 from topomerge.io.maps import load_map
-from topomerge.matching.match import checked
+from topomerge.matching.match import embed_rooms
 from topomerge.registration.bend.bend import bend_together
 from topomerge.registration.prepared import Prepared, prepare
-from topomerge.registration.refine import surface
+from topomerge.registration.refine import build_surface
 from topomerge.types import Array, Deformation, Sim3, TopometricMap
 
 LOADED_AT_ONCE = 3  # maps in memory, of those that are files
@@ -32,11 +31,11 @@ Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
-class Facts:
+class MapSummary:
     """What is asked of a map before it is put together with others.
 
     Args:
-        key: `map_key`.
+        key: `hash_map`.
         rooms: their number.
     """
 
@@ -54,7 +53,7 @@ class Memory:
 
     def __init__(self, coarse: MutableMapping[tuple[str, str], float] | None = None) -> None:
         self.coarse = {} if coarse is None else coarse
-        self._facts: dict[Path, tuple[tuple[int, int, int], Facts]] = {}  # of files, with what tells whether they changed
+        self._facts: dict[Path, tuple[tuple[int, int, int], MapSummary]] = {}  # of files, with what tells whether they changed
         self._sources: dict[str, TopometricMap | str | Path] = {}
         self._loaded: OrderedDict[str, TopometricMap] = OrderedDict()
         self._prepared: OrderedDict[str, Any] = OrderedDict()
@@ -71,48 +70,48 @@ class Memory:
         self._sources = dict(sources)
         self._before, self._answers = self._answers, {}
 
-    def facts(self, source: TopometricMap | str | Path) -> Facts:
-        """What is asked of a map first; of a file that has not changed it is remembered.
+    def summarise(self, source: TopometricMap | str | Path) -> MapSummary:
+        """Summarise a map; the summary of a file that has not changed is remembered.
 
         Raises:
             InputError: the file can't be read.
         """
         if isinstance(source, TopometricMap):
-            return _facts(source)
+            return _summarise_map(source)
         path = Path(source)
         try:
             stat = path.stat()
         except OSError:
-            return _facts(load_map(path))  # says what is wrong with it
+            return _summarise_map(load_map(path))  # says what is wrong with it
         stamp = (stat.st_ino, stat.st_size, stat.st_mtime_ns)
         if path not in self._facts or self._facts[path][0] != stamp:
-            self._facts[path] = (stamp, _facts(load_map(path)))
+            self._facts[path] = (stamp, _summarise_map(load_map(path)))
         return self._facts[path][1]
 
-    def map(self, key: str) -> TopometricMap:
-        """A map; files are loaded when they are needed."""
+    def load(self, key: str) -> TopometricMap:
+        """Return a map; files are loaded when they are needed."""
         source = self._sources[key]
         if isinstance(source, TopometricMap):
             return source
-        return _recent(self._loaded, key, LOADED_AT_ONCE, lambda: load_map(source))
+        return _get_recent(self._loaded, key, LOADED_AT_ONCE, lambda: load_map(source))
 
-    def file(self, key: str) -> Path | None:
-        """Where a map is loaded from; None of one that is given as it is."""
+    def get_file(self, key: str) -> Path | None:
+        """Return the file that a map is loaded from; None of one that is given as it is."""
         source = self._sources[key]
         return None if isinstance(source, TopometricMap) else Path(source)
 
-    def prepared(self, key: str, make: Callable[[], Made]) -> Made:
-        """The plans of a map, one of the last that were asked for or made now."""
-        out: Made = _recent(self._prepared, key, PREPARED_AT_ONCE, make)
+    def get_prepared(self, key: str, make: Callable[[], Made]) -> Made:
+        """Return the plans of a map, one of the last that were asked for or made now."""
+        out: Made = _get_recent(self._prepared, key, PREPARED_AT_ONCE, make)
         return out
 
-    def surface(self, key: str, make: Callable[[], Made]) -> Made:
-        """The surface of a map, one of the last that were asked for or made now."""
-        out: Made = _recent(self._surfaces, key, SURFACES_AT_ONCE, make)
+    def get_surface(self, key: str, make: Callable[[], Made]) -> Made:
+        """Return the surface of a map, one of the last that were asked for or made now."""
+        out: Made = _get_recent(self._surfaces, key, SURFACES_AT_ONCE, make)
         return out
 
     def answer(self, question: tuple[Hashable, ...], make: Callable[[], Made]) -> Made:
-        """What was answered before to a question, or is answered now.
+        """Return the remembered answer to a question, or compute it.
 
         Args:
             question: all that the answer depends on; of maps their keys.
@@ -123,11 +122,11 @@ class Memory:
         return out
 
 
-def _facts(map: TopometricMap) -> Facts:
-    return Facts(map_key(map), len(map.rooms), Extent.of(map))
+def _summarise_map(map: TopometricMap) -> MapSummary:
+    return MapSummary(hash_map(map), len(map.rooms), Extent.from_map(map))
 
 
-def map_key(map: TopometricMap) -> str:
+def hash_map(map: TopometricMap) -> str:
     """16 hexadecimal digits of a hash of cells, rooms and free space."""
     digest = hashlib.sha256()
     for grid in (map.grid, map.navigable, map.free):
@@ -137,7 +136,7 @@ def map_key(map: TopometricMap) -> str:
     return digest.hexdigest()[:16]
 
 
-def _recent(memory: OrderedDict[str, Made], key: str, capacity: int, make: Callable[[], Made]) -> Made:
+def _get_recent(memory: OrderedDict[str, Made], key: str, capacity: int, make: Callable[[], Made]) -> Made:
     """What was made of a map, from the memory of those that were used last."""
     if key not in memory:
         memory[key] = make()
@@ -174,45 +173,45 @@ class Maps:
         return len(self.keys)
 
     def __getitem__(self, k: int) -> TopometricMap:
-        return self.memory.map(self.keys[k])
+        return self.memory.load(self.keys[k])
 
-    def file(self, k: int) -> Path | None:
-        """The file of a map; None of one in memory."""
-        return self.memory.file(self.keys[k])
+    def get_file(self, k: int) -> Path | None:
+        """Return the file of a map; None of one in memory."""
+        return self.memory.get_file(self.keys[k])
 
-    def prepared(self, k: int) -> Prepared:
+    def get_prepared(self, k: int) -> Prepared:
         """Plans, for registration."""
         memory, key = self.memory, self.keys[k]
 
         def make() -> Prepared:
-            make_surface = partial(memory.surface, key, lambda: surface(memory.map(key).grid))
-            return replace(prepare(memory.map(key)), load=lambda: memory.map(key), make_surface=make_surface)
+            make_surface = partial(memory.get_surface, key, lambda: build_surface(memory.load(key).grid))
+            return replace(prepare(memory.load(key)), load=lambda: memory.load(key), make_surface=make_surface)
 
-        return memory.prepared(key, make)
+        return memory.get_prepared(key, make)
 
     def answer(self, question: tuple[Hashable, ...], maps: Iterable[int], make: Callable[[], Made]) -> Made:
         """`Memory.answer` to a question about some of the maps."""
         return self.memory.answer((*question, *(self.keys[k] for k in maps)), make)
 
-    def area(self, k: int) -> float:
+    def get_area(self, k: int) -> float:
         """Floor area, m2, of what is known from above."""
 
         def make() -> float:
-            return float(sum(v.plan.explored.sum() * v.plan.edge**2 for v in self.prepared(k).storeys))
+            return float(sum(v.plan.explored.sum() * v.plan.edge**2 for v in self.get_prepared(k).storeys))
 
         return self.answer(("area",), (k,), make)
 
-    def middle(self, k: int) -> Array:
-        """(3,) of its cells, m."""
-        return self.answer(("middle",), (k,), lambda: self.prepared(k).middle)
+    def get_middle(self, k: int) -> Array:
+        """Return (3,) of its cells, m."""
+        return self.answer(("middle",), (k,), lambda: self.get_prepared(k).middle)
 
-    def sliced(self, k: int) -> bool:
+    def is_sliced(self, k: int) -> bool:
         """Is a storey a slice, which has no planes?"""
-        return self.answer(("sliced",), (k,), lambda: any(v.plan.sliced for v in self.prepared(k).storeys))
+        return self.answer(("sliced",), (k,), lambda: any(v.plan.sliced for v in self.get_prepared(k).storeys))
 
-    def rows(self, k: int) -> Rows:
-        """Descriptors of the rooms."""
-        return self.memory.answer(("rows", self.embedder, self.keys[k]), lambda: checked(self._describe, self[k]))
+    def get_rows(self, k: int) -> Rows:
+        """Return descriptors of the rooms."""
+        return self.memory.answer(("rows", self.embedder, self.keys[k]), lambda: embed_rooms(self._describe, self[k]))
 
 
 class MapFiles(Mapping[int, TopometricMap]):
@@ -231,7 +230,7 @@ class MapFiles(Mapping[int, TopometricMap]):
         return len(self._files)
 
 
-def bent_together(
+def bend_maps(
     maps: Maps, poses: Mapping[int, Sim3], pairs: Sequence[tuple[int, int]], scaled: bool
 ) -> tuple[dict[int, Sim3], dict[int, Deformation], str]:
     """`bend_together` of some maps, by their numbers."""
@@ -239,7 +238,7 @@ def bent_together(
     places = tuple((names.index(i), names.index(j)) for i, j in pairs)
 
     def make() -> tuple[dict[int, Sim3], dict[int, Deformation], str]:
-        return bend_together({n: maps.prepared(k) for n, k in enumerate(names)}, dict(enumerate(lying)), places, scaled)
+        return bend_together({n: maps.get_prepared(k) for n, k in enumerate(names)}, dict(enumerate(lying)), places, scaled)
 
     lying = tuple(poses[k] for k in names)
     moved, deformations, reason = maps.answer(("bent", lying, places, scaled), names, make)

@@ -10,14 +10,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from topomerge.fusion.atlas.maps import Maps
-from topomerge.kernels import align
+from topomerge.kernels import registration as align
 from topomerge.matching.match import match
-from topomerge.matching.plan_fields import FREE_MARGIN, PlanFields
-from topomerge.matching.poses import PoseHypothesis, pose_difference
-from topomerge.matching.refinement import refine, storeys_at
+from topomerge.matching.poses import FREE_MARGIN, PlanFields, PoseHypothesis, pair_storeys, pose_difference, refine
 from topomerge.registration.judge import Judge
-from topomerge.registration.pipeline import fine, register
-from topomerge.registration.verify import plausibility
+from topomerge.registration.pipeline import refine_by_surfaces, register
+from topomerge.registration.verify import score_plausibility
 from topomerge.types import Array, Sim3, TopometricMap
 
 PLACE_REACH = 3.0  # m: what contradicts within this of one spot is one place, about as wide as a room
@@ -53,8 +51,8 @@ class Conflict:
     middle: tuple[float, float, float]
     area: float
 
-    def moved(self, pose: Sim3) -> Conflict:
-        """The same place in another frame."""
+    def transform(self, pose: Sim3) -> Conflict:
+        """Return the same place in another frame."""
         x, y, z = pose.apply(np.array([self.middle]))[0].tolist()
         return replace(self, middle=(x, y, z))
 
@@ -76,10 +74,10 @@ class Contradiction:
     area: float
 
 
-def conflict_columns(a: Sequence[PlanFields], b: Sequence[PlanFields], pose: Sim3) -> Array:
+def find_conflict_columns(a: Sequence[PlanFields], b: Sequence[PlanFields], pose: Sim3) -> Array:
     """(n, 4) place in a's frame and area (half of it, as both maps are asked) of the walls on free floor under T_ab, m and m2."""
     rows = [np.zeros((0, 4))]
-    for v, w in storeys_at(a, b, pose.translation[2], pose.scale):
+    for v, w in pair_storeys(a, b, pose.translation[2], pose.scale):
         sides = ((w, v, pose, pose.scale**2), (v, w, pose.inverse(), 1.0))
         for n, (source, target, move, grown) in enumerate(sides):
             walls = source.walls
@@ -95,8 +93,8 @@ def conflict_columns(a: Sequence[PlanFields], b: Sequence[PlanFields], pose: Sim
 
 
 def find_conflicts(a: Sequence[PlanFields], b: Sequence[PlanFields], pose: Sim3) -> tuple[Conflict, ...]:
-    """Places at which maps a and b contradict each other under T_ab, the largest first."""
-    columns = conflict_columns(a, b, pose)
+    """Return places at which maps a and b contradict each other under T_ab, the largest first."""
+    columns = find_conflict_columns(a, b, pose)
     found = []
     while columns[:, 3].sum() >= LEAST_CONFLICT:
         spots, owner = np.unique(np.floor(columns[:, :2] / SPOT), axis=0, return_inverse=True)
@@ -115,7 +113,7 @@ def find_conflicts(a: Sequence[PlanFields], b: Sequence[PlanFields], pose: Sim3)
 
 
 def sum_places(costs: Iterable[tuple[Array, float]]) -> float:
-    """The sum of the costs of places (3,), each place once: of those that several pairs show, the highest.
+    """Return the sum of the costs of places (3,), each place once: of those that several pairs show, the highest.
 
     Args:
         costs: middle of a place, m, in one frame for all, and its cost.
@@ -130,30 +128,30 @@ def sum_places(costs: Iterable[tuple[Array, float]]) -> float:
 def locate_contradiction(
     pair: tuple[int, int], conflict: Conflict, maps: tuple[TopometricMap, TopometricMap], pose: Sim3, columns: Array, frame: Sim3
 ) -> Contradiction:
-    """A conflict of two joined maps with the rooms in which it lies.
+    """Return a conflict of two joined maps with the rooms in which it lies.
 
     Args:
         maps: i and j.
         pose: T_ij.
-        columns: of `conflict_columns`.
+        columns: of `find_conflict_columns`.
         frame: of map i in its component.
     """
     near = columns[np.linalg.norm(columns[:, :2] - conflict.middle[:2], axis=1) <= PLACE_REACH, :3]
-    rooms = rooms_near(maps[0], near), rooms_near(maps[1], pose.inverse().apply(near))
-    return Contradiction(pair, rooms, conflict.moved(frame).middle, conflict.area)
+    rooms = find_rooms_near(maps[0], near), find_rooms_near(maps[1], pose.inverse().apply(near))
+    return Contradiction(pair, rooms, conflict.transform(frame).middle, conflict.area)
 
 
-def rooms_near(map: TopometricMap, at: Array) -> tuple[int, ...]:
+def find_rooms_near(map: TopometricMap, at: Array) -> tuple[int, ...]:
     """Rooms on whose floor places (n, 3), m, lie, or the nearest floor; those that hold a tenth of the places at least."""
     if not len(at) or not len(map.navigable):
         return ()
-    distance, nearest = cKDTree(map.navigable.centroids()).query(at, distance_upper_bound=PLACE_REACH)
+    distance, nearest = cKDTree(map.navigable.compute_centroids()).query(at, distance_upper_bound=PLACE_REACH)
     rooms = map.navigable_room[nearest[np.isfinite(distance)]]
     counts = np.bincount(rooms[rooms >= 0], minlength=1)
     return tuple(int(room) for room in np.flatnonzero(counts >= max(ROOM_SHARE * len(at), 1)))
 
 
-def contradiction_to_json(c: Contradiction) -> dict[str, Any]:
+def serialise_contradiction(c: Contradiction) -> dict[str, Any]:
     """A contradiction as plain values: numbers of both maps, rooms of each, its middle, m, and the area of the walls, m2."""
     return {"maps": c.maps, "rooms": c.rooms, "at": [round(v, 2) for v in c.middle], "m2": round(c.area, 2)}
 
@@ -177,16 +175,16 @@ class Check:
     conflicts: tuple[Conflict, ...] = ()
 
 
-def hypotheses(
+def find_hypotheses(
     maps: Maps, i: int, j: int, scale: str = "fixed", same: str = "nothing", proposed: Sequence[Sim3] = ()
 ) -> tuple[PoseHypothesis, ...]:
-    """Where map j may lie in map i, most probable first; each with its share of the probability that one of them is right.
+    """Find the poses of map j in map i, most probable first, each with its share of the probability of a right one.
 
     Args:
         proposed: poses T_ij that are tried beside those that are looked for.
     """
-    poses = [*(_room_poses(maps, i, j, scale) if maps.matched else []), *proposed]
-    registration = register(maps.prepared(i), maps.prepared(j), scale=scale, proposed=poses, same=same)
+    poses = [*(_propose_room_poses(maps, i, j, scale) if maps.matched else []), *proposed]
+    registration = register(maps.get_prepared(i), maps.get_prepared(j), scale=scale, proposed=poses, same=same)
     if registration.transform is None or not registration.alternatives:
         return ()
     best, probability = registration.alternatives[0].score, registration.probability
@@ -198,14 +196,14 @@ def hypotheses(
     return tuple(ranked)
 
 
-def _room_poses(maps: Maps, i: int, j: int, scale: str) -> list[Sim3]:
+def _propose_room_poses(maps: Maps, i: int, j: int, scale: str) -> list[Sim3]:
     """Poses T_ij of matched rooms."""
-    if maps.prepared(j).order < maps.prepared(i).order:
-        return [pose.inverse() for pose in _room_poses(maps, j, i, scale)]
+    if maps.get_prepared(j).order < maps.get_prepared(i).order:
+        return [pose.inverse() for pose in _propose_room_poses(maps, j, i, scale)]
     a, b = maps[i], maps[j]
     if not len(a.rooms) or not len(b.rooms):
         return []
-    descriptors = {id(a): maps.rows(i), id(b): maps.rows(j)}
+    descriptors = {id(a): maps.get_rows(i), id(b): maps.get_rows(j)}
     return [h.transform for h in match(a, b, lambda m: descriptors[id(m)], scale_free=scale == "free").alternatives]
 
 
@@ -218,72 +216,74 @@ class Checks:
         self._fine: dict[tuple[int, int], list[tuple[Sim3, Sim3]]] = {}
         self._places: dict[tuple[int, int], list[tuple[Sim3, Array]]] = {}
 
-    def place(self, i: int, j: int, pose: Sim3) -> Array:
+    def locate_place(self, i: int, j: int, pose: Sim3) -> Array:
         """`place` of maps i and j (i < j) under T_ij."""
 
         def made() -> Array:
-            return place(self.maps.prepared(i).storeys, self.maps.prepared(j).storeys, pose)
+            return locate_place(self.maps.get_prepared(i).storeys, self.maps.get_prepared(j).storeys, pose)
 
         def make() -> Array:
             return self.maps.answer(("place", pose), (i, j), made)
 
-        return _once(self._places, (i, j), pose, self.maps.middle(j), make)
+        return _get_or_compute(self._places, (i, j), pose, self.maps.get_middle(j), make)
 
-    def fine(self, i: int, j: int, pose: Sim3) -> Sim3:
+    def refine_pose(self, i: int, j: int, pose: Sim3) -> Sim3:
         """T_ij after the fine registration (i < j); as it was where a map is a slice, which has no planes."""
-        if self.maps.sliced(i) or self.maps.sliced(j):
+        if self.maps.is_sliced(i) or self.maps.is_sliced(j):
             return pose
 
         def made() -> Sim3:
-            return fine(self.maps.prepared(i), self.maps.prepared(j), pose, self.scaled)[0]
+            return refine_by_surfaces(self.maps.get_prepared(i), self.maps.get_prepared(j), pose, self.scaled)[0]
 
         def make() -> Sim3:
             return self.maps.answer(("fine", pose, self.scaled), (i, j), made)
 
-        return _once(self._fine, (i, j), pose, self.maps.middle(j), make)
+        return _get_or_compute(self._fine, (i, j), pose, self.maps.get_middle(j), make)
 
     def __call__(self, i: int, j: int, pose: Sim3) -> Check:
         """What maps i and j say to T_ij."""
         if j < i:
             turned = self(j, i, pose.inverse())
             back = turned.pose.inverse()
-            conflicts = tuple(c.moved(back) for c in turned.conflicts)
+            conflicts = tuple(c.transform(back) for c in turned.conflicts)
             return Check(back, turned.log_odds, turned.overlap, turned.features, conflicts)
 
         def make() -> Check:
-            return self.maps.answer(("check", pose, self.scaled), (i, j), lambda: self._judged(i, j, pose))
+            return self.maps.answer(("check", pose, self.scaled), (i, j), lambda: self._judge_pose(i, j, pose))
 
-        return _once(self._checks, (i, j), pose, self.maps.middle(j), make)
+        return _get_or_compute(self._checks, (i, j), pose, self.maps.get_middle(j), make)
 
-    def _judged(self, i: int, j: int, pose: Sim3) -> Check:
-        a, b = self.maps.prepared(i).storeys, self.maps.prepared(j).storeys
-        if not len(common_points(a, b, pose)):
+    def _judge_pose(self, i: int, j: int, pose: Sim3) -> Check:
+        a, b = self.maps.get_prepared(i).storeys, self.maps.get_prepared(j).storeys
+        if not len(sample_common_points(a, b, pose)):
             return Check(pose, 0.0, False, {})
         judge = Judge(a, b)
         moved, features = pose, judge(pose)
         for candidate in refine(a, b, [PoseHypothesis(pose, from_rooms=True)], self.scaled):
             again = judge(candidate.transform)
-            if alike(candidate.transform, pose, place(a, b, pose).mean(axis=0)) and score_pose(again) > score_pose(features):
+            if is_same_pose(candidate.transform, pose, locate_place(a, b, pose).mean(axis=0)) and score_pose(again) > score_pose(
+                features
+            ):
                 moved, features = candidate.transform, again
         if features["free"] < OVERLAP_FLOOR and features["walls"] < OVERLAP_WALLS:
             return Check(moved, 0.0, False, features)
-        conflicts = find_conflicts(a, b, moved) if excess_conflict(features) else ()
+        conflicts = find_conflicts(a, b, moved) if compute_excess_conflict(features) else ()
         return Check(moved, score_pose(features, conflicts), True, features, conflicts)
 
 
-def _once(
+def _get_or_compute(
     memory: dict[tuple[int, int], list[tuple[Sim3, T]]], pair: tuple[int, int], pose: Sim3, at: Array, make: Callable[[], T]
 ) -> T:
     """What was made for a pair under a pose that is the same, or what is made now."""
     entries = memory.setdefault(pair, [])
     for other, value in entries:
-        if alike(pose, other, at, CHECKED_ONCE):
+        if is_same_pose(pose, other, at, CHECKED_ONCE):
             return value
     entries.append((pose, make()))
     return entries[-1][1]
 
 
-def excess_conflict(f: Mapping[str, float]) -> float:
+def compute_excess_conflict(f: Mapping[str, float]) -> float:
     """Share of the walls that stand on free floor of the other map, above what true poses have; 0 where it is so little that it
     may be noise."""
     return max(f["conflict_share"] - POSE_USUAL_CONFLICT, 0.0) if f["conflict"] > LEAST_CONFLICT else 0.0
@@ -301,8 +301,8 @@ def score_pose(f: Mapping[str, float], conflicts: Sequence[Conflict] | None = No
         conflicts: places at which the maps contradict each other; what is scattered beside them counts as further places. If
             None, it may be everywhere.
     """
-    support = float(np.clip(plausibility(f) + 3.0, 0.0, 3.0))
-    excess = excess_conflict(f)
+    support = float(np.clip(score_plausibility(f) + 3.0, 0.0, 3.0))
+    excess = compute_excess_conflict(f)
     most = MOST_AGAINST
     if conflicts is not None:
         scattered = max(f["conflict"] - sum(c.area for c in conflicts), 0.0) / LEAST_CONFLICT
@@ -310,15 +310,15 @@ def score_pose(f: Mapping[str, float], conflicts: Sequence[Conflict] | None = No
     return support - min(CONFLICT_ODDS * excess, most)
 
 
-def alike(p: Sim3, q: Sim3, at: Array, limits: tuple[float, float, float] = DRIFT_LIMITS) -> bool:
+def is_same_pose(p: Sim3, q: Sim3, at: Array, limits: tuple[float, float, float] = DRIFT_LIMITS) -> bool:
     """Are two poses of a map one, near a point (3,) of it?"""
     return all(d <= limit for d, limit in zip(pose_difference(p, q, at), limits, strict=True))
 
 
-def common_points(a: Sequence[PlanFields], b: Sequence[PlanFields], pose: Sim3) -> Array:
-    """(n, 3) points of b's floors, a sample, where both maps know something under T_ab."""
+def sample_common_points(a: Sequence[PlanFields], b: Sequence[PlanFields], pose: Sim3) -> Array:
+    """Return (n, 3) points of b's floors, a sample, where both maps know something under T_ab."""
     samples = [np.zeros((0, 3))]
-    for v, w in storeys_at(a, b, pose.translation[2], pose.scale):
+    for v, w in pair_storeys(a, b, pose.translation[2], pose.scale):
         rows = np.argwhere(w.plan.explored)
         rows = rows[:: max(len(rows) // SAMPLED_COLUMNS, 1)]
         at = np.column_stack([w.plan.origin + (rows + 0.5) * w.plan.edge, np.full(len(rows), w.plan.floor_guess)])
@@ -328,9 +328,9 @@ def common_points(a: Sequence[PlanFields], b: Sequence[PlanFields], pose: Sim3) 
     return np.concatenate(samples)
 
 
-def place(a: Sequence[PlanFields], b: Sequence[PlanFields], pose: Sim3) -> Array:
+def locate_place(a: Sequence[PlanFields], b: Sequence[PlanFields], pose: Sim3) -> Array:
     """(5, 3) points of b that stand for the place which both maps saw: its middle, and as far from it as it is wide."""
-    points = common_points(a, b, pose)
+    points = sample_common_points(a, b, pose)
     if not len(points):
         points = np.append(b[0].middle, 0.0)[None]
     middle, (x, y, _) = points.mean(axis=0), np.maximum(points.std(axis=0), PLACE_HALF_WIDTH)

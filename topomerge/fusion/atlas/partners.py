@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.embedding.room_cells import Descriptor
-from topomerge.embedding.turns import QUARTERS, Rows, TurnedRows
+from topomerge.embedding.quarter_turns import QUARTERS, Descriptor, Rows, TurnedRows
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.maps import Maps, Memory
-from topomerge.fusion.atlas.pairs import hypotheses
+from topomerge.fusion.atlas.pairs import find_hypotheses
 from topomerge.fusion.inputs import FEW_MAPS
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.registration.judge import Judge
@@ -38,19 +37,19 @@ MOST_PARTNERS = 5  # of these and of those that name it, the ones on which it li
 LIKELY_PARTNERS = 2  # that its rooms look most like, however it lies: drift spoils a coarse pose
 
 
-def vectors(rows: Rows, turns: int = 0) -> Array:
+def compute_vectors(rows: Rows, turns: int = 0) -> Array:
     """(R, D), or (R, 4 D) of turned rows, in single precision and of length 1: the rooms of a map that is turned so often."""
-    flat = rows.flat(turns) if isinstance(rows, TurnedRows) else rows
+    flat = rows.flatten(turns) if isinstance(rows, TurnedRows) else rows
     out: Array = (flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)).astype(np.float32)
     return out
 
 
-def queries(rows: Rows) -> Array:
-    """(T, R, ·) `vectors` of a map at each turn, T of 4 of turned rows and else 1."""
-    return np.stack([vectors(rows, k) for k in range(QUARTERS if isinstance(rows, TurnedRows) else 1)])
+def compute_queries(rows: Rows) -> Array:
+    """Return (T, R, ·) `vectors` of a map at each turn, T of 4 of turned rows and else 1."""
+    return np.stack([compute_vectors(rows, k) for k in range(QUARTERS if isinstance(rows, TurnedRows) else 1)])
 
 
-def nearest(table: Array, asked: Array, count: int = ROOM_NEIGHBOURS, but: tuple[int, int] = (0, 0)) -> tuple[Array, Array]:
+def find_nearest(table: Array, asked: Array, count: int = ROOM_NEIGHBOURS, but: tuple[int, int] = (0, 0)) -> tuple[Array, Array]:
     """Rows of a table (N, D) that are most alike to each of (Q, D), and their cosines: (Q, n) each, n of count and N the less.
 
     Exact, by products of matrices; most alike first, of equal ones the first.
@@ -58,25 +57,25 @@ def nearest(table: Array, asked: Array, count: int = ROOM_NEIGHBOURS, but: tuple
     Args:
         but: first and last + 1 of rows that come after all others: those of the map that is asked for.
     """
-    parts = [_nearest(table, asked[k : k + QUERIES_AT_ONCE], count, but) for k in range(0, len(asked), QUERIES_AT_ONCE)]
+    parts = [_search_blocks(table, asked[k : k + QUERIES_AT_ONCE], count, but) for k in range(0, len(asked), QUERIES_AT_ONCE)]
     return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
 
 
-def _nearest(table: Array, asked: Array, count: int, but: tuple[int, int]) -> tuple[Array, Array]:
+def _search_blocks(table: Array, asked: Array, count: int, but: tuple[int, int]) -> tuple[Array, Array]:
     rooms: Array = np.zeros((len(asked), 0), np.int64)
     cosine: Array = np.zeros((len(asked), 0), np.float32)
     for first in range(0, len(table), VECTORS_AT_ONCE):
         block = asked @ table[first : first + VECTORS_AT_ONCE].T
         block[:, max(but[0] - first, 0) : max(but[1] - first, 0)] = -2.0
-        best = _highest(block, count)
+        best = _find_highest(block, count)
         rooms = np.concatenate([rooms, best + first], axis=1)
         cosine = np.concatenate([cosine, np.take_along_axis(block, best, axis=1)], axis=1)
-        best = _highest(cosine, count)
+        best = _find_highest(cosine, count)
         rooms, cosine = (np.take_along_axis(values, best, axis=1) for values in (rooms, cosine))
     return rooms, cosine
 
 
-def _highest(values: Array, count: int) -> Array:
+def _find_highest(values: Array, count: int) -> Array:
     """Places of the highest values of each row, highest first."""
     if count < values.shape[1]:
         best = np.sort(np.argpartition(-values, count - 1, axis=1)[:, :count], axis=1)
@@ -86,8 +85,8 @@ def _highest(values: Array, count: int) -> Array:
     return np.take_along_axis(best, order, axis=1)
 
 
-def votes(rooms: Array, cosine: Array, turns: int, owner: Array, maps: int) -> Array:
-    """(maps,) of the votes of a map's rooms; each has one, shared among its neighbours by how alike they are.
+def count_votes(rooms: Array, cosine: Array, turns: int, owner: Array, maps: int) -> Array:
+    """Return (maps,) of the votes of a map's rooms; each has one, shared among its neighbours by how alike they are.
 
     Args:
         rooms: (turns * R, n) neighbours of `queries`, one turn after the other.
@@ -102,43 +101,43 @@ def votes(rooms: Array, cosine: Array, turns: int, owner: Array, maps: int) -> A
     return out
 
 
-def owners(counts: Sequence[int]) -> Array:
-    """(N,) map of each room, of maps with so many rooms."""
+def list_owners(counts: Sequence[int]) -> Array:
+    """Return (N,) map of each room, of maps with so many rooms."""
     return np.repeat(np.arange(len(counts)), counts)
 
 
-def most_alike(rows: Sequence[Rows], number: int) -> Iterator[tuple[int, ...]]:
+def iter_most_similar(rows: Sequence[Rows], number: int) -> Iterator[tuple[int, ...]]:
     """For each map those of the others that its rooms look most like, at most `number`, most alike first; exact.
 
     None for a map without rooms, and none that has no room among the neighbours.
     """
-    table = np.concatenate([vectors(of) for of in rows if len(of)] or [np.zeros((0, 1), np.float32)])
+    table = np.concatenate([compute_vectors(of) for of in rows if len(of)] or [np.zeros((0, 1), np.float32)])
     counts = [len(of) for of in rows]
-    owner, last = owners(counts), np.cumsum(counts).tolist()
+    owner, last = list_owners(counts), np.cumsum(counts).tolist()
     for k, of in enumerate(rows):
         if not counts[k]:
             yield ()
             continue
-        asked = queries(of)
-        rooms, cosine = nearest(table, asked.reshape(-1, asked.shape[2]), but=(last[k] - counts[k], last[k]))
-        score = votes(rooms, cosine, len(asked), np.where(owner == k, -1, owner), len(rows))
+        asked = compute_queries(of)
+        rooms, cosine = find_nearest(table, asked.reshape(-1, asked.shape[2]), but=(last[k] - counts[k], last[k]))
+        score = count_votes(rooms, cosine, len(asked), np.where(owner == k, -1, owner), len(rows))
         best = np.argsort(-score, kind="stable")[:number].tolist()
         yield tuple(m for m in best if score[m] > 0)
 
 
-def coarse_key(maps: Maps, i: int, j: int) -> tuple[str, str]:
+def build_coarse_key(maps: Maps, i: int, j: int) -> tuple[str, str]:
     """Under which `Memory.coarse` holds two maps."""
     return min(maps.keys[i], maps.keys[j]), max(maps.keys[i], maps.keys[j])
 
 
-def coarse_log_odds(maps: Maps, i: int, j: int, scale: str = "fixed") -> float:
+def compute_coarse_log_odds(maps: Maps, i: int, j: int, scale: str = "fixed") -> float:
     """Log odds that the best rigid pose of two maps is right, seen by itself; what is in `Memory.coarse` is not made again.
 
     Drift lowers them: of a real floor some right pairs have -7, as strangers of few rooms have.
     """
-    pair, coarse = coarse_key(maps, i, j), maps.memory.coarse
+    pair, coarse = build_coarse_key(maps, i, j), maps.memory.coarse
     if pair not in coarse:
-        first, second = sorted((maps.prepared(i), maps.prepared(j)), key=lambda m: m.order)
+        first, second = sorted((maps.get_prepared(i), maps.get_prepared(j)), key=lambda m: m.order)
         hypotheses = (search_scaled if scale == "free" else search)(first.storeys, second.storeys)
         ranked = rank(hypotheses, Judge(first.storeys, second.storeys))
         coarse[pair] = ranked[0].score if ranked else NO_POSE
@@ -180,40 +179,40 @@ class PairTask:
 
 
 @cache
-def _memory() -> Memory:
+def _get_memory() -> Memory:
     """Of this process: a map that comes in many pairs is prepared once."""
     return Memory()
 
 
-def lay_coarsely(task: CoarseTask) -> tuple[float, ...]:
-    """How likely each map but the first lies on the first one (`coarse.coarse_log_odds`)."""
-    memory = _memory()
+def score_coarsely(task: CoarseTask) -> tuple[float, ...]:
+    """Compute the log odds that each map but the first lies on the first one (`coarse.coarse_log_odds`)."""
+    memory = _get_memory()
     memory.coarse = {}  # what an earlier task found may be of another scale
     maps = Maps(task.files, None, memory, task.keys)
-    return tuple(coarse_log_odds(maps, 0, k, task.scale) for k in range(1, len(maps)))
+    return tuple(compute_coarse_log_odds(maps, 0, k, task.scale) for k in range(1, len(maps)))
 
 
 def register_pair(task: PairTask) -> tuple[PoseHypothesis, ...]:
-    """Where the second map may lie in the first one (`pairs.hypotheses`)."""
-    return hypotheses(Maps(task.files, task.embedder, _memory(), task.keys), 0, 1, task.scale, task.same, task.proposed)
+    """Register the second map in the first one (`pairs.find_hypotheses`)."""
+    return find_hypotheses(Maps(task.files, task.embedder, _get_memory(), task.keys), 0, 1, task.scale, task.same, task.proposed)
 
 
-def processes(jobs: int) -> Workers:
+def start_processes(jobs: int) -> Workers:
     """So many processes of this machine."""
     from joblib import Parallel, delayed
 
     def run(work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
         parallel = Parallel(min(jobs, len(tasks)), return_as="generator_unordered", batch_size=1)
-        yield from parallel(delayed(_numbered)(work, k, task) for k, task in enumerate(tasks))
+        yield from parallel(delayed(_run_numbered)(work, k, task) for k, task in enumerate(tasks))
 
     return run
 
 
-def _numbered(work: Callable[[Any], Any], number: int, task: Any) -> tuple[int, Any]:
+def _run_numbered(work: Callable[[Any], Any], number: int, task: Any) -> tuple[int, Any]:
     return number, work(task)
 
 
-def cluster(address: str) -> Workers:
+def connect_cluster(address: str) -> Workers:
     """The workers of a Dask scheduler, e.g. ``tcp://host:8786``. Pairs of a worker that dies are given to another one.
 
     Raises:
@@ -241,7 +240,7 @@ def cluster(address: str) -> Workers:
     return run
 
 
-def partners_of(
+def find_partners(
     maps: Maps,
     linked: Iterable[tuple[int, int]] = (),
     scale: str = "fixed",
@@ -257,62 +256,62 @@ def partners_of(
         workers: lay maps that are files; None: this process does.
     """
     count = len(maps)
-    named = _named(maps)
+    named = _list_similar_maps(maps)
     sets = [set(of) for of in named]
     for k, of in enumerate(named):
         for m in of:
             sets[m].add(k)
     if workers is not None and count > 2:
-        _lay_all(maps, named, scale, workers)
-    odds, complete = _laid(maps, named, scale, end)
-    chosen = {_pair(*pair) for pair in linked}
+        _score_in_workers(maps, named, scale, workers)
+    odds, complete = _score_partners(maps, named, scale, end)
+    chosen = {_order_pair(*pair) for pair in linked}
     for k in range(count):
-        best = sorted(sets[k], key=lambda m, k=k: (-odds.get(_pair(k, m), -np.inf), m))  # type: ignore[misc]
-        chosen |= {_pair(k, m) for m in (best if count <= FEW_MAPS else best[:MOST_PARTNERS] + named[k][:LIKELY_PARTNERS])}
+        best = sorted(sets[k], key=lambda m, k=k: (-odds.get(_order_pair(k, m), -np.inf), m))  # type: ignore[misc]
+        chosen |= {_order_pair(k, m) for m in (best if count <= FEW_MAPS else best[:MOST_PARTNERS] + named[k][:LIKELY_PARTNERS])}
     partners: list[dict[int, float]] = [{} for _ in range(count)]
     for i, j in sorted(chosen):
         partners[i][j] = partners[j][i] = odds.get((i, j), -np.inf)
     return [[m for _, m in sorted((-likely, m) for m, likely in of.items())] for of in partners], complete
 
 
-def _named(maps: Maps) -> list[list[int]]:
+def _list_similar_maps(maps: Maps) -> list[list[int]]:
     """For each map those that its rooms look most like, most alike first; all others where they are few."""
     count = len(maps)
     if count <= FEW_MAPS:
         return [[m for m in range(count) if m != k] for k in range(count)]
-    largest = sorted(range(count), key=lambda k: -maps.area(k))
-    named = most_alike([maps.rows(k) for k in range(count)], COARSE_PARTNERS)
+    largest = sorted(range(count), key=lambda k: -maps.get_area(k))
+    named = iter_most_similar([maps.get_rows(k) for k in range(count)], COARSE_PARTNERS)
     return [list(of) or [m for m in largest if m != k][:COARSE_PARTNERS] for k, of in enumerate(named)]
 
 
-def _laid(maps: Maps, named: list[list[int]], scale: str, end: float) -> tuple[dict[tuple[int, int], float], bool]:
+def _score_partners(maps: Maps, named: list[list[int]], scale: str, end: float) -> tuple[dict[tuple[int, int], float], bool]:
     """Log odds of the pairs; those are all, if time allowed and there is a choice. Map by map, so that few are in memory; those
     that look most alike first, if time may end."""
     ranks: dict[tuple[int, int], int] = {}
     for k, of in enumerate(named):
         for place, m in enumerate(of):
-            ranks[_pair(k, m)] = min(place, ranks.get(_pair(k, m), place))
+            ranks[_order_pair(k, m)] = min(place, ranks.get(_order_pair(k, m), place))
     odds: dict[tuple[int, int], float] = {}
     for i, j in sorted(ranks, key=lambda pair: ranks[pair] if np.isfinite(end) else 0) if len(maps) > 2 else ():
         if time.perf_counter() >= end:
             return odds, False
-        odds[i, j] = coarse_log_odds(maps, i, j, scale)
+        odds[i, j] = compute_coarse_log_odds(maps, i, j, scale)
     return odds, True
 
 
-def _lay_all(maps: Maps, named: list[list[int]], scale: str, workers: Workers) -> None:
+def _score_in_workers(maps: Maps, named: list[list[int]], scale: str, workers: Workers) -> None:
     """Let workers lay maps that are files on each other, where that was not done before: each on all later ones at once."""
-    files = [maps.file(k) for k in range(len(maps))]
+    files = [maps.get_file(k) for k in range(len(maps))]
     later: dict[int, list[int]] = {}
-    for i, j in sorted({_pair(k, m) for k, of in enumerate(named) for m in of}):
-        if files[i] and files[j] and coarse_key(maps, i, j) not in maps.memory.coarse:
+    for i, j in sorted({_order_pair(k, m) for k, of in enumerate(named) for m in of}):
+        if files[i] and files[j] and build_coarse_key(maps, i, j) not in maps.memory.coarse:
             later.setdefault(i, [i]).append(j)
     laid = list(later.values())
     tasks = [CoarseTask(tuple(filter(None, (files[k] for k in of))), tuple(maps.keys[k] for k in of), scale) for of in laid]
-    for number, odds in workers(lay_coarsely, tasks) if tasks else ():
+    for number, odds in workers(score_coarsely, tasks) if tasks else ():
         for k, log_odds in zip(laid[number][1:], odds, strict=True):
-            maps.memory.coarse[coarse_key(maps, laid[number][0], k)] = log_odds
+            maps.memory.coarse[build_coarse_key(maps, laid[number][0], k)] = log_odds
 
 
-def _pair(i: int, j: int) -> tuple[int, int]:
+def _order_pair(i: int, j: int) -> tuple[int, int]:
     return min(i, j), max(i, j)

@@ -61,17 +61,17 @@ class AtlasResult:
             return "merged"
         return "parted" if len(self.components[0]) > 1 else "abstained"
 
-    def component_of(self, k: int) -> int:
-        """The component of a map."""
+    def find_component(self, k: int) -> int:
+        """Return the component of a map."""
         return next(n for n, members in enumerate(self.components) if k in members)
 
-    def probability(self, component: int) -> float:
+    def get_probability(self, component: int) -> float:
         """Of the weakest link of a component; 0 for a map alone."""
         probabilities = [link.probability for link in self.links if link.maps[0] in self.components[component]]
         return min(probabilities, default=0.0)
 
-    def in_frames(self, frames: Mapping[int, Sim3]) -> AtlasResult:
-        """The same where components lie in other frames.
+    def transform_components(self, frames: Mapping[int, Sim3]) -> AtlasResult:
+        """Return the same where components lie in other frames.
 
         Args:
             frames: k -> pose of map k in the frame of its component, where it is the first map of one; identities are left out.
@@ -80,8 +80,8 @@ class AtlasResult:
         moved = {k: frames[first[k]] @ pose for k, pose in self.transforms.items() if first[k] in frames}
         return replace(self, transforms=self.transforms | moved)
 
-    def joined(self, component: int) -> TopometricMap:
-        """The joined map of a component in its frame; made anew at each call.
+    def join_component(self, component: int) -> TopometricMap:
+        """Return the joined map of a component in its frame; made anew at each call.
 
         Raises:
             InputError: no such component, or more maps together than provenance can tell apart.
@@ -92,12 +92,12 @@ class AtlasResult:
             raise InputError(f"there is no component {component!r}: the atlas has {there}")
         return fuse(self.maps, [(k, self.transforms[k]) for k in self.components[component]], self.bends)
 
-    def words(self) -> str:
-        """What came out, in a sentence or two."""
-        return "; ".join(_words(self))
+    def format_summary(self) -> str:
+        """Summarise the result in a sentence or two."""
+        return "; ".join(_iter_sentences(self))
 
 
-def _words(atlas: AtlasResult) -> Iterator[str]:
+def _iter_sentences(atlas: AtlasResult) -> Iterator[str]:
     def names(members: Iterable[int]) -> str:
         return ", ".join(Path(atlas.names[k]).name for k in members)
 
@@ -107,7 +107,7 @@ def _words(atlas: AtlasResult) -> Iterator[str]:
     elif not joined:
         yield f"nothing could be connected: all {len(atlas.names)} maps stand apart"
     for n, members in enumerate(joined):
-        yield f"{len(members)} maps belong together ({names(members)}), weakest link {atlas.probability(n):.2f}"
+        yield f"{len(members)} maps belong together ({names(members)}), weakest link {atlas.get_probability(n):.2f}"
     if joined and atlas.alone:
         several = len(atlas.alone) > 1
         yield f"{names(atlas.alone)} {'stand' if several else 'stands'} apart: nothing connects {'them' if several else 'it'}"
@@ -117,7 +117,7 @@ def _words(atlas: AtlasResult) -> Iterator[str]:
         yield f"{match} was thrown out, {who} it"
     for pair in sorted({c.maps for c in atlas.contradictions}):
         places = [c for c in atlas.contradictions if c.maps == pair]
-        rooms = [_rooms(sorted({room for c in places for room in c.rooms[k]}), names((pair[k],))) for k in (0, 1)]
+        rooms = [_format_rooms(sorted({room for c in places for room in c.rooms[k]}), names((pair[k],))) for k in (0, 1)]
         area = sum(c.area for c in places)
         yield (
             f"{names(pair)} contradict each other in {' and '.join(rooms)}: {area:.1f} m2 of walls of the one stand on free "
@@ -125,7 +125,7 @@ def _words(atlas: AtlasResult) -> Iterator[str]:
         )
 
 
-def _rooms(rooms: Sequence[int], name: str) -> str:
+def _format_rooms(rooms: Sequence[int], name: str) -> str:
     """Rooms of a map in words."""
     if not rooms:
         return f"no room of {name}"

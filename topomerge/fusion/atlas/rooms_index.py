@@ -17,16 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.embedding.embedders import DEFAULT
-from topomerge.embedding.room_cells import Descriptor
-from topomerge.embedding.turns import Rows, TurnedRows, numbers
-from topomerge.embedding.weights import read_embedder_card
+from topomerge.embedding.learned import DEFAULT, read_embedder_card
+from topomerge.embedding.quarter_turns import Descriptor, Rows, TurnedRows, get_rows
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.folder import Entry, Stored
-from topomerge.fusion.atlas.partners import ROOM_NEIGHBOURS, owners, vectors
+from topomerge.fusion.atlas.folder import Entry, StoredAtlas
+from topomerge.fusion.atlas.partners import ROOM_NEIGHBOURS, compute_vectors, list_owners
 from topomerge.io import archive
 from topomerge.io.maps import load_map
-from topomerge.matching.match import checked
+from topomerge.matching.match import embed_rooms
 from topomerge.types import Array
 
 INDEX_HEAD, GRAPH_HEAD = (
@@ -56,7 +54,7 @@ def check_graph(graph: bytes, count: int, size: int, links: int) -> None:
     """
     whole = np.frombuffer(graph, np.uint8)
     start = 8 + count * size
-    if len(whole) < start + INDEX_HEAD + GRAPH_HEAD + 2 * count or tuple(_at(whole, [0], 2)[0]) != (count, size):
+    if len(whole) < start + INDEX_HEAD + GRAPH_HEAD + 2 * count or tuple(_read_integers(whole, [0], 2)[0]) != (count, size):
         raise ValueError("cut off, or of other vectors")
     head = graph[start : start + INDEX_HEAD]
     if head[:7] != b"usearch" or head[13:17] != KINDS:
@@ -75,10 +73,10 @@ def check_graph(graph: bytes, count: int, size: int, links: int) -> None:
     if ends[-1] != len(whole):
         raise ValueError("cut off")
     nodes = ends - sizes
-    keys = _at(whole, nodes, 2)
+    keys = _read_integers(whole, nodes, 2)
     if (keys[:, 1] != 0).any() or len(np.unique(keys[:, 0])) < count or keys[:, 0].max() >= count:
         raise ValueError("keys are wrong")
-    if not np.array_equal(_at(whole, nodes + NODE - 4, 1)[:, 0] >> 16, levels):
+    if not np.array_equal(_read_integers(whole, nodes + NODE - 4, 1)[:, 0] >> 16, levels):
         raise ValueError("its levels are wrong")
     _check_links(whole, nodes + NODE, lowest, np.ones(count, bool))
     for level in range(1, highest + 1):
@@ -89,13 +87,13 @@ def check_graph(graph: bytes, count: int, size: int, links: int) -> None:
 def _check_links(whole: Array, places: Array, most: int, there: Array) -> None:
     """Lists at these bytes, each the number of links and then so many rooms, which must be `there` at this level."""
     for k in range(0, len(places), LISTS_AT_ONCE):
-        lists = _at(whole, places[k : k + LISTS_AT_ONCE], 1 + most)
+        lists = _read_integers(whole, places[k : k + LISTS_AT_ONCE], 1 + most)
         to = lists[:, 1:][np.arange(most) < lists[:, :1]]
         if lists[:, 0].max() > most or to.max(initial=0) >= len(there) or not there[to].all():
             raise ValueError("links lead nowhere")
 
 
-def _at(whole: Array, places: Array | list[int], count: int) -> Array:
+def _read_integers(whole: Array, places: Array | list[int], count: int) -> Array:
     """(n, count) whole numbers of 32 bits that begin at these bytes."""
     at = np.asarray(places)[:, None] + np.arange(4 * count)
     return np.ascontiguousarray(whole[at]).view("<u4").astype(np.int64)
@@ -114,57 +112,57 @@ class RoomRows:
         InputError: the file is damaged, or of another embedder or atlas.
     """
 
-    def __init__(self, stored: Stored, describe: Descriptor, signature: str, like: Rows) -> None:
-        self.path, self.entries, self._like = stored.folder / ROOMS_FILE, stored.entries, numbers(like).shape[1:]
+    def __init__(self, stored: StoredAtlas, describe: Descriptor, signature: str, like: Rows) -> None:
+        self.path, self.entries, self._like = stored.folder / ROOMS_FILE, stored.entries, get_rows(like).shape[1:]
         self._arrays: Mapping[str, Array] | None = None  # None: they stay in the file
-        written = archive.names(self.path, ROOMS_KIND) if self.path.exists() else []
+        written = archive.list_arrays(self.path, ROOMS_KIND) if self.path.exists() else []
         if written:
             embedder = archive.read(self.path, ROOMS_KIND, ["embedder"])
             check_made_for(self.path, embedder, signature, {e.key for e in stored.entries}, written)
         if {e.key for e in stored.entries} | {"embedder"} != {name.removesuffix(".places") for name in written}:
-            self._arrays = self._completed(stored, describe, written)
+            self._arrays = self._complete_rows(stored, describe, written)
             with suppress(InputError):  # an atlas that may only be read is looked through all the same
-                archive.write({"embedder": signed(signature), **self._arrays}, self.path)
+                archive.write({"embedder": encode_signature(signature), **self._arrays}, self.path)
 
-    def _completed(self, stored: Stored, describe: Descriptor, written: Collection[str]) -> dict[str, Array]:
+    def _complete_rows(self, stored: StoredAtlas, describe: Descriptor, written: Collection[str]) -> dict[str, Array]:
         """What is written of the maps of the atlas, and what is missing."""
-        arrays = archive.read(self.path, ROOMS_KIND, _of_maps(self.entries)) if written else {}
+        arrays = archive.read(self.path, ROOMS_KIND, _list_array_names(self.entries)) if written else {}
         made: dict[str, Array] = {}
         for entry in self.entries:
             places = f"{entry.key}.places"
             if entry.key in arrays:
                 made |= {name: arrays[name] for name in (entry.key, places) if name in arrays}
             else:
-                rows = checked(describe, load_map(stored.folder / entry.file))
-                made[entry.key] = numbers(rows).astype(np.float32)
+                rows = embed_rooms(describe, load_map(stored.folder / entry.file))
+                made[entry.key] = get_rows(rows).astype(np.float32)
                 made |= {places: rows.places} if isinstance(rows, TurnedRows) else {}
         return made
 
-    def of(self, maps: Sequence[int]) -> list[Rows]:
-        """Rows of some maps, by their numbers in the atlas.
+    def get_rows(self, maps: Sequence[int]) -> list[Rows]:
+        """Return rows of some maps, by their numbers in the atlas.
 
         Raises:
             InputError: the file is damaged, or does not fit a map.
         """
         entries = [self.entries[k] for k in maps]
         arrays = self._read(entries)
-        return [self._rows(arrays, entry, float) for entry in entries]
+        return [self._parse_rows(arrays, entry, float) for entry in entries]
 
-    def vectors(self, maps: Sequence[int]) -> Array:
-        """(N, D) `neighbours.vectors` of all rooms of some maps, one map after the other.
+    def compute_vectors(self, maps: Sequence[int]) -> Array:
+        """Return (N, D) `neighbours.vectors` of all rooms of some maps, one map after the other.
 
         Raises:
             InputError: the file is damaged, or does not fit a map.
         """
         entries = [self.entries[k] for k in maps if self.entries[k].rooms]
         arrays = self._read(entries)
-        each = [vectors(self._rows(arrays, entry, np.float32)) for entry in entries]
+        each = [compute_vectors(self._parse_rows(arrays, entry, np.float32)) for entry in entries]
         return np.concatenate(each or [np.zeros((0, int(np.prod(self._like))), np.float32)])
 
     def _read(self, entries: Sequence[Entry]) -> Mapping[str, Array]:
-        return archive.read(self.path, ROOMS_KIND, _of_maps(entries)) if self._arrays is None else self._arrays
+        return archive.read(self.path, ROOMS_KIND, _list_array_names(entries)) if self._arrays is None else self._arrays
 
-    def _rows(self, arrays: Mapping[str, Array], entry: Entry, number: type) -> Rows:
+    def _parse_rows(self, arrays: Mapping[str, Array], entry: Entry, number: type) -> Rows:
         """What was written of a map."""
         of, places = arrays.get(entry.key, np.zeros(0)), arrays.get(f"{entry.key}.places")
         fits = of.ndim == (2 if places is None else 3) and len(of if places is None else places) == len(of) == entry.rooms
@@ -174,7 +172,7 @@ class RoomRows:
         return of.astype(number) if places is None else TurnedRows(of.astype(number), places)
 
 
-def _of_maps(entries: Iterable[Entry]) -> set[str]:
+def _list_array_names(entries: Iterable[Entry]) -> set[str]:
     """Names of the arrays of some maps."""
     return {name for e in entries for name in (e.key, f"{e.key}.places")}
 
@@ -191,19 +189,19 @@ def check_made_for(
     Raises:
         InputError: it is not.
     """
-    if not np.array_equal(arrays.get("embedder", np.zeros(0)), signed(signature)):
+    if not np.array_equal(arrays.get("embedder", np.zeros(0)), encode_signature(signature)):
         raise InputError(f"{path}: holds rows of another embedder; {ADVICE}")
     if not set(keys) & set(written):
         raise InputError(f"{path}: is of another atlas; {ADVICE}")
 
 
-def signed(signature: str) -> Array:
-    """A signature as an array."""
+def encode_signature(signature: str) -> Array:
+    """Return a signature as an array."""
     return np.frombuffer(signature.encode(), np.uint8)
 
 
-def embedder_signature(name: str) -> str:
-    """What tells rows of one embedder from those of another."""
+def compute_embedder_signature(name: str) -> str:
+    """Compute a signature that tells the rows of one embedder from those of another."""
     if name == DEFAULT or Path(name).is_dir():
         return read_embedder_card(None if name == DEFAULT else name).digest
     return hashlib.sha256(name.encode()).hexdigest()
@@ -245,12 +243,14 @@ class RoomsIndex:
     def add(self, keys: Sequence[str], counts: Sequence[int], vectors: Array) -> None:
         """Add the rooms (N, D) of some maps. The same ones in the same order give the same bytes."""
         first = sum(self.counts)
-        self._graph.add(np.arange(first, first + len(vectors), dtype=np.uint64), self._bytes(vectors), threads=1)
+        self._graph.add(np.arange(first, first + len(vectors), dtype=np.uint64), self._quantise(vectors), threads=1)
         self.keys, self.counts = [*self.keys, *keys], [*self.counts, *counts]
 
-    def nearest(self, asked: Array, count: int = ROOM_NEIGHBOURS) -> tuple[Array, Array]:
+    def find_nearest(self, asked: Array, count: int = ROOM_NEIGHBOURS) -> tuple[Array, Array]:
         """`neighbours.nearest` by the index: most of them, and cosines to about .01."""
-        hits = self._graph.search(self._bytes(np.concatenate([asked, asked[:1]])), count)  # one alone has another kind of answer
+        hits = self._graph.search(
+            self._quantise(np.concatenate([asked, asked[:1]])), count
+        )  # one alone has another kind of answer
         reached = np.arange(hits.keys.shape[1]) < np.asarray(hits.counts)[:, None]
         product = 1 - np.where(reached, hits.distances, np.inf)
         rooms, cosine = np.where(reached, hits.keys, 0).astype(np.int64), product / self._unit**2
@@ -261,7 +261,7 @@ class RoomsIndex:
         """What a number of 1 is in eight bits: numbers up to six times the usual one have room."""
         return float(127 / min(1.0, 6 / np.sqrt(self.size)))
 
-    def _bytes(self, vectors: Array) -> Array:
+    def _quantise(self, vectors: Array) -> Array:
         out: Array = np.clip(np.rint(vectors * self._unit), -127, 127).astype(np.int8)
         return out
 
@@ -273,7 +273,7 @@ class RoomsIndex:
         """
         graph = np.frombuffer(self._graph.save(), np.uint8)
         keys = np.array([key.encode() for key in self.keys])
-        arrays = {"embedder": signed(signature), "keys": keys, "counts": np.array(self.counts), "graph": graph}
+        arrays = {"embedder": encode_signature(signature), "keys": keys, "counts": np.array(self.counts), "graph": graph}
         archive.write(arrays, path, effort=0)
 
     @classmethod
@@ -307,7 +307,7 @@ class RoomsIndex:
         return index
 
 
-def rooms_index(stored: Stored, rows: RoomRows, signature: str, size: int) -> RoomsIndex | None:
+def prepare_rooms_index(stored: StoredAtlas, rows: RoomRows, signature: str, size: int) -> RoomsIndex | None:
     """The index of an atlas, made or completed where it is not; None where exact search is better, or `usearch` is missing.
 
     Args:
@@ -331,9 +331,9 @@ def rooms_index(stored: Stored, rows: RoomRows, signature: str, size: int) -> Ro
     indexed = set(index.keys)
     new = [k for k, e in enumerate(stored.entries) if e.rooms and e.key not in indexed]
     if new:
-        index.add([stored.entries[k].key for k in new], [stored.entries[k].rooms for k in new], rows.vectors(new))
+        index.add([stored.entries[k].key for k in new], [stored.entries[k].rooms for k in new], rows.compute_vectors(new))
         with suppress(InputError):  # an atlas that may only be read is looked through all the same
             index.write(path, signature)
     numbers = {e.key: k for k, e in enumerate(stored.entries)}
-    index.owner = np.array([numbers.get(key, -1) for key in index.keys])[owners(index.counts)]
+    index.owner = np.array([numbers.get(key, -1) for key in index.keys])[list_owners(index.counts)]
     return index

@@ -7,25 +7,39 @@ Of more than eleven maps each is only registered with some that its rooms look m
 
 from __future__ import annotations
 
+import hashlib
+import json
+import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from topomerge.embedding.room_cells import Descriptor
+from topomerge import __version__
+from topomerge.embedding.quarter_turns import Descriptor
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.link_evidence import Link
-from topomerge.fusion.atlas.maps import Facts, Maps, Memory, bent_together
-from topomerge.fusion.atlas.pairs import Checks, Contradiction, conflict_columns, hypotheses, locate_contradiction
-from topomerge.fusion.atlas.partners import PairTask, Workers, partners_of, register_pair
+from topomerge.fusion.atlas.maps import Maps, MapSummary, Memory, bend_maps
+from topomerge.fusion.atlas.pairs import Checks, Contradiction, find_conflict_columns, find_hypotheses, locate_contradiction
+from topomerge.fusion.atlas.partners import PairTask, Workers, find_partners, register_pair
 from topomerge.fusion.atlas.result import AtlasResult
-from topomerge.fusion.inputs import check_cells, check_list, check_scale, check_units, link_threshold, without_rooms
-from topomerge.fusion.pose_graph import Assembler, Assembly, residual
+from topomerge.fusion.inputs import (
+    check_cells,
+    check_list,
+    check_scale,
+    check_units,
+    format_no_rooms_warning,
+    resolve_link_threshold,
+)
+from topomerge.fusion.pose_graph import Assembler, Assembly, compute_residual
+from topomerge.io.listing import convert_to_plain
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.registration.bend.bend import NEITHER_BENDS
 from topomerge.registration.posterior import check_same
+from topomerge.registration.verify import load_model
 from topomerge.types import Array, Deformation, Sim3, TopometricMap
 
 SURE_LINK = 4.0  # log odds of a link, above which no further ones are looked for within its component
@@ -46,7 +60,7 @@ class AtlasSettings:
 
 
 @dataclass(frozen=True)
-class Pace:
+class SolvingSchedule:
     """When an answer is wanted, and who works on it.
 
     Args:
@@ -60,7 +74,7 @@ class Pace:
     workers: Workers | None = None
 
 
-def atlas(
+def build_atlas(
     maps: Sequence[TopometricMap | str | Path],
     *,
     scale: str = "fixed",
@@ -98,13 +112,13 @@ def solve(
     keys: Sequence[str] | None = None,
     proposed: Proposed | None = None,
     memory: Memory | None = None,
-    pace: Pace | None = None,
+    pace: SolvingSchedule | None = None,
 ) -> AtlasResult:
     """As `atlas`, of any number of maps, one or none, too.
 
     Args:
         names: of the maps, for messages; their sources if None.
-        keys: what `map_key` should give for each map.
+        keys: what `hash_map` should give for each map.
         proposed: poses of pairs, tried beside those that are looked for; these may be registered however alike the maps look.
         memory: of maps that were put together before; it changes how long it takes, not what comes out.
         pace: of who waits for an answer.
@@ -115,21 +129,21 @@ def solve(
     began = time.perf_counter()
     check_scale(settings.scale)
     check_same(settings.same)
-    threshold = _log_odds(link_threshold(settings.threshold, len(maps)))
+    threshold = _compute_log_odds(resolve_link_threshold(settings.threshold, len(maps)))
     memory = Memory() if memory is None else memory
-    names, map_keys, warnings = _checked(maps, names, keys, settings.scale, memory)
+    names, map_keys, warnings = _check_maps(maps, names, keys, settings.scale, memory)
     order = sorted(range(len(maps)), key=lambda k: map_keys[k])
     ordered = Maps([maps[k] for k in order], settings.embedder, memory, [map_keys[k] for k in order])
     explorer = _Explorer(ordered, settings, threshold, {} if registrations is None else registrations, proposed or {})
-    pace = pace or Pace()
-    assembly = explorer.explored(began + pace.seconds, pace.workers)
+    pace = pace or SolvingSchedule()
+    assembly = explorer.explore(began + pace.seconds, pace.workers)
     if pace.answered is not None:
-        pace.answered(_result(assembly, explorer, names, order, rigid=True, fine=False))
-    result = _result(assembly, explorer, names, order, settings.rigid)
+        pace.answered(_build_result(assembly, explorer, names, order, rigid=True, fine=False))
+    result = _build_result(assembly, explorer, names, order, settings.rigid)
     return replace(result, maps=Maps(maps), seconds=time.perf_counter() - began, warnings=(*warnings, *result.warnings))
 
 
-def _checked(
+def _check_maps(
     maps: Sequence[TopometricMap | str | Path],
     names: Sequence[str] | None,
     keys: Sequence[str] | None,
@@ -140,9 +154,9 @@ def _checked(
     map_names: list[str] = []
     map_keys: list[str] = []
     warnings: list[str] = []
-    first: Facts | None = None
+    first: MapSummary | None = None
     for k, source in enumerate(maps):
-        facts = memory.facts(source)
+        facts = memory.summarise(source)
         name = names[k] if names else facts.extent.source or f"map {k}"
         if keys and keys[k] != facts.key:
             raise InputError(f"{source}: is not the map that was added as {name}; take it out with `topomerge atlas remove`")
@@ -154,13 +168,13 @@ def _checked(
         elif scale == "fixed":
             check_units(first.extent, facts.extent)
         if not facts.rooms:
-            warnings.append(without_rooms(name))
+            warnings.append(format_no_rooms_warning(name))
         map_names.append(name)
         map_keys.append(facts.key)
     return map_names, map_keys, warnings
 
 
-def _log_odds(probability: float) -> float:
+def _compute_log_odds(probability: float) -> float:
     return float(np.log(max(probability, 1e-9) / max(1 - probability, 1e-9)))
 
 
@@ -186,25 +200,25 @@ class _Explorer:
         self.linked = sorted((min(place[a], place[b]), max(place[a], place[b])) for a, b in proposed if {a, b} <= set(place))
         self.partners: list[list[int]] = []
 
-    def explored(self, end: float = np.inf, workers: Workers | None = None) -> Assembly:
+    def explore(self, end: float = np.inf, workers: Workers | None = None) -> Assembly:
         """The assembly that more registrations would not change; after the end of the time that of those that were made."""
-        self.partners, looked = partners_of(self.maps, self.linked, self.scale, (time.perf_counter() + end) / 2, workers)
-        self.tried.update({pair: self._registered(*pair) for pair in self.linked if self._is_registered(*pair)})
+        self.partners, looked = find_partners(self.maps, self.linked, self.scale, (time.perf_counter() + end) / 2, workers)
+        self.tried.update({pair: self._register(*pair) for pair in self.linked if self._is_registered(*pair)})
         while True:
             assembly = self.assembler.build()
             counts = np.bincount([k for pair in self.tried for k in pair], minlength=len(self.maps))
-            pairs = set(self._next_pairs(assembly, counts, time.perf_counter() >= end))
+            pairs = set(self._iter_next_pairs(assembly, counts, time.perf_counter() >= end))
             if not pairs:
-                self.complete = looked and not any(self._next_pairs(assembly, counts))
+                self.complete = looked and not any(self._iter_next_pairs(assembly, counts))
                 return assembly
             in_turn = sorted(pairs, key=lambda pair: (counts[list(pair)].min(), pair))  # what nothing is known of comes first
             if workers is not None and time.perf_counter() < end:
                 self._register_all(in_turn, workers)
             for i, j in in_turn:
                 if self._is_registered(i, j) or time.perf_counter() < end:
-                    self.tried[i, j] = self._registered(i, j)
+                    self.tried[i, j] = self._register(i, j)
 
-    def _next_pairs(self, assembly: Assembly, counts: Array, late: bool = False) -> Iterator[tuple[int, int]]:
+    def _iter_next_pairs(self, assembly: Assembly, counts: Array, late: bool = False) -> Iterator[tuple[int, int]]:
         """For each map its most promising partner in another component, and where it is not surely connected one in its own.
 
         Args:
@@ -227,7 +241,7 @@ class _Explorer:
         """Let workers register those pairs of files that were not yet."""
         todo, tasks = [], []
         for i, j in pairs:
-            files, keys = (self.maps.file(i), self.maps.file(j)), (self.maps.keys[i], self.maps.keys[j])
+            files, keys = (self.maps.get_file(i), self.maps.get_file(j)), (self.maps.keys[i], self.maps.keys[j])
             if not self._is_registered(i, j) and files[0] is not None and files[1] is not None:
                 proposed = (self.proposed[keys],) if keys in self.proposed else ()
                 tasks.append(PairTask((files[0], files[1]), keys, self.embedder, self.scale, self.same, proposed))
@@ -235,15 +249,15 @@ class _Explorer:
         for number, ranked in workers(register_pair, tasks) if tasks else ():
             self.registrations[todo[number]] = ranked
 
-    def _registered(self, i: int, j: int) -> tuple[PoseHypothesis, ...]:
+    def _register(self, i: int, j: int) -> tuple[PoseHypothesis, ...]:
         pair = (self.maps.keys[i], self.maps.keys[j])
         if pair not in self.registrations:
             tried = [self.proposed[pair]] if pair in self.proposed else []
-            self.registrations[pair] = hypotheses(self.maps, i, j, self.scale, self.same, tried)
+            self.registrations[pair] = find_hypotheses(self.maps, i, j, self.scale, self.same, tried)
         return self.registrations[pair]
 
 
-def _result(
+def _build_result(
     assembly: Assembly, explorer: _Explorer, names: Sequence[str], order: Sequence[int], rigid: bool, fine: bool = True
 ) -> AtlasResult:
     """All by the places of the maps as they were given, in the frames of the first ones."""
@@ -257,17 +271,17 @@ def _result(
         rigid_poses = poses
         if not rigid and len(component) > 1:
             pairs = sorted({link.maps for link in assembly.links if link.maps[0] in component})
-            poses, deformations, reason = bent_together(explorer.maps, poses, pairs, explorer.scale == "free")
+            poses, deformations, reason = bend_maps(explorer.maps, poses, pairs, explorer.scale == "free")
             if reason not in ("", NEITHER_BENDS):
                 warnings.append(f"{', '.join(names[order[k]] for k in sorted(component))} were not bent: {reason}")
             bends |= {order[k]: d for k, d in deformations.items()}
         first = min(component, key=lambda k: order[k])
         back = poses[first].inverse()
         if fine:
-            contradictions += _contradictions(explorer, rigid_poses, order, rigid_poses[first].inverse())
+            contradictions += _iter_contradictions(explorer, rigid_poses, order, rigid_poses[first].inverse())
         for k in component:
             transforms[order[k]] = Sim3() if k == first else back @ poses[k]
-            gaps = [residual(e, poses) for e in edges if k in e.maps]
+            gaps = [compute_residual(e, poses) for e in edges if k in e.maps]
             residuals[order[k]] = float(np.sqrt(np.mean(np.square(gaps)))) if gaps else float("nan")
     components = [tuple(sorted(order[k] for k in component)) for component in assembly.components]
     components.sort(key=lambda c: (len(c) == 1, c))
@@ -276,8 +290,8 @@ def _result(
         tuple(names),
         tuple(components),
         transforms,
-        _reordered(assembly.links, order),
-        _reordered(assembly.rejected, order),
+        _reorder_links(assembly.links, order),
+        _reorder_links(assembly.rejected, order),
         residuals,
         bends,
         (len(explorer.tried), len(names) * (len(names) - 1) // 2),
@@ -287,7 +301,9 @@ def _result(
     )
 
 
-def _contradictions(explorer: _Explorer, poses: Mapping[int, Sim3], order: Sequence[int], back: Sim3) -> Iterator[Contradiction]:
+def _iter_contradictions(
+    explorer: _Explorer, poses: Mapping[int, Sim3], order: Sequence[int], back: Sim3
+) -> Iterator[Contradiction]:
     """Where maps of a component contradict each other, by the places of the maps as they were given.
 
     Args:
@@ -298,22 +314,148 @@ def _contradictions(explorer: _Explorer, poses: Mapping[int, Sim3], order: Seque
         for j in names[n + 1 :]:
             check = explorer.checks(i, j, poses[i].inverse() @ poses[j])
             if check.conflicts:
-                a, b = explorer.maps.prepared(i), explorer.maps.prepared(j)
-                columns = conflict_columns(a.storeys, b.storeys, check.pose)
+                a, b = explorer.maps.get_prepared(i), explorer.maps.get_prepared(j)
+                columns = find_conflict_columns(a.storeys, b.storeys, check.pose)
                 pair, maps = (order[i], order[j]), (explorer.maps[i], explorer.maps[j])
                 for conflict in check.conflicts:
                     yield locate_contradiction(pair, conflict, maps, check.pose, columns, back @ poses[i])
 
 
-def _reordered(links: Iterable[Link], order: Sequence[int]) -> tuple[Link, ...]:
+def _reorder_links(links: Iterable[Link], order: Sequence[int]) -> tuple[Link, ...]:
     """Links by the places of the maps as they were given, the lower one first."""
-    return tuple(sorted((_renamed(link, order) for link in links), key=lambda link: link.maps))
+    return tuple(sorted((_renumber_link(link, order) for link in links), key=lambda link: link.maps))
 
 
-def _renamed(link: Link, order: Sequence[int]) -> Link:
+def _renumber_link(link: Link, order: Sequence[int]) -> Link:
     i, j = (order[k] for k in link.maps)
     against = None if link.against is None else (order[link.against[0]], order[link.against[1]])
     h = link.hypothesis
     if j < i:
         i, j, h = j, i, replace(h, transform=h.transform.inverse())
     return Link((i, j), h, link.log_odds, against and (min(against), max(against)))
+
+
+PAIRS_FILE, PAIRS_FORMAT = "pairs.json", 1
+JOURNAL_FILE = ".registered.jsonl"
+UNREADABLE = (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError)
+Pair = tuple[str, str]
+
+
+class Journal(dict[Pair, tuple[PoseHypothesis, ...]]):
+    """The registrations of an atlas, as its files hold them. Those that are added stand in `JOURNAL_FILE` at once, until the
+    atlas itself is written.
+
+    Args:
+        folder: of the atlas, which exists.
+        settings: of the atlas.
+
+    Attributes:
+        coarse: the coarse ones, log odds of pairs; written down, too (`coarse.coarse_log_odds`).
+    """
+
+    def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
+        listing = _read_listing(folder, settings)
+        super().__init__(_parse_registrations(listing))
+        self.coarse = _Coarse(self._write, _parse_coarse(listing))
+        self._file, self._stamp = folder / JOURNAL_FILE, _compute_stamp(settings)
+        if self._file.is_file():
+            for line in self._file.read_text(encoding="utf-8", errors="replace").splitlines():
+                self._take(line)
+
+    def __setitem__(self, pair: Pair, hypotheses: tuple[PoseHypothesis, ...]) -> None:
+        super().__setitem__(pair, hypotheses)
+        self._write(_serialise_entry(pair, hypotheses))
+
+    def _write(self, entry: Mapping[str, Any]) -> None:
+        with self._file.open("a", encoding="utf-8") as out:
+            out.write(json.dumps({"stamp": self._stamp, **entry}) + "\n")
+
+    def _take(self, line: str) -> None:
+        """What a line says; nothing where it was cut, or is of other settings."""
+        try:
+            entry = json.loads(line)
+            if entry["stamp"] == self._stamp and "coarse" in entry:
+                self.coarse.update(_parse_coarse(entry))
+            elif entry["stamp"] == self._stamp:
+                super().__setitem__(*_parse_entry(entry))
+        except UNREADABLE:
+            return
+
+
+class _Coarse(dict[Pair, float]):
+    """Log odds of pairs; those that are added are written down."""
+
+    def __init__(self, write: Callable[[Mapping[str, Any]], None], listed: Mapping[Pair, float]) -> None:
+        super().__init__(listed)
+        self._write_entry = write
+
+    def __setitem__(self, pair: Pair, log_odds: float) -> None:
+        super().__setitem__(pair, log_odds)
+        self._write_entry({"coarse": [[*pair, log_odds]]})
+
+
+def _read_listing(folder: Path, settings: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What stands in pairs.json; nothing where the file is missing, damaged or of another version or other settings."""
+    try:
+        listing: Mapping[str, Any] = json.loads((folder / PAIRS_FILE).read_text(encoding="utf-8"))
+        return listing if listing["format"] == PAIRS_FORMAT and listing["stamp"] == _compute_stamp(settings) else {}
+    except (OSError, *UNREADABLE):
+        return {}
+
+
+def _parse_registrations(listing: Mapping[str, Any]) -> RegistrationsByPair:
+    try:
+        return dict(_parse_entry(entry) for entry in listing.get("pairs", ()))
+    except UNREADABLE:
+        return {}
+
+
+def _parse_coarse(listing: Mapping[str, Any]) -> dict[Pair, float]:
+    try:
+        coarse = {(str(a), str(b)): float(log_odds) for a, b, log_odds in listing.get("coarse", ())}
+    except UNREADABLE:
+        return {}
+    return {pair: log_odds for pair, log_odds in coarse.items() if math.isfinite(log_odds)}
+
+
+def serialise_registrations(registrations: Journal, keys: Collection[str], settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Serialise the registrations of the maps with these keys; `Journal` reads them."""
+    of = set(keys)
+    pairs = [_serialise_entry(pair, hypotheses) for pair, hypotheses in sorted(registrations.items()) if of.issuperset(pair)]
+    coarse = [[*pair, log_odds] for pair, log_odds in sorted(registrations.coarse.items()) if of.issuperset(pair)]
+    return {"format": PAIRS_FORMAT, "stamp": _compute_stamp(settings), "pairs": pairs, "coarse": coarse}
+
+
+def _serialise_entry(pair: Pair, hypotheses: Sequence[PoseHypothesis]) -> dict[str, Any]:
+    return {"maps": list(pair), "hypotheses": [_serialise_hypothesis(h) for h in hypotheses]}
+
+
+def _parse_entry(entry: Mapping[str, Any]) -> tuple[Pair, tuple[PoseHypothesis, ...]]:
+    """What `_entry` gave."""
+    return (entry["maps"][0], entry["maps"][1]), tuple(_parse_hypothesis(h) for h in entry["hypotheses"])
+
+
+def _compute_stamp(settings: Mapping[str, Any]) -> str:
+    """What registrations depend on beside the maps."""
+    inputs = [__version__, load_model(), settings["scale"], str(settings["embedder"]), settings["same"]]
+    return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _parse_hypothesis(listed: Mapping[str, Any]) -> PoseHypothesis:
+    x, y, z = map(float, listed["translation"])
+    p = float(listed["probability"])
+    if not 0 <= p <= 1:
+        raise ValueError(f"probability {p}")
+    pose = Sim3(float(listed["yaw"]), (x, y, z), float(listed["scale"]))
+    return PoseHypothesis(pose, probability=p, features={str(k): float(v) for k, v in listed["features"].items()})
+
+
+def _serialise_hypothesis(hypothesis: PoseHypothesis) -> dict[str, Any]:
+    pose = hypothesis.transform
+    return {
+        "yaw": pose.yaw,
+        "translation": list(pose.translation),
+        "scale": pose.scale,
+        "probability": hypothesis.probability,
+        "features": convert_to_plain(dict(hypothesis.features)),
+    }

@@ -35,26 +35,34 @@ from topomerge.errors import InputError
 from topomerge.fusion.atlas.folder import (
     ATLAS_FORMAT,
     Entry,
-    Stored,
-    changing,
-    check_folder,
+    StoredAtlas,
+    change_folder,
     files_of,
-    held_by,
     link_or_copy,
     read_atlas,
+    read_finished_folder,
+    read_folder,
 )
 from topomerge.fusion.atlas.link_evidence import Link
-from topomerge.fusion.atlas.maps import MapFiles, Maps, Memory, map_key
-from topomerge.fusion.atlas.pairs import contradiction_to_json
+from topomerge.fusion.atlas.maps import MapFiles, Maps, Memory, hash_map
+from topomerge.fusion.atlas.pairs import serialise_contradiction
 from topomerge.fusion.atlas.partners import Workers
-from topomerge.fusion.atlas.registration_cache import JOURNAL_FILE, PAIRS_FILE, Journal, registrations_to_json
 from topomerge.fusion.atlas.result import AtlasResult
-from topomerge.fusion.atlas.solve import AtlasSettings, Pace, Proposed, solve
-from topomerge.fusion.result import transform_to_json
-from topomerge.io.listing import json_text, plain
+from topomerge.fusion.atlas.solve import (
+    JOURNAL_FILE,
+    PAIRS_FILE,
+    AtlasSettings,
+    Journal,
+    Proposed,
+    SolvingSchedule,
+    serialise_registrations,
+    solve,
+)
+from topomerge.fusion.result import serialise_transform
+from topomerge.io.listing import convert_to_plain, format_json
 from topomerge.io.maps import save_map
 from topomerge.io.rooms_ply import save_rooms_ply
-from topomerge.types import LEVELLED, Array, Sim3, TopometricMap, between_files, is_level
+from topomerge.types import LEVELLED, Array, Sim3, TopometricMap, convert_pose_to_files, is_level
 
 TILE_CELLS = 1_000_000  # cells of a tile, at most, but for a single room
 NEAREST_BY = 0.5  # m: the raster in which the nearest room is looked for
@@ -63,8 +71,8 @@ JOINED_ON_ONE_PAGE = 4  # joined maps; of more each has a page of its own
 STAMP_FILE = "report_stamp.css"
 
 
-def component_to_json(atlas: AtlasResult, stored: Stored, n: int) -> dict[str, Any]:
-    """What atlas.json says of a component, but for its files."""
+def serialise_component(atlas: AtlasResult, stored: StoredAtlas, n: int) -> dict[str, Any]:
+    """Serialise a component for atlas.json, without its files."""
     members = atlas.components[n]
     digest = hashlib.sha256(__version__.encode())
     for k in members:
@@ -72,17 +80,20 @@ def component_to_json(atlas: AtlasResult, stored: Stored, n: int) -> dict[str, A
     return {
         "maps": list(members),
         "names": [stored.entries[k].name for k in members],
-        "probability": round(atlas.probability(n), 4),
+        "probability": round(atlas.get_probability(n), 4),
         "made_of": digest.hexdigest()[:16],
     }
 
 
-def atlas_to_json(atlas: AtlasResult, stored: Stored, components: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def serialise_atlas(atlas: AtlasResult, stored: StoredAtlas, components: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """atlas.json, see docs/outputs.md."""
     into = {k: members[0] for members in atlas.components for k in members}
     moved = sorted(k for k, first in into.items() if k != first or atlas.transforms[k] != Sim3())
-    lying = {k: between_files(atlas.transforms[k], stored.entries[k].levelling, stored.entries[into[k]].levelling) for k in moved}
-    poses = {str(k): transform_to_json(atlas.transforms[k], atlas.residuals[k], lying[k], into[k]) for k in moved}
+    lying = {
+        k: convert_pose_to_files(atlas.transforms[k], stored.entries[k].levelling, stored.entries[into[k]].levelling)
+        for k in moved
+    }
+    poses = {str(k): serialise_transform(atlas.transforms[k], atlas.residuals[k], lying[k], into[k]) for k in moved}
     maps = [
         {"name": e.name, "file": e.file, "key": e.key, "source": e.source, "rooms": e.rooms, "storeys": e.storeys}
         | ({} if e.frame == Sim3() else {"frame": e.frame.matrix.tolist()})
@@ -92,40 +103,40 @@ def atlas_to_json(atlas: AtlasResult, stored: Stored, components: Sequence[Mappi
     listing = {
         "format": ATLAS_FORMAT,
         "status": atlas.status,
-        "reason": atlas.words(),
+        "reason": atlas.format_summary(),
         "settings": dict(stored.settings),
         "maps": maps,
         "components": components,
         "transforms": poses,
-        "links": [_link(link) | {"probability": round(link.probability, 4)} for link in atlas.links],
-        "thrown_out": [_link(link) | {"against": link.against} for link in atlas.rejected],
-        "contradictions": [contradiction_to_json(c) for c in atlas.contradictions],
+        "links": [_serialise_link(link) | {"probability": round(link.probability, 4)} for link in atlas.links],
+        "thrown_out": [_serialise_link(link) | {"against": link.against} for link in atlas.rejected],
+        "contradictions": [serialise_contradiction(c) for c in atlas.contradictions],
         "registered": {"pairs": atlas.registered[0], "of": atlas.registered[1], "complete": atlas.complete},
         "seconds": round(atlas.seconds, 3),
     }
-    plain_listing: dict[str, Any] = plain(listing)
+    plain_listing: dict[str, Any] = convert_to_plain(listing)
     return plain_listing
 
 
-def _link(link: Link) -> dict[str, Any]:
+def _serialise_link(link: Link) -> dict[str, Any]:
     return {"maps": link.maps, "by_itself": round(link.hypothesis.probability, 4)}
 
 
-def shown_of(atlas: AtlasResult, n: int, component: Mapping[str, Any], title: str) -> str:
-    """A hash of all that the page of a component shows."""
+def hash_component_page(atlas: AtlasResult, n: int, component: Mapping[str, Any], title: str) -> str:
+    """Return a hash of all that the page of a component shows."""
     members = set(atlas.components[n])
     links = [x for x in (*atlas.links, *atlas.rejected) if members & {*x.maps}]
     named = [[atlas.names[k] for k in (*x.maps, *(x.against or ()))] for x in links]
     odds = [[repr(x.hypothesis.probability), repr(x.log_odds)] for x in links]
     missed = [repr(atlas.residuals.get(k)) for k in sorted(members)]
-    differing = [contradiction_to_json(c) for c in atlas.contradictions if members & {*c.maps}]
+    differing = [serialise_contradiction(c) for c in atlas.contradictions if members & {*c.maps}]
     content = [title, n, component["maps"], component["names"], component["made_of"], missed, named, odds, differing]
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
-def tiles(map: TopometricMap) -> list[Array]:
-    """The rooms of each tile, ascending; every room is in one. A map without rooms is one tile."""
-    size = np.bincount(nearest_rooms(map), minlength=len(map.rooms)) if len(map.rooms) else np.zeros(0, np.int64)
+def split_into_tiles(map: TopometricMap) -> list[Array]:
+    """Return the rooms of each tile, ascending; every room is in one. A map without rooms is one tile."""
+    size = np.bincount(find_nearest_rooms(map), minlength=len(map.rooms)) if len(map.rooms) else np.zeros(0, np.int64)
     parts, small = [np.arange(len(map.rooms))], []
     while parts:
         rooms = parts.pop()
@@ -140,7 +151,7 @@ def tiles(map: TopometricMap) -> list[Array]:
     return small
 
 
-def nearest_rooms(map: TopometricMap) -> Array:
+def find_nearest_rooms(map: TopometricMap) -> Array:
     """(n,) room of each occupied cell; of those without one that of the nearest cell with one, from above. 0 where none has."""
     owner = map.room.astype(np.int64)
     inside = owner >= 0
@@ -154,19 +165,19 @@ def nearest_rooms(map: TopometricMap) -> Array:
     return owner
 
 
-def tile_map(map: TopometricMap, rooms: Sequence[int] | Array) -> TopometricMap:
-    """The map with nothing but what belongs to some of its rooms, which keep their numbers."""
+def select_tile(map: TopometricMap, rooms: Sequence[int] | Array) -> TopometricMap:
+    """Return the map with nothing but what belongs to some of its rooms, which keep their numbers."""
     mine = np.zeros(max(len(map.rooms), 1), bool)
     mine[np.asarray(rooms, np.int64)] = True
     mine |= not len(map.rooms)
-    cells, floor = mine[nearest_rooms(map)], (map.navigable_room >= 0) & mine[np.maximum(map.navigable_room, 0)]
+    cells, floor = mine[find_nearest_rooms(map)], (map.navigable_room >= 0) & mine[np.maximum(map.navigable_room, 0)]
     assert map.navigable_area is not None
     return replace(
         map,
-        grid=map.grid.subset(cells),
+        grid=map.grid.select_cells(cells),
         room=map.room[cells],
         provenance=None if map.provenance is None else map.provenance[cells],
-        navigable=map.navigable.subset(floor),
+        navigable=map.navigable.select_cells(floor),
         navigable_room=map.navigable_room[floor],
         navigable_area=map.navigable_area[floor],
         edges=map.edges[mine[map.edges["rooms"]].any(axis=1)] if len(map.edges) else map.edges,
@@ -188,7 +199,7 @@ class Change:
         seconds: after which no more pairs are registered: what is left is for the next change.
     """
 
-    stored: Stored
+    stored: StoredAtlas
     new: Mapping[str, TopometricMap | Path] = field(default_factory=dict)
     proposed: Proposed = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
@@ -208,28 +219,28 @@ def add(
         folder: of the atlas.
         maps: name, map; where a name is taken already, a number is put behind it. Only one is in memory at once, if they are made
             one after the other.
-        report: makes report.html (`topomerge.atlas_html`).
+        report: makes report.html (`topomerge.render_atlas_html`).
         workers: register pairs in place of this process (`workers.processes`, `workers.cluster`).
         settings: ``scale``, ``threshold``, ``embedder`` of `atlas`; they stay those of the atlas.
 
     Raises:
         InputError: the folder is no atlas, a map is in it already, or what `atlas` says of the maps.
     """
-    check_folder(folder)
+    read_folder(folder)
     with tempfile.TemporaryDirectory(prefix="topomerge-") as spool:
         entries = []
         for k, (name, m) in enumerate(maps):
-            entries.append(entry_of(name, m, Stored(Path(folder))))
+            entries.append(build_entry(name, m, StoredAtlas(Path(folder))))
             save_map(m, Path(spool) / f"{k}.tmap")
 
-        def with_maps(stored: Stored) -> Change:
+        def with_maps(stored: StoredAtlas) -> Change:
             stored = replace(stored, settings={**stored.settings, **settings})
             new = {}
             for k, entry in enumerate(entries):
-                same = stored.named(entry.key)
+                same = stored.find_name(entry.key)
                 if same is not None:
                     raise InputError(f"{entry.source}: is in the atlas already, as {same}; leave it out")
-                entry = replace(entry, name=_free_name(entry.name, stored.entries))
+                entry = replace(entry, name=_find_free_name(entry.name, stored.entries))
                 stored = replace(stored, entries=(*stored.entries, entry))
                 new[entry.name] = Path(spool) / f"{k}.tmap"
             return Change(stored, new)
@@ -248,7 +259,7 @@ def remove(folder: str | Path, names: Sequence[str], report: Report) -> AtlasRes
     """
     read_atlas(folder)
 
-    def without_maps(stored: Stored) -> Change:
+    def without_maps(stored: StoredAtlas) -> Change:
         held = [e.name for e in stored.entries]
         for name in names:
             if name not in held:
@@ -258,13 +269,13 @@ def remove(folder: str | Path, names: Sequence[str], report: Report) -> AtlasRes
     return change(folder, without_maps, report)
 
 
-def entry_of(name: str, map: TopometricMap, stored: Stored) -> Entry:
+def build_entry(name: str, map: TopometricMap, stored: StoredAtlas) -> Entry:
     """The entry of a map that an atlas does not hold yet, under its name or, where that is taken, under another one."""
-    free_name, source, counts = _free_name(name, stored.entries), map.source or name, (len(map.rooms), len(map.storeys))
-    return Entry(free_name, map_key(map), source, *counts, levelling=map.levelling)
+    free_name, source, counts = _find_free_name(name, stored.entries), map.source or name, (len(map.rooms), len(map.storeys))
+    return Entry(free_name, hash_map(map), source, *counts, levelling=map.levelling)
 
 
-def _free_name(name: str, entries: Iterable[Entry]) -> str:
+def _find_free_name(name: str, entries: Iterable[Entry]) -> str:
     taken = {e.name.lower() for e in entries}
     name = "".join(c if c.isalnum() or c in "-_. " else "_" for c in name).strip(". ")[:80] or "map"
     numbered = [name, *(f"{name}-{k}" for k in range(2, len(taken) + 3))]
@@ -273,7 +284,7 @@ def _free_name(name: str, entries: Iterable[Entry]) -> str:
 
 def change(
     folder: str | Path,
-    make: Callable[[Stored], Change],
+    make: Callable[[StoredAtlas], Change],
     report: Report,
     memory: Memory | None = None,
     answered: Callable[[AtlasResult], None] | None = None,
@@ -285,45 +296,47 @@ def change(
         make: called with what the atlas holds when no other process can change it any more.
         report: as of `add`.
         memory: of what was made of its maps before.
-        answered, workers: as of `solve.Pace`.
+        answered, workers: as of `solve.SolvingSchedule`.
 
     Raises:
         InputError: what `make` says, or `atlas` of the maps; or the folder can't be written.
     """
     folder = Path(folder)
     gone: list[str] = []
-    with changing(folder, gone) as place:
-        before = held_by(folder)
-        wanted = make(before)
-        stored = wanted.stored
+    with change_folder(folder, gone) as place:
+        before = read_finished_folder(folder)
+        requested = make(before)
+        stored = requested.stored
         (place / "maps").mkdir()
         for entry in stored.entries:
-            new = wanted.new.get(entry.name)
+            new = requested.new.get(entry.name)
             if isinstance(new, Path):
                 link_or_copy(new, place / entry.file)
             elif new is not None:
                 save_map(new, place / entry.file)
-        files = [place / e.file if e.name in wanted.new else folder / e.file for e in stored.entries]
+        files = [place / e.file if e.name in requested.new else folder / e.file for e in stored.entries]
         names, keys = [e.name for e in stored.entries], [e.key for e in stored.entries]
         registrations = Journal(folder, stored.settings)
         memory = Memory() if memory is None else memory
         memory.coarse = registrations.coarse
-        choices, proposed = AtlasSettings(**stored.settings), {**before.lying(), **wanted.proposed}
-        atlas = solve(files, choices, registrations, names, keys, proposed, memory, Pace(wanted.seconds, answered, workers))
-        atlas = atlas.in_frames({k: e.frame for k, e in enumerate(stored.entries) if e.frame != Sim3()})
-        components = [component_to_json(atlas, stored, n) for n in range(len(atlas.components))]
-        joined = _joined(atlas, components, before, place)
+        choices, proposed = AtlasSettings(**stored.settings), {**before.compute_relative_poses(), **requested.proposed}
+        atlas = solve(
+            files, choices, registrations, names, keys, proposed, memory, SolvingSchedule(requested.seconds, answered, workers)
+        )
+        atlas = atlas.transform_components({k: e.frame for k, e in enumerate(stored.entries) if e.frame != Sim3()})
+        components = [serialise_component(atlas, stored, n) for n in range(len(atlas.components))]
+        joined = _write_joined_maps(atlas, components, before, place)
         title = folder.resolve().name
-        pages = _pages(atlas, components, before, place, title, partial(report, atlas, joined, title))
-        listing = atlas_to_json(atlas, stored, components)
-        pairs = json.dumps(registrations_to_json(registrations, keys, stored.settings))
-        stamp = hashlib.sha256(json_text(listing | {"seconds": 0}).encode()).hexdigest()[:16]
+        pages = _write_pages(atlas, components, before, place, title, partial(report, atlas, joined, title))
+        listing = serialise_atlas(atlas, stored, components)
+        pairs = json.dumps(serialise_registrations(registrations, keys, stored.settings))
+        stamp = hashlib.sha256(format_json(listing | {"seconds": 0}).encode()).hexdigest()[:16]
         page = report(atlas, joined, title, stamp=stamp, pages=pages)
-        css = "".join(f':root {{ --{name}: "{value}"; }}\n' for name, value in _stamps(stamp, components))
-        texts = {PAIRS_FILE: pairs, "report.html": page, STAMP_FILE: css, "atlas.json": json_text(listing)}
-        for name, text in (texts | dict(wanted.files)).items():
+        css = "".join(f':root {{ --{name}: "{value}"; }}\n' for name, value in _iter_stamps(stamp, components))
+        texts = {PAIRS_FILE: pairs, "report.html": page, STAMP_FILE: css, "atlas.json": format_json(listing)}
+        for name, text in (texts | dict(requested.files)).items():
             _write(place / name, text)
-        gone += [JOURNAL_FILE, *sorted(set(before.files()) - set(replace(stored, listing=listing).files()))]
+        gone += [JOURNAL_FILE, *sorted(set(before.list_files()) - set(replace(stored, listing=listing).list_files()))]
     return replace(atlas, maps=Maps([folder / e.file for e in stored.entries]))
 
 
@@ -331,7 +344,9 @@ def _write(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8", errors="replace", newline="\n")
 
 
-def _joined(atlas: AtlasResult, components: Sequence[dict[str, Any]], before: Stored, place: Path) -> Mapping[int, TopometricMap]:
+def _write_joined_maps(
+    atlas: AtlasResult, components: Sequence[dict[str, Any]], before: StoredAtlas, place: Path
+) -> Mapping[int, TopometricMap]:
     """The joined maps, written one after the other, copied where the atlas had the same before; read when they are asked for."""
     files = {}
     for n, component in enumerate(components):
@@ -339,27 +354,27 @@ def _joined(atlas: AtlasResult, components: Sequence[dict[str, Any]], before: St
             continue
         component |= {"map": f"map_{n}.tmap", "ply": f"merged_{n}.ply"}
         files[n] = place / component["map"]
-        old = _copied(before, component, "made_of", ("map", "ply"), place)
+        old = _copy_component(before, component, "made_of", ("map", "ply"), place)
         if old is None:
-            joined = atlas.joined(n)
+            joined = atlas.join_component(n)
             save_map(joined, files[n])
             save_rooms_ply(joined, place / component["ply"])
-        count = len(tiles(joined)) if old is None else len(old.get("tiles", ()))
+        count = len(split_into_tiles(joined)) if old is None else len(old.get("tiles", ()))
         if count > 1:
             component["tiles"] = [f"map_{n}_tile_{k}.html" for k in range(count)]
     return MapFiles(files)
 
 
-def _pages(
-    atlas: AtlasResult, components: Sequence[dict[str, Any]], before: Stored, place: Path, title: str, page: Report
+def _write_pages(
+    atlas: AtlasResult, components: Sequence[dict[str, Any]], before: StoredAtlas, place: Path, title: str, page: Report
 ) -> dict[int, str]:
     """Of more joined maps than one page shows, or larger ones, the pages of each, written like the maps."""
     joined = [n for n, component in enumerate(components) if "map" in component]
     if len(joined) <= JOINED_ON_ONE_PAGE and not any("tiles" in components[n] for n in joined):
         return {}
     for n in joined:
-        components[n] |= {"page": f"map_{n}.html", "shown": shown_of(atlas, n, components[n], title)}
-        if _copied(before, components[n], "shown", ("page", "tiles"), place) is None:
+        components[n] |= {"page": f"map_{n}.html", "shown": hash_component_page(atlas, n, components[n], title)}
+        if _copy_component(before, components[n], "shown", ("page", "tiles"), place) is None:
             stamp = components[n]["shown"]
             _write(place / components[n]["page"], page(component=n, stamp=stamp))
             for k, file in enumerate(components[n].get("tiles", ())):
@@ -367,8 +382,8 @@ def _pages(
     return {n: components[n]["page"] for n in joined}
 
 
-def _copied(
-    before: Stored, component: Mapping[str, Any], digest: str, kinds: Sequence[str], place: Path
+def _copy_component(
+    before: StoredAtlas, component: Mapping[str, Any], digest: str, kinds: Sequence[str], place: Path
 ) -> Mapping[str, Any] | None:
     """Take files over from the atlas before, where it has a component with the same digest: that component."""
     old: Mapping[str, Any]
@@ -381,7 +396,7 @@ def _copied(
     return None
 
 
-def _stamps(stamp: str, components: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str]]:
+def _iter_stamps(stamp: str, components: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str]]:
     """By what each page is told: name, stamp."""
     yield "stamp", stamp
     yield from ((f"stamp-{n}", component["shown"]) for n, component in enumerate(components) if "shown" in component)

@@ -18,16 +18,16 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.folder import Entry, Stored, changing, check_folder, held_by
+from topomerge.fusion.atlas.folder import Entry, StoredAtlas, change_folder, read_finished_folder, read_folder
 from topomerge.fusion.atlas.maps import Memory
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.solve import Proposed
-from topomerge.fusion.atlas.store import Change, Report, change, entry_of
-from topomerge.fusion.fuse import rooms_in_common
-from topomerge.fusion.inputs import check_cells, check_units, link_threshold
-from topomerge.io.listing import json_text
+from topomerge.fusion.atlas.store import Change, Report, build_entry, change
+from topomerge.fusion.fuse import match_common_rooms
+from topomerge.fusion.inputs import check_cells, check_units, resolve_link_threshold
+from topomerge.io.listing import format_json
 from topomerge.io.maps import load_map
-from topomerge.io.points import PICTURES, suffixes
+from topomerge.io.points import PICTURES, list_suffixes
 from topomerge.registration.pipeline import register
 from topomerge.types import Sim3, TopometricMap
 
@@ -64,25 +64,25 @@ def read_sources(folder: Path) -> dict[str, Source]:
         listing = json.loads((folder / SOURCES_FILE).read_text(encoding="utf-8"))
         if listing["format"] != SOURCES_FORMAT:
             return {}
-        return {str(path): _source(listed) for path, listed in listing["files"].items()}
+        return {str(path): _parse_source(listed) for path, listed in listing["files"].items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return {}
 
 
-def _source(listed: Mapping[str, Any]) -> Source:
+def _parse_source(listed: Mapping[str, Any]) -> Source:
     words = [listed[name] for name in ("stamp", "digest", "map", "error")]
     if not all(isinstance(word, str) for word in words):
         raise ValueError("no source")
     return Source(*words)
 
 
-def sources_to_json(sources: Mapping[str, Source]) -> str:
-    """What `read_sources` reads."""
-    return json_text({"format": SOURCES_FORMAT, "files": {path: asdict(sources[path]) for path in sorted(sources)}})
+def serialise_sources(sources: Mapping[str, Source]) -> str:
+    """Serialise sources; `read_sources` reads them."""
+    return format_json({"format": SOURCES_FORMAT, "files": {path: asdict(sources[path]) for path in sorted(sources)}})
 
 
-def beside_clouds(folder: Path) -> tuple[str, ...]:
-    """The files that `simulate` wrote beside its clouds, if its truth.json is in the folder."""
+def list_simulation_files(folder: Path) -> tuple[str, ...]:
+    """Return the files that `simulate` wrote beside its clouds, if its truth.json is in the folder."""
     try:
         with (folder / "truth.json").open("rb") as file:
             start = "".join(file.read(200).decode(errors="replace").split())
@@ -91,7 +91,7 @@ def beside_clouds(folder: Path) -> tuple[str, ...]:
     return ("truth.json", "plan.png") if start.startswith(TRUTH) else ()
 
 
-def stamp_of(path: Path, options: str) -> str:
+def compute_stamp(path: Path, options: str) -> str:
     """Hash of the names, sizes and times of change of a file, or of all files of a folder, and of the options that it is read
     with; empty where it is gone."""
     try:
@@ -101,8 +101,8 @@ def stamp_of(path: Path, options: str) -> str:
     return hashlib.sha256(repr((of, options)).encode()).hexdigest()[:16] if of else ""
 
 
-def digest_of(path: Path, options: str) -> str:
-    """Hash of the content of a file, or of all files of a folder, and of the options that it is read with.
+def compute_digest(path: Path, options: str) -> str:
+    """Return hash of the content of a file, or of all files of a folder, and of the options that it is read with.
 
     Raises:
         OSError: it can't be read.
@@ -125,7 +125,7 @@ def files_of(path: Path) -> list[Path]:
 
 
 @dataclass(frozen=True)
-class Longer:
+class LongerVersion:
     """A longer version of a map.
 
     Args:
@@ -141,7 +141,7 @@ class Longer:
     of: int
 
 
-def longer_version(name: str, old: TopometricMap, new: TopometricMap, stored: Stored) -> Longer | None:
+def find_longer_version(name: str, old: TopometricMap, new: TopometricMap, stored: StoredAtlas) -> LongerVersion | None:
     """Where a new map lies in the one before, if it is a longer version of it: if their registration is believed as a link of the
     atlas would be, and the new map has most rooms of the one before.
 
@@ -149,16 +149,16 @@ def longer_version(name: str, old: TopometricMap, new: TopometricMap, stored: St
         name: of the old map in the atlas.
     """
     registration = register(old, new, scale=stored.settings["scale"], same=stored.settings["same"])
-    if registration.transform is None or registration.probability < link_threshold(stored.settings["threshold"]):
+    if registration.transform is None or registration.probability < resolve_link_threshold(stored.settings["threshold"]):
         return None
-    pairs, _ = rooms_in_common(old, new, registration.transform)
+    pairs, _ = match_common_rooms(old, new, registration.transform)
     rooms = len(np.unique(pairs[:, 0]))
     if rooms < LONGER * len(old.rooms):
         return None
-    return Longer(name, registration.transform, rooms, len(old.rooms))
+    return LongerVersion(name, registration.transform, rooms, len(old.rooms))
 
 
-def replaced(stored: Stored, longer: Longer, new: Entry) -> tuple[Stored, Proposed]:
+def replace_map(stored: StoredAtlas, longer: LongerVersion, new: Entry) -> tuple[StoredAtlas, Proposed]:
     """An atlas in which the new map stands where the one before stood, and where it may lie in those that were linked with it.
 
     Args:
@@ -167,7 +167,7 @@ def replaced(stored: Stored, longer: Longer, new: Entry) -> tuple[Stored, Propos
     old = next(e for e in stored.entries if e.name == longer.name)
     entry = replace(new, name=old.name, frame=old.frame @ longer.pose)
     proposed = {}
-    for (a, b), pose in stored.lying().items():
+    for (a, b), pose in stored.compute_relative_poses().items():
         if a == old.key:
             proposed[new.key, b] = longer.pose.inverse() @ pose
         elif b == old.key:
@@ -191,7 +191,7 @@ class Reader:
 
 
 @dataclass(frozen=True)
-class _Looked:
+class _ReadFile:
     """A file that was looked at; a map only where it is a new one."""
 
     path: Path
@@ -200,7 +200,7 @@ class _Looked:
 
 
 @dataclass(eq=False)
-class Watch:
+class FolderWatcher:
     """A folder and the atlas of its maps.
 
     Args:
@@ -233,44 +233,44 @@ class Watch:
             raise InputError(f"{self.folder}: no such folder; name the folder in which scans or maps appear")
         if self.folder.resolve() == self.atlas.resolve():
             raise InputError(f"{self.folder}: is watched and can't be the atlas, too; give another folder for it")
-        held = check_folder(self.atlas)
+        held = read_folder(self.atlas)
         self._complete = held.complete and not (self.warm and held.entries)
         self._since: dict[str, tuple[str, float]] = {}
         self._broken: set[Path] = set()  # links that were told of
 
-    def look(self) -> bool:
+    def update(self) -> bool:
         """Put what is new or changed, and written, into the atlas; is there anything that is just being written?
 
         Raises:
             InputError: the folder is gone, or the atlas can't be written.
         """
-        check_folder(self.atlas)
+        read_folder(self.atlas)
         sources, now = read_sources(self.atlas), time.monotonic()
-        stamps = {str(p): self._stamp(p) for p in self._inputs()}
+        stamps = {str(p): self._compute_stamp(p) for p in self._list_inputs()}
         stamps = {p: stamp for p, stamp in stamps.items() if stamp and stamp != sources.get(p, Source("", "")).stamp}
         before, self._since = self._since, {}
         for path, stamp in stamps.items():
             seen, since = before.get(path, ("", now))
             self._since[path] = (stamp, since if seen == stamp else now)
         settled = [p for p, (_, since) in self._since.items() if now - since >= self.settle]
-        for batch in self._batches(sorted(settled)):
+        for batch in self._iter_batches(sorted(settled)):
             self._write(batch)
         if not settled and not self._complete:
             self._write([])
         return len(settled) < len(stamps) or not self._complete
 
-    def _stamp(self, path: Path) -> str:
-        return stamp_of(path, self.reader.options)
+    def _compute_stamp(self, path: Path) -> str:
+        return compute_stamp(path, self.reader.options)
 
-    def _inputs(self) -> list[Path]:
+    def _list_inputs(self) -> list[Path]:
         """What may be a map."""
         try:
             there = sorted(p for p in self.folder.resolve().iterdir() if not p.name.startswith("."))
         except OSError as error:
             raise InputError(f"{self.folder}: can't be read ({error.strerror or error}); is it there?") from error
-        simulated = beside_clouds(self.folder)
+        simulated = list_simulation_files(self.folder)
         described = {p.stem for p in there if p.suffix.lower() in (".yaml", ".yml")}  # their pictures are no maps of their own
-        kinds = {*suffixes(), ".tmap"}
+        kinds = {*list_suffixes(), ".tmap"}
         there = [p for p in there if p.name not in simulated]
         own = [p for p in there if not (p.suffix.lower() in PICTURES and p.stem in described)]
         for p in sorted({p for p in own if p.is_symlink() and not p.exists()} - self._broken):
@@ -278,11 +278,11 @@ class Watch:
             self._broken.add(p)
         return [p for p in own if (p.is_dir() and p != self.atlas.resolve()) or (p.is_file() and p.suffix.lower() in kinds)]
 
-    def _batches(self, paths: list[str]) -> Iterator[list[_Looked]]:
+    def _iter_batches(self, paths: list[str]) -> Iterator[list[_ReadFile]]:
         """Read files, as many as are written at once."""
-        batch, began = list[_Looked](), time.monotonic()
+        batch, began = list[_ReadFile](), time.monotonic()
         for path in paths:
-            looked = self._looked(Path(path))
+            looked = self._read_file(Path(path))
             if looked is not None:
                 batch.append(looked)
             maps = sum(one.map is not None for one in batch)
@@ -292,40 +292,40 @@ class Watch:
         if batch:
             yield batch
 
-    def _looked(self, path: Path) -> _Looked | None:
+    def _read_file(self, path: Path) -> _ReadFile | None:
         """What a file gives; None where it changes meanwhile."""
-        stamp, sources = self._stamp(path), read_sources(self.atlas)
+        stamp, sources = self._compute_stamp(path), read_sources(self.atlas)
         try:
-            digest = digest_of(path, self.reader.options)
+            digest = compute_digest(path, self.reader.options)
             same = next((s for s in sources.values() if s.digest == digest and s.map), None)
             if same is not None:
-                return _Looked(path, replace(same, stamp=stamp))
+                return _ReadFile(path, replace(same, stamp=stamp))
             map = self.reader.read(path)
             check_cells(len(map.grid), str(path))
         except Exception as error:
             line = self.reader.failure(error, path)
             if line is None:
                 raise
-            return _Looked(path, Source(stamp, "", error=line)) if stamp == self._stamp(path) else None
-        return _Looked(path, Source(stamp, digest), map) if stamp == self._stamp(path) else None
+            return _ReadFile(path, Source(stamp, "", error=line)) if stamp == self._compute_stamp(path) else None
+        return _ReadFile(path, Source(stamp, digest), map) if stamp == self._compute_stamp(path) else None
 
-    def _write(self, batch: list[_Looked]) -> None:
+    def _write(self, batch: list[_ReadFile]) -> None:
         """Put what was read into the atlas, or go on with registering if nothing was, and say what came of it."""
         plan = _Plan(self, batch)
         if batch and all(looked.map is None for looked in batch) and (self.atlas / "atlas.json").exists():
-            with changing(self.atlas, []) as place:  # notes only
-                for name, text in plan(held_by(self.atlas)).files.items():
+            with change_folder(self.atlas, []) as place:  # notes only
+                for name, text in plan(read_finished_folder(self.atlas)).files.items():
                     (place / name).write_text(text, encoding="utf-8")
         else:
-            self._complete = change(self.atlas, plan, self.report, self.memory, plan.say).complete
-        plan.say(None)
+            self._complete = change(self.atlas, plan, self.report, self.memory, plan.report).complete
+        plan.report(None)
         self.counts.update(plan.counts)
 
 
 class _Plan:
     """What a batch changes of an atlas, found out when nobody else can change it."""
 
-    def __init__(self, watch: Watch, batch: list[_Looked]) -> None:
+    def __init__(self, watch: FolderWatcher, batch: list[_ReadFile]) -> None:
         self.watch, self.batch = watch, batch
         self.lines: list[tuple[str, bool]] = []
         self.counts: Counter[str] = Counter()
@@ -333,62 +333,64 @@ class _Plan:
         self.before: dict[str, int] = {}  # name -> component
         self.links: list[set[str]] = []  # of two maps each, that were believed
 
-    def __call__(self, stored: Stored) -> Change:
-        self.before = {name: n for name, (n, _) in stored.poses().items()}
-        self.links = [{stored.entries[k].name for k in pair} for pair in stored.linked()]
+    def __call__(self, stored: StoredAtlas) -> Change:
+        self.before = {name: n for name, (n, _) in stored.get_poses().items()}
+        self.links = [{stored.entries[k].name for k in pair} for pair in stored.list_linked_pairs()]
         sources = read_sources(stored.folder)
-        wanted = Change(replace(stored, settings={**stored.settings, **self.watch.settings}))
+        requested = Change(replace(stored, settings={**stored.settings, **self.watch.settings}))
         for looked in self.batch:
             source = looked.source
             if source.error:
                 self.lines.append((source.error, True))
                 self.counts["unreadable"] += 1
             elif looked.map is not None:
-                wanted, source = self._with_map(wanted, looked, looked.map, sources.get(str(looked.path)))
+                requested, source = self._add_map(requested, looked, looked.map, sources.get(str(looked.path)))
             sources[str(looked.path)] = source
         seconds = SECONDS_TO_ANSWER if self.batch else SECONDS_BETWEEN
-        return replace(wanted, files={SOURCES_FILE: sources_to_json(sources)}, seconds=seconds)
+        return replace(requested, files={SOURCES_FILE: serialise_sources(sources)}, seconds=seconds)
 
-    def say(self, result: AtlasResult | None) -> None:
+    def report(self, result: AtlasResult | None) -> None:
         """Say what was found out, once: as soon as it is known where the maps lie, if it will be."""
-        lines = self.lines + [(line, False) for line in (outcome(result, self) if result is not None else ())]
+        lines = self.lines + [(line, False) for line in (iter_outcome(result, self) if result is not None else ())]
         self.lines = []
         for line, is_warning in lines:
             self.watch.tell(line, is_warning)
 
-    def _with_map(self, wanted: Change, looked: _Looked, map: TopometricMap, before: Source | None) -> tuple[Change, Source]:
+    def _add_map(self, requested: Change, looked: _ReadFile, map: TopometricMap, before: Source | None) -> tuple[Change, Source]:
         """The change with one more map."""
-        stored, name = wanted.stored, looked.path.name
-        entry = entry_of(looked.path.stem, map, stored)
-        same = stored.named(entry.key)
+        stored, name = requested.stored, looked.path.name
+        entry = build_entry(looked.path.stem, map, stored)
+        same = stored.find_name(entry.key)
         if same is not None:
             self.lines.append((f"{name}: is in the atlas already, as {same}", False))
-            return wanted, replace(looked.source, map=same)
-        old = next((e for e in stored.entries if before is not None and e.name == before.map and e.name not in wanted.new), None)
+            return requested, replace(looked.source, map=same)
+        old = next(
+            (e for e in stored.entries if before is not None and e.name == before.map and e.name not in requested.new), None
+        )
         first = next(iter(stored.entries), None)
         if first is not None and stored.settings["scale"] == "fixed":
             try:
-                there = wanted.new.get(first.name) or stored.folder / first.file
-                check_units(self.watch.memory.facts(there).extent, map)
+                there = requested.new.get(first.name) or stored.folder / first.file
+                check_units(self.watch.memory.summarise(there).extent, map)
             except InputError as error:
                 self.lines.append((f"{name}: {error}", True))
                 self.counts["unreadable"] += 1
-                return wanted, replace(looked.source, error=f"{name}: {error}")
+                return requested, replace(looked.source, error=f"{name}: {error}")
         longer = None
         if old is not None and self.watch.replacing:
-            longer = longer_version(old.name, load_map(stored.folder / old.file), map, stored)
+            longer = find_longer_version(old.name, load_map(stored.folder / old.file), map, stored)
         if longer is not None:
-            stored, proposed = replaced(stored, longer, entry)
-            entry, wanted = replace(entry, name=longer.name), replace(wanted, proposed={**wanted.proposed, **proposed})
+            stored, proposed = replace_map(stored, longer, entry)
+            entry, requested = replace(entry, name=longer.name), replace(requested, proposed={**requested.proposed, **proposed})
         else:
             stored = replace(stored, entries=(*stored.entries, entry))
         self.counts["replaced" if longer else "added"] += 1
-        self.names[entry.name] = described(name, entry.name, map, longer, old.name if old else "")
-        return replace(wanted, stored=stored, new={**wanted.new, entry.name: map}), replace(looked.source, map=entry.name)
+        self.names[entry.name] = describe_file(name, entry.name, map, longer, old.name if old else "")
+        return replace(requested, stored=stored, new={**requested.new, entry.name: map}), replace(looked.source, map=entry.name)
 
 
-def described(file: str, name: str, map: TopometricMap, longer: Longer | None, old: str) -> str:
-    """What a file gave, in words.
+def describe_file(file: str, name: str, map: TopometricMap, longer: LongerVersion | None, old: str) -> str:
+    """Describe in words the map that was read from a file.
 
     Args:
         old: name of the map that the file gave before; empty: none.
@@ -401,42 +403,42 @@ def described(file: str, name: str, map: TopometricMap, longer: Longer | None, o
     return f"{file} -> {name}: {rooms}"
 
 
-def outcome(result: AtlasResult, plan: _Plan) -> Iterator[str]:
-    """Where the new maps lie, and which of the others were joined and taken apart."""
+def iter_outcome(result: AtlasResult, plan: _Plan) -> Iterator[str]:
+    """Yield sentences on where the new maps lie, and which others were joined and taken apart."""
     names = [str(name) for name in result.names]
     for name, words in plan.names.items():
-        n = result.component_of(names.index(name))
+        n = result.find_component(names.index(name))
         others = [names[k] for k in result.components[n] if names[k] != name]
         apart = "stands apart" if result.complete else "stands apart so far, there is more to be tried"
-        yield f"{words}; lies with {_listed(others)} ({result.probability(n):.2f})" if others else f"{words}; {apart}"
+        yield f"{words}; lies with {_format_names(others)} ({result.get_probability(n):.2f})" if others else f"{words}; {apart}"
     for link in result.rejected:
         pair = [names[k] for k in link.maps]
         if set(pair) in plan.links:
-            against = _listed([names[k] for k in link.against]) if link.against else "other maps"
-            yield f"no longer believed: {_listed(sorted(pair))}: {against} contradict it"
-    yield from changes({names[k]: n for n, members in enumerate(result.components) for k in members}, plan.before)
+            against = _format_names([names[k] for k in link.against]) if link.against else "other maps"
+            yield f"no longer believed: {_format_names(sorted(pair))}: {against} contradict it"
+    yield from iter_changes({names[k]: n for n, members in enumerate(result.components) for k in members}, plan.before)
 
 
-def changes(after: Mapping[str, int], before: Mapping[str, int]) -> Iterator[str]:
-    """Which maps were taken apart, and which joined, in words; of those that were there before.
+def iter_changes(after: Mapping[str, int], before: Mapping[str, int]) -> Iterator[str]:
+    """Yield sentences on which of the earlier maps were taken apart, and which joined.
 
     Args:
         after, before: name -> component.
     """
     both = [name for name in after if name in before]
     for one, two, words, between in ((before, after, "taken apart", " | "), (after, before, "joined now", " + ")):
-        for group in _groups(both, one):
-            parts = list(_groups(group, two))
+        for group in _iter_groups(both, one):
+            parts = list(_iter_groups(group, two))
             if len(parts) > 1:
-                yield f"{words}: {between.join(map(_listed, parts))}"
+                yield f"{words}: {between.join(map(_format_names, parts))}"
 
 
-def _groups(names: list[str], component: Mapping[str, int]) -> Iterator[list[str]]:
+def _iter_groups(names: list[str], component: Mapping[str, int]) -> Iterator[list[str]]:
     """Names by their component."""
     for n in dict.fromkeys(component[name] for name in names):
         yield [name for name in names if component[name] == n]
 
 
-def _listed(names: list[str]) -> str:
+def _format_names(names: list[str]) -> str:
     more = len(names) - NAMED_AT_MOST
     return ", ".join(names[:NAMED_AT_MOST]) + (f" and {more} more" if more > 0 else "")

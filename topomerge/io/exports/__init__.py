@@ -45,8 +45,8 @@ FORMATS = {
 }
 
 
-def formats(text: str) -> list[str]:
-    """The formats in "a,b".
+def parse_formats(text: str) -> list[str]:
+    """Parse the formats in "a,b".
 
     Raises:
         InputError: none, an unknown one, or one twice.
@@ -63,8 +63,8 @@ def formats(text: str) -> list[str]:
     return names
 
 
-def outputs(map: TopometricMap, name: str, path: Path, folder: bool, **options: Any) -> list[tuple[Path, Save]]:
-    """What writing a map in one format takes: paths, and for each the function that writes it there.
+def prepare_outputs(map: TopometricMap, name: str, path: Path, folder: bool, **options: Any) -> list[tuple[Path, Save]]:
+    """Prepare the writing of a map in one format: paths, and for each the function that writes it there.
 
     Args:
         map: any map.
@@ -82,7 +82,7 @@ def outputs(map: TopometricMap, name: str, path: Path, folder: bool, **options: 
     given = {key: value for key, value in options.items() if key in form.options}
     if form.folder:
         place, stem = (path.parent, path.name + "_") if folder else (path, "")
-        files: list[tuple[Path, Save]] = module.files(map, place, stem, **given)
+        files: list[tuple[Path, Save]] = module.prepare_files(map, place, stem, **given)
         return files
     return [(path.with_name(path.name + form.suffixes[0]) if folder else path, partial(module.save, map, **given))]
 
@@ -96,7 +96,7 @@ def save_export(map: TopometricMap, name: str, path: str | Path, min_confidence:
         path: the file; for ros the folder, which is made.
         min_confidence: rooms, doors, stairs and windows that are less likely are left out, 0 to 1; 0: none.
         options: `storey` (geojson, ros) a number; `origin` (geojson) "latitude,longitude" or "latitude,longitude,heading";
-            `transforms` (tf2) as `topomerge.io.exports.tf2.frame_poses` gives them.
+            `transforms` (tf2) as `topomerge.io.exports.tf2.read_frame_poses` gives them.
 
     Returns:
         The files that were written.
@@ -104,7 +104,7 @@ def save_export(map: TopometricMap, name: str, path: str | Path, min_confidence:
     Raises:
         InputError: an unknown format, a missing package, a wrong option, or the path can't be written.
     """
-    from topomerge.types import confident
+    from topomerge.types import filter_confident
 
     if name not in FORMATS:
         raise InputError(f"{name}: is no format that can be written; choose from {', '.join(FORMATS)}")
@@ -113,7 +113,7 @@ def save_export(map: TopometricMap, name: str, path: str | Path, min_confidence:
     unknown = ", ".join(sorted(set(options) - set(FORMATS[name].options)))
     if unknown:
         raise InputError(f"{unknown}: means nothing for {name}")
-    files = outputs(confident(map, min_confidence), name, Path(path), False, **options)
+    files = prepare_outputs(filter_confident(map, min_confidence), name, Path(path), False, **options)
     if FORMATS[name].folder:
         Path(path).mkdir(parents=True, exist_ok=True)
     for place, save in files:

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import shapely
 
-from topomerge.io.atomic import replacing
-from topomerge.io.palette import room_colours
-from topomerge.structure.floors import floor_polygons, inside
+from topomerge.io.archive import replace_on_success
+from topomerge.io.rooms_ply import assign_room_colours
+from topomerge.structure.floors import build_floor_polygons, find_inside_point
 from topomerge.types import ROOM_ODDS, Array, TopometricMap
 
 VERSION = {"major": 1, "minor": 1, "patch": 3}
@@ -36,8 +36,8 @@ def save(map: TopometricMap, path: Path) -> None:
     Raises:
         InputError: the path can't be written.
     """
-    nodes, edges = [*_building(map), *_rooms(map)], list(_room_edges(map))
-    for node, its_edges in _places(map):
+    nodes, edges = [*_iter_building_nodes(map), *_iter_room_nodes(map)], list(_iter_room_edges(map))
+    for node, its_edges in _iter_places(map):
         nodes.append(node)
         edges += its_edges
     graph = {
@@ -50,16 +50,16 @@ def save(map: TopometricMap, path: Path) -> None:
         "nodes": nodes,
         "edges": edges,
     }
-    with replacing(path) as beside:
+    with replace_on_success(path) as beside:
         beside.write_text(json.dumps(graph, allow_nan=False, indent=1), encoding="utf-8")
 
 
-def symbol(letter: str, number: int) -> int:
-    """The id of a node: its letter in the highest of eight bytes."""
+def encode_symbol(letter: str, number: int) -> int:
+    """Encode the id of a node: its letter in the highest of eight bytes."""
     return (ord(letter) << 56) | number
 
 
-def _node(layer: int, id: int, kind: str, name: str, at: Array, colour: Any = GREY, **more: Any) -> Json:
+def _build_node(layer: int, id: int, kind: str, name: str, at: Array, colour: Any = GREY, **more: Any) -> Json:
     attributes = {
         "type": kind,
         "position": np.asarray(at, np.float64).tolist(),
@@ -71,47 +71,49 @@ def _node(layer: int, id: int, kind: str, name: str, at: Array, colour: Any = GR
         "color": dict(zip("rgba", (*(int(c) for c in colour), 255), strict=True)),
         "semantic_label": NO_LABEL,
         "semantic_feature": {"rows": 0, "cols": 0, "data": None},
-        "bounding_box": _box(),
+        "bounding_box": _build_box(),
         **more,
     }
     return {"id": id, "layer": layer, "partition": 0, "attributes": attributes}
 
 
-def _box(low: Any = None, high: Any = None) -> Json:
+def _build_box(low: Any = None, high: Any = None) -> Json:
     none = low is None
     middle, size = (np.zeros(3), np.zeros(3)) if none else ((low + high) / 2, high - low)
     place = {"world_P_center": middle.tolist(), "world_R_center": NO_ROTATION}
     return {"type": "INVALID" if none else "AABB", "dimensions": size.tolist(), **place}
 
 
-def _edge(a: int, b: int, metadata: Json | None = None, weight: float | None = None) -> Json:
+def _build_edge(a: int, b: int, metadata: Json | None = None, weight: float | None = None) -> Json:
     weighting = {"weighted": weight is not None, "weight": 1.0 if weight is None else float(weight)}
     return {"source": a, "target": b, "info": {"type": "EdgeAttributes", "metadata": metadata or {}, **weighting}}
 
 
-def _building(map: TopometricMap) -> Iterator[Json]:
+def _iter_building_nodes(map: TopometricMap) -> Iterator[Json]:
     if len(map.rooms):
         low, high = map.rooms["lo"].min(axis=0), map.rooms["hi"].max(axis=0)
-        box = _box(low, high)
-        yield _node(BUILDING_LAYER, symbol("B", 0), "SemanticNodeAttributes", "building", (low + high) / 2, bounding_box=box)
+        box = _build_box(low, high)
+        yield _build_node(
+            BUILDING_LAYER, encode_symbol("B", 0), "SemanticNodeAttributes", "building", (low + high) / 2, bounding_box=box
+        )
 
 
-def _rooms(map: TopometricMap) -> Iterator[Json]:
-    for r, (room, colour) in enumerate(zip(map.rooms, room_colours(map), strict=True)):
+def _iter_room_nodes(map: TopometricMap) -> Iterator[Json]:
+    for r, (room, colour) in enumerate(zip(map.rooms, assign_room_colours(map), strict=True)):
         properties = {name: room[name].tolist() for name in ROOM_METADATA}
-        more = {"metadata": properties, "bounding_box": _box(room["lo"], room["hi"]), "semantic_class_probabilities": {}}
-        yield _node(ROOM_LAYER, symbol("R", r), "RoomNodeAttributes", f"room {r}", room["centroid"], colour, **more)
+        more = {"metadata": properties, "bounding_box": _build_box(room["lo"], room["hi"]), "semantic_class_probabilities": {}}
+        yield _build_node(ROOM_LAYER, encode_symbol("R", r), "RoomNodeAttributes", f"room {r}", room["centroid"], colour, **more)
 
 
-def _room_edges(map: TopometricMap) -> Iterator[Json]:
+def _iter_room_edges(map: TopometricMap) -> Iterator[Json]:
     """Rooms to their building, and to each other."""
     for r in range(len(map.rooms)):
-        yield _edge(symbol("B", 0), symbol("R", r))
-    for (a, b), ways in _ways_by_pair(map.edges).items():
-        yield _edge(symbol("R", a), symbol("R", b), _ways_metadata(ways))
+        yield _build_edge(encode_symbol("B", 0), encode_symbol("R", r))
+    for (a, b), ways in _group_edges_by_pair(map.edges).items():
+        yield _build_edge(encode_symbol("R", a), encode_symbol("R", b), _describe_edges(ways))
 
 
-def _ways_by_pair(table: Array) -> dict[tuple[int, int], list[Any]]:
+def _group_edges_by_pair(table: Array) -> dict[tuple[int, int], list[Any]]:
     """The rows of an edge table by the pair that they join, in order: the library refuses a second edge of a pair."""
     ways: dict[tuple[int, int], list[Any]] = {}
     for way in table:
@@ -121,49 +123,51 @@ def _ways_by_pair(table: Array) -> dict[tuple[int, int], list[Any]]:
     return dict(sorted(ways.items()))
 
 
-def _ways_metadata(ways: list[Any], kind: str = "") -> Json:
+def _describe_edges(ways: list[Any], kind: str = "") -> Json:
     """Kind and width (m) of the widest way, then each way with its centre (m); a given kind stands for that of all."""
     listed = [{"kind": kind or str(w["kind"]), "width": float(w["width"]), "centre": w["centre"].tolist()} for w in ways]
     widest = max(listed, key=lambda way: way["width"])
     return {"kind": widest["kind"], "width": widest["width"], "ways": listed}
 
 
-def _places(map: TopometricMap) -> Iterator[tuple[Json, list[Json]]]:
+def _iter_places(map: TopometricMap) -> Iterator[tuple[Json, list[Json]]]:
     """Each place with the edges that lead to it: areas first, then the ways between rooms."""
-    colours, floors = room_colours(map), floor_polygons(map)
-    owner, centres = _areas(map, floors)
+    colours, floors = assign_room_colours(map), build_floor_polygons(map)
+    owner, centres = _compute_area_centres(map, floors)
     narrows: dict[int, list[Json]] = {}
-    for (a, b), ways in _ways_by_pair(map.narrows).items():
+    for (a, b), ways in _group_edges_by_pair(map.narrows).items():
         far = float(np.linalg.norm(centres[a] - centres[b]))
-        narrows.setdefault(b, []).append(_edge(symbol("p", a), symbol("p", b), _ways_metadata(ways, "narrow"), far))
+        narrows.setdefault(b, []).append(
+            _build_edge(encode_symbol("p", a), encode_symbol("p", b), _describe_edges(ways, "narrow"), far)
+        )
     for i, (r, at) in enumerate(zip(owner.tolist(), centres, strict=True)):
         clear = 0.0 if floors[r].is_empty else floors[r].boundary.distance(shapely.Point(at[:2]))
-        place = _place(i, f"area {i}", at, clear, colours[r], {"room": r, "storey": int(map.rooms["storey"][r])})
-        yield place, [_edge(symbol("R", r), symbol("p", i)), *narrows.get(i, [])]
+        place = _build_place(i, f"area {i}", at, clear, colours[r], {"room": r, "storey": int(map.rooms["storey"][r])})
+        yield place, [_build_edge(encode_symbol("R", r), encode_symbol("p", i)), *narrows.get(i, [])]
     for number, way in enumerate(map.edges, start=len(owner)):
         ends, kind = way["rooms"].tolist(), str(way["kind"])
         metadata = {"kind": kind, "open": bool(way["open"]), "half": bool(way["half"]), "confidence": float(way["confidence"])}
-        place = _place(number, kind, way["centre"], way["width"] / 2, GREY, {**metadata, "rooms": ends})
-        edges = [_edge(symbol("R", ends[0]), symbol("p", number))]  # a node has one parent
+        place = _build_place(number, kind, way["centre"], way["width"] / 2, GREY, {**metadata, "rooms": ends})
+        edges = [_build_edge(encode_symbol("R", ends[0]), encode_symbol("p", number))]  # a node has one parent
         for r in dict.fromkeys(ends):
             areas_of_room = np.flatnonzero(owner == r)
             apart = np.linalg.norm(centres[areas_of_room] - way["centre"], axis=1)
             near = int(areas_of_room[apart.argmin()])
-            edges.append(_edge(symbol("p", near), symbol("p", number), metadata, float(apart.min())))
+            edges.append(_build_edge(encode_symbol("p", near), encode_symbol("p", number), metadata, float(apart.min())))
         yield place, edges
 
 
-def _areas(map: TopometricMap, floors: list[Any]) -> tuple[Array, Array]:
+def _compute_area_centres(map: TopometricMap, floors: list[Any]) -> tuple[Array, Array]:
     """(A,) room and (A, 3) a point well inside of each area; a room without areas counts as one."""
     bare = np.setdiff1d(np.arange(len(map.rooms)), map.areas["room"])
     owner = np.concatenate([map.areas["room"], bare]).astype(np.int64)
     centres = np.concatenate([map.areas["centroid"], map.rooms["centroid"][bare]])
     for i, r in enumerate(owner):
-        centres[i, :2] = inside(floors[r], centres[i])
+        centres[i, :2] = find_inside_point(floors[r], centres[i])
     return owner, centres
 
 
-def _place(number: int, name: str, at: Any, clear: float, colour: Any, metadata: Json) -> Json:
+def _build_place(number: int, name: str, at: Any, clear: float, colour: Any, metadata: Json) -> Json:
     more = {
         "distance": float(clear),
         "num_basis_points": 0,
@@ -180,4 +184,4 @@ def _place(number: int, name: str, at: Any, clear: float, colour: Any, metadata:
         "mesh_vertex_labels": [],
         "metadata": metadata,
     }
-    return _node(PLACE_LAYER, symbol("p", number), "PlaceNodeAttributes", name, at, colour, **more)
+    return _build_node(PLACE_LAYER, encode_symbol("p", number), "PlaceNodeAttributes", name, at, colour, **more)

@@ -17,10 +17,10 @@ import numpy as np
 import shapely
 
 from topomerge.errors import InputError
-from topomerge.io.atomic import replacing
-from topomerge.structure.floors import is_flight, jambs, room_levels
-from topomerge.structure.plan_structure import plan_structure
-from topomerge.structure.walls import wall_part
+from topomerge.io.archive import replace_on_success
+from topomerge.structure.floors import compute_jambs, is_flight, measure_room_levels
+from topomerge.structure.plan_structure import build_plan_structure
+from topomerge.structure.walls import build_wall_polygon
 from topomerge.types import ROOM_ODDS, Array, TopometricMap
 
 SEMI_MAJOR, FLATTENING = 6378137.0, 1 / 298.257223563  # m; the ellipsoid of WGS84
@@ -40,7 +40,7 @@ class Origin:
 
 
 def parse_origin(text: str) -> Origin:
-    """The origin in "latitude,longitude" or "latitude,longitude,heading", in degrees.
+    """Parse the origin in "latitude,longitude" or "latitude,longitude,heading", in degrees.
 
     Raises:
         InputError: something else, or a place that is not on earth.
@@ -74,33 +74,36 @@ def save(map: TopometricMap, path: Path, origin: Origin | None = None, storey: i
         raise InputError(f"--storey {storey}: the map has no such storey ({there})")
     if origin is not None:
         _check_near(map)
-    place = _metres if origin is None else _on_earth(origin)
-    features = [*_rooms(map, place, storey), *_doors(map, place, storey), *_windows(map, place, storey)]
-    features += [*_walls(map, place, storey), *_openings(map, place, storey)]
+    place = _round_positions if origin is None else _build_geodetic_transform(origin)
+    features = [*_iter_rooms(map, place, storey), *_iter_doors(map, place, storey), *_iter_windows(map, place, storey)]
+    features += [*_iter_walls(map, place, storey), *_iter_openings(map, place, storey)]
     listing: dict[str, Any] = {"type": "FeatureCollection"}
     if origin is None:
-        listing |= {"crs": None, "topomerge": _about(map, "metres in the frame of the map, z up; not longitude and latitude")}
+        listing |= {
+            "crs": None,
+            "topomerge": _describe_map(map, "metres in the frame of the map, z up; not longitude and latitude"),
+        }
     else:
-        listing["topomerge"] = _about(map, "WGS84 longitude and latitude in degrees; then metres in the frame of the map")
+        listing["topomerge"] = _describe_map(map, "WGS84 longitude and latitude in degrees; then metres in the frame of the map")
         listing["topomerge"]["origin"] = vars(origin)
-    with replacing(path) as beside:
-        beside.write_text(_text(listing, features), encoding="utf-8", errors="replace")
+    with replace_on_success(path) as beside:
+        beside.write_text(_format_collection(listing, features), encoding="utf-8", errors="replace")
 
 
-def _about(map: TopometricMap, coordinates: str) -> dict[str, Any]:
+def _describe_map(map: TopometricMap, coordinates: str) -> dict[str, Any]:
     return {"coordinates": coordinates, "source": map.source, "voxel_size": float(map.grid.edge)}
 
 
-def _text(listing: dict[str, Any], features: list[dict[str, Any]]) -> str:
+def _format_collection(listing: dict[str, Any], features: list[dict[str, Any]]) -> str:
     """A line for each feature, so that files can be compared."""
     head = json.dumps(listing, ensure_ascii=False, allow_nan=False)[:-1]
     lines = ",\n".join(json.dumps(f, ensure_ascii=False, allow_nan=False) for f in features)
     return f'{head}, "features": [\n{lines}\n]}}\n'
 
 
-def _rooms(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
-    levels, seen = room_levels(map)
-    for r, (room, floor) in enumerate(zip(map.rooms, plan_structure(map).rooms, strict=True)):
+def _iter_rooms(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
+    levels, seen = measure_room_levels(map)
+    for r, (room, floor) in enumerate(zip(map.rooms, build_plan_structure(map).rooms, strict=True)):
         if storey not in (None, int(room["storey"])):
             continue
         properties = {"kind": "room", "room": r, "storey": int(room["storey"]), "area": round(float(room["area"]), 3)}
@@ -108,74 +111,78 @@ def _rooms(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dic
         properties |= {"floor": round(float(levels[r, 0]), 3), "completeness": round(float(room["completeness"]), 3)}
         properties["glimpsed"] = bool(room["glimpsed"])
         properties |= {name: round(float(room[name]), 3) for name in ROOM_ODDS}
-        yield _feature(f"room {r}", _polygons(floor, float(levels[r, 0]), place), properties)
+        yield _build_feature(f"room {r}", _build_polygons(floor, float(levels[r, 0]), place), properties)
 
 
-def _doors(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
+def _iter_doors(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
     for i, edge in enumerate(map.edges):
         ends = edge["rooms"].tolist()
         storeys = sorted({int(s) for s in map.rooms["storey"][ends]})
         if storey is not None and storey not in storeys:
             continue
-        line = np.stack([edge["lower"], edge["upper"]]) if is_flight(edge) else jambs(edge)
+        line = np.stack([edge["lower"], edge["upper"]]) if is_flight(edge) else compute_jambs(edge)
         properties = {"kind": str(edge["kind"]), "rooms": ends, "storey": storeys[0], "storeys": storeys}
         properties |= {name: round(float(edge[name]), 3) for name in ("width", "confidence")}
         properties |= {"height": round(float(edge["height"]), 3) or None, "open": bool(edge["open"]), "half": bool(edge["half"])}
-        yield _feature(f"edge {i}", {"type": "LineString", "coordinates": place(line)}, properties)
+        yield _build_feature(f"edge {i}", {"type": "LineString", "coordinates": place(line)}, properties)
 
 
-def _windows(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
-    for k, (window, pane) in enumerate(zip(map.windows, plan_structure(map).windows, strict=True)):
+def _iter_windows(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
+    for k, (window, pane) in enumerate(zip(map.windows, build_plan_structure(map).windows, strict=True)):
         if storey in (None, level := int(map.rooms["storey"][window["rooms"][0]])):
-            properties = {"kind": "window", "window": k, "rooms": _sides(window), "storey": level}
-            properties |= {name: _height(window[name]) for name in ("width", "sill", "head", "confidence")}
-            yield _feature(f"window {k}", {"type": "LineString", "coordinates": place(jambs(pane))}, properties)
+            properties = {"kind": "window", "window": k, "rooms": _list_side_rooms(window), "storey": level}
+            properties |= {name: _round_height(window[name]) for name in ("width", "sill", "head", "confidence")}
+            yield _build_feature(f"window {k}", {"type": "LineString", "coordinates": place(compute_jambs(pane))}, properties)
 
 
-def _height(value: Any) -> float | None:
+def _round_height(value: Any) -> float | None:
     return round(float(value), 3) if np.isfinite(value) else None
 
 
-def _walls(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
-    for k, wall in enumerate(plan_structure(map).walls):
+def _iter_walls(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
+    for k, wall in enumerate(build_plan_structure(map).walls):
         if storey in (None, int(wall["storey"])):
-            properties = {"kind": "wall", "wall": k, "storey": int(wall["storey"]), "rooms": _sides(wall)}
+            properties = {"kind": "wall", "wall": k, "storey": int(wall["storey"]), "rooms": _list_side_rooms(wall)}
             properties |= {"thickness": round(float(wall["thickness"]), 3), "faces": int(wall["faces"])}
             properties |= {name: round(float(wall[name]), 3) for name in ("low", "high")}
-            shape = shapely.MultiPolygon([wall_part(wall)])
-            yield _feature(f"wall {k}", _polygons(shape, float(wall["low"]), place), properties)
+            shape = shapely.MultiPolygon([build_wall_polygon(wall)])
+            yield _build_feature(f"wall {k}", _build_polygons(shape, float(wall["low"]), place), properties)
 
 
-def _openings(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
-    structure = plan_structure(map)
+def _iter_openings(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
+    structure = build_plan_structure(map)
     for opening in structure.openings[structure.openings["wall"] >= 0]:
         i, wall = int(opening["edge"]), structure.walls[opening["wall"]]
         if storey in (None, int(wall["storey"])):
             properties = {"kind": "wall_opening", "of": str(opening["kind"]), "edge": i, "wall": int(opening["wall"])}
             properties |= {"storey": int(wall["storey"]), "rooms": map.edges["rooms"][i].tolist()}
             properties |= {"width": round(float(opening["width"]), 3), "height": round(float(opening["height"]), 3) or None}
-            shape = shapely.MultiPolygon([wall_part(wall, opening)])
-            yield _feature(f"opening {i}", _polygons(shape, float(opening["centre"][2]), place), properties)
+            shape = shapely.MultiPolygon([build_wall_polygon(wall, opening)])
+            yield _build_feature(f"opening {i}", _build_polygons(shape, float(opening["centre"][2]), place), properties)
     for pane in structure.windows[structure.windows["wall"] >= 0]:
         k, wall = int(pane["window"]), structure.walls[pane["wall"]]
         if storey in (None, int(wall["storey"])):
             properties = {"kind": "wall_opening", "of": "window", "window": k, "wall": int(pane["wall"])}
-            properties |= {"storey": int(wall["storey"]), "rooms": _sides(map.windows[k]), "width": _height(pane["width"])}
-            properties |= {name: _height(map.windows[name][k]) for name in ("sill", "head")}
-            shape = shapely.MultiPolygon([wall_part(wall, pane)])
-            yield _feature(f"pane {k}", _polygons(shape, float(pane["centre"][2] + pane["sill"]), place), properties)
+            properties |= {
+                "storey": int(wall["storey"]),
+                "rooms": _list_side_rooms(map.windows[k]),
+                "width": _round_height(pane["width"]),
+            }
+            properties |= {name: _round_height(map.windows[name][k]) for name in ("sill", "head")}
+            shape = shapely.MultiPolygon([build_wall_polygon(wall, pane)])
+            yield _build_feature(f"pane {k}", _build_polygons(shape, float(pane["centre"][2] + pane["sill"]), place), properties)
 
 
-def _sides(wall: Any) -> list[int | None]:
+def _list_side_rooms(wall: Any) -> list[int | None]:
     """Rooms on both sides of a wall or a window; null where none was seen."""
     return [r if r >= 0 else None for r in wall["rooms"].tolist()]
 
 
-def _feature(name: str, geometry: dict[str, Any] | None, properties: dict[str, Any]) -> dict[str, Any]:
+def _build_feature(name: str, geometry: dict[str, Any] | None, properties: dict[str, Any]) -> dict[str, Any]:
     return {"type": "Feature", "id": name, "geometry": geometry, "properties": properties}
 
 
-def _polygons(floor: shapely.MultiPolygon, z: float, place: Place) -> dict[str, Any] | None:
+def _build_polygons(floor: shapely.MultiPolygon, z: float, place: Place) -> dict[str, Any] | None:
     """The geometry of a floor; null, as RFC 7946 has it, where there is none."""
     parts = [
         [place(np.column_stack([ring.coords, np.full(len(ring.coords), z)])) for ring in (part.exterior, *part.interiors)]
@@ -186,7 +193,7 @@ def _polygons(floor: shapely.MultiPolygon, z: float, place: Place) -> dict[str, 
     return {"type": "Polygon", "coordinates": parts[0]} if len(parts) == 1 else {"type": "MultiPolygon", "coordinates": parts}
 
 
-def _metres(points: Array) -> list[list[float]]:
+def _round_positions(points: Array) -> list[list[float]]:
     rounded: list[list[float]] = np.round(np.asarray(points, np.float64), DIGITS_M).tolist()
     return rounded
 
@@ -198,7 +205,7 @@ def _check_near(map: TopometricMap) -> None:
         raise InputError(f"--origin: the map lies {far}; leave --origin out and name that grid in your GIS")
 
 
-def _on_earth(origin: Origin) -> Place:
+def _build_geodetic_transform(origin: Origin) -> Place:
     """Longitude and latitude of points in the plane that touches the ellipsoid at the origin; their z stays."""
     lat, lon, heading = (math.radians(v) for v in (origin.latitude, origin.longitude, origin.heading))
     up = np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])

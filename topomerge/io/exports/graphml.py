@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as xml
 
-from topomerge.io.exports.markup import text, write_xml
+from topomerge.io.exports.markup import replace_forbidden, write_xml
 from topomerge.types import TopometricMap
 
 SPACE = "http://graphml.graphdrawing.org/xmlns"
@@ -28,36 +28,38 @@ def save(map: TopometricMap, path: Path) -> None:
         InputError: the path can't be written.
     """
     root = xml.Element("graphml", xmlns=SPACE)
-    nodes, edges = list(_nodes(map)), list(_edges(map))
+    nodes, edges = list(_iter_nodes(map)), list(_iter_edges(map))
     keys = {
-        where: {name: _type([a[name] for _, a in items if name in a]) for name in sorted({n for _, a in items for n in a})}
+        where: {
+            name: _get_graphml_type([a[name] for _, a in items if name in a]) for name in sorted({n for _, a in items for n in a})
+        }
         for where, items in (("node", nodes), ("edge", edges))
     }
-    about = {"source": text(map.source), "voxel_size": float(map.grid.edge), "unit": "m"}
-    keys["graph"] = {name: _type([value]) for name, value in about.items()}
+    about = {"source": replace_forbidden(map.source), "voxel_size": float(map.grid.edge), "unit": "m"}
+    keys["graph"] = {name: _get_graphml_type([value]) for name, value in about.items()}
     for where, names in keys.items():
         for name, kind in names.items():
             xml.SubElement(root, "key", {"id": f"{where}_{name}", "for": where, "attr.name": name, "attr.type": kind})
     graph = xml.SubElement(root, "graph", id="map", edgedefault="undirected")
-    _data(graph, "graph", about)
+    _add_data(graph, "graph", about)
     for (name,), values in nodes:
-        _data(xml.SubElement(graph, "node", id=name), "node", values)
+        _add_data(xml.SubElement(graph, "node", id=name), "node", values)
     for number, (ends, values) in enumerate(edges):
-        _data(xml.SubElement(graph, "edge", id=f"e{number}", source=ends[0], target=ends[1]), "edge", values)
+        _add_data(xml.SubElement(graph, "edge", id=f"e{number}", source=ends[0], target=ends[1]), "edge", values)
     write_xml(root, path)
 
 
-def _type(values: list[Any]) -> str:
+def _get_graphml_type(values: list[Any]) -> str:
     return GRAPHML_TYPES[type(values[0])]
 
 
-def _data(parent: Any, where: str, values: dict[str, Any]) -> None:
+def _add_data(parent: Any, where: str, values: dict[str, Any]) -> None:
     for name, value in values.items():
         said = str(value).lower() if isinstance(value, bool) else repr(value) if isinstance(value, float) else str(value)
         xml.SubElement(parent, "data", key=f"{where}_{name}").text = said
 
 
-def _values(row: Any, *left_out: str) -> dict[str, Any]:
+def _read_row(row: Any, *left_out: str) -> dict[str, Any]:
     """The columns of a table's row; points as three numbers, what is not known (nan) left out."""
     values: dict[str, Any] = {}
     for name in row.dtype.names:
@@ -71,25 +73,25 @@ def _values(row: Any, *left_out: str) -> dict[str, Any]:
     return values
 
 
-def _place(values: dict[str, Any], name: str) -> dict[str, Any]:
+def _rename_position(values: dict[str, Any], name: str) -> dict[str, Any]:
     """The point `name_x` … as x, y and z, which programs take as a position."""
     return {key.removeprefix(f"{name}_"): value for key, value in values.items()}
 
 
-def _nodes(map: TopometricMap) -> Iterator[Item]:
+def _iter_nodes(map: TopometricMap) -> Iterator[Item]:
     for i, storey in enumerate(map.storeys):
-        yield (f"s{i}",), {"kind": "storey", "label": f"storey {i}", **_values(storey)}
+        yield (f"s{i}",), {"kind": "storey", "label": f"storey {i}", **_read_row(storey)}
     for i, room in enumerate(map.rooms):
-        yield (f"r{i}",), {"kind": "room", "label": f"room {i}", **_place(_values(room), "centroid")}
+        yield (f"r{i}",), {"kind": "room", "label": f"room {i}", **_rename_position(_read_row(room), "centroid")}
     for i, area in enumerate(map.areas):
-        yield (f"a{i}",), {"kind": "area", "label": f"area {i}", **_place(_values(area), "centroid")}
+        yield (f"a{i}",), {"kind": "area", "label": f"area {i}", **_rename_position(_read_row(area), "centroid")}
 
 
-def _edges(map: TopometricMap) -> Iterator[Item]:
+def _iter_edges(map: TopometricMap) -> Iterator[Item]:
     for table, letter, named in ((map.edges, "r", ""), (map.narrows, "a", "narrow")):
         for edge in table:
             a, b = edge["rooms"].tolist()
-            values = _place(_values(edge, "rooms", "kind"), "centre")
+            values = _rename_position(_read_row(edge, "rooms", "kind"), "centre")
             yield (f"{letter}{a}", f"{letter}{b}"), {"kind": named or str(edge["kind"]), **values}
     for i, room in enumerate(map.rooms):
         yield (f"s{room['storey']}", f"r{i}"), {"kind": "contains"}

@@ -19,10 +19,10 @@ from xml.etree import ElementTree as xml
 import numpy as np
 import shapely
 
-from topomerge.io.exports.markup import text, write_xml
-from topomerge.structure.floors import inside, is_flight, jambs, room_levels
-from topomerge.structure.plan_structure import PlanStructure, plan_structure
-from topomerge.structure.walls import wall_part
+from topomerge.io.exports.markup import replace_forbidden, write_xml
+from topomerge.structure.floors import compute_jambs, find_inside_point, is_flight, measure_room_levels
+from topomerge.structure.plan_structure import PlanStructure, build_plan_structure
+from topomerge.structure.walls import build_wall_polygon
 from topomerge.types import ROOM_ODDS, Array, TopometricMap
 
 CORE, GML = "http://www.opengis.net/indoorgml/1.0/core", "http://www.opengis.net/gml/3.2"
@@ -44,192 +44,201 @@ def save(map: TopometricMap, path: Path) -> None:
     """
     for prefix, space in (("core", CORE), ("gml", GML), ("xlink", LINK), ("xsi", SCHEMA)):
         xml.register_namespace(prefix, space)
-    structure, (levels, _) = plan_structure(map), room_levels(map)
+    structure, (levels, _) = build_plan_structure(map), measure_room_levels(map)
     floors = structure.rooms
-    root = xml.Element(_core("IndoorFeatures"), {_gml("id"): "topomerge", f"{{{SCHEMA}}}schemaLocation": f"{CORE} {XSD}"})
-    _head(root, map.source or "map")
-    _bounds(root, map)
-    place = _new(_new(root, "primalSpaceFeatures"), "PrimalSpaceFeatures", "PS")
+    root = xml.Element(
+        _qualify_core("IndoorFeatures"), {_qualify_gml("id"): "topomerge", f"{{{SCHEMA}}}schemaLocation": f"{CORE} {XSD}"}
+    )
+    _add_description(root, map.source or "map")
+    _add_bounds(root, map)
+    place = _add_element(_add_element(root, "primalSpaceFeatures"), "PrimalSpaceFeatures", "PS")
     for r, floor in enumerate(floors):
-        _cell(_new(place, "cellSpaceMember"), map, r, floor, levels[r])
-    for k, bodies in enumerate(_wall_bodies(structure)):
+        _add_cell(_add_element(place, "cellSpaceMember"), map, r, floor, levels[r])
+    for k, bodies in enumerate(_build_wall_bodies(structure)):
         for n, body in enumerate(bodies):
-            _wall(_new(place, "cellSpaceMember"), f"W{k}-{n}", structure.walls[k], *body)
+            _add_wall(_add_element(place, "cellSpaceMember"), f"W{k}-{n}", structure.walls[k], *body)
     for i, edge in enumerate(map.edges):
         if not is_flight(edge):
-            _boundary(_new(place, "cellSpaceBoundaryMember"), i, edge)
+            _add_boundary(_add_element(place, "cellSpaceBoundaryMember"), i, edge)
     for k, pane in enumerate(structure.windows):
-        _pane(_new(place, "cellSpaceBoundaryMember"), k, map.windows[k], pane)
+        _add_window(_add_element(place, "cellSpaceBoundaryMember"), k, map.windows[k], pane)
     if len(map.rooms):  # a layer without states is none
         places = zip(floors, map.rooms["centroid"], levels[:, 0], strict=True)
-        points = [np.append(inside(floor, middle), low) for floor, middle, low in places]
-        _graph(root, map, points)
+        points = [np.append(find_inside_point(floor, middle), low) for floor, middle, low in places]
+        _add_graph(root, map, points)
     write_xml(root, path)
 
 
-def _core(name: str) -> str:
+def _qualify_core(name: str) -> str:
     return f"{{{CORE}}}{name}"
 
 
-def _gml(name: str) -> str:
+def _qualify_gml(name: str) -> str:
     return f"{{{GML}}}{name}"
 
 
-def _new(parent: Any, name: str, id: str = "", space: str = CORE) -> Any:
-    return xml.SubElement(parent, f"{{{space}}}{name}", {_gml("id"): id} if id else {})
+def _add_element(parent: Any, name: str, id: str = "", space: str = CORE) -> Any:
+    return xml.SubElement(parent, f"{{{space}}}{name}", {_qualify_gml("id"): id} if id else {})
 
 
-def _link(parent: Any, name: str, id: str) -> None:
-    xml.SubElement(parent, _core(name), {f"{{{LINK}}}href": f"#{id}"})
+def _add_link(parent: Any, name: str, id: str) -> None:
+    xml.SubElement(parent, _qualify_core(name), {f"{{{LINK}}}href": f"#{id}"})
 
 
-def _head(parent: Any, name: str, **facts: Any) -> None:
+def _add_description(parent: Any, name: str, **facts: Any) -> None:
     """Description and name. Viewers read the first as key="value" pairs."""
     if facts:
-        _new(parent, "description", space=GML).text = ":".join(f'{key}="{value}"' for key, value in facts.items())
-    _new(parent, "name", space=GML).text = text(name)
+        _add_element(parent, "description", space=GML).text = ":".join(f'{key}="{value}"' for key, value in facts.items())
+    _add_element(parent, "name", space=GML).text = replace_forbidden(name)
 
 
-def _bounds(root: Any, map: TopometricMap) -> None:
+def _add_bounds(root: Any, map: TopometricMap) -> None:
     if len(map.rooms):
-        envelope = _new(_new(root, "boundedBy", space=GML), "Envelope", space=GML)
+        envelope = _add_element(_add_element(root, "boundedBy", space=GML), "Envelope", space=GML)
         envelope.set("srsDimension", "3")
         for name, corner in (("lowerCorner", map.rooms["lo"].min(axis=0)), ("upperCorner", map.rooms["hi"].max(axis=0))):
-            _new(envelope, name, space=GML).text = _numbers(corner)
+            _add_element(envelope, name, space=GML).text = _format_point(corner)
 
 
-def _numbers(point: Any) -> str:
+def _format_point(point: Any) -> str:
     return " ".join(f"{value:.4f}" for value in np.asarray(point).tolist())
 
 
-def _cell(member: Any, map: TopometricMap, r: int, floor: shapely.MultiPolygon, level: Array) -> None:
+def _add_cell(member: Any, map: TopometricMap, r: int, floor: shapely.MultiPolygon, level: Array) -> None:
     room = map.rooms[r]
-    cell = _new(member, "CellSpace", f"C{r}")
+    cell = _add_element(member, "CellSpace", f"C{r}")
     facts = {"storey": int(room["storey"]), "area": f"{room['area']:.2f}", "height": f"{room['height']:.2f}"}
-    _head(cell, f"room {r}", **facts, **{name: f"{room[name]:.2f}" for name in ROOM_ODDS})
+    _add_description(cell, f"room {r}", **facts, **{name: f"{room[name]:.2f}" for name in ROOM_ODDS})
     if not floor.is_empty:
-        _solid(cell, f"C{r}", max(floor.geoms, key=lambda part: part.area), *level.tolist())
-    _link(cell, "duality", f"S{r}")
+        _add_solid(cell, f"C{r}", max(floor.geoms, key=lambda part: part.area), *level.tolist())
+    _add_link(cell, "duality", f"S{r}")
     for i in np.flatnonzero((map.edges["rooms"] == r).any(axis=1)):
         if not is_flight(map.edges[i]):
-            _link(cell, "partialboundedBy", f"B{i}")
+            _add_link(cell, "partialboundedBy", f"B{i}")
     for k in np.flatnonzero((map.windows["rooms"] == r).any(axis=1)):
-        _link(cell, "partialboundedBy", f"P{k}")
+        _add_link(cell, "partialboundedBy", f"P{k}")
 
 
-def _solid(cell: Any, id: str, plan: shapely.Polygon, low: float, high: float) -> None:
-    shape = _new(_new(cell, "cellSpaceGeometry"), "Geometry3D")
-    shell = _new(_new(_new(shape, "Solid", f"{id}-solid", GML), "exterior", space=GML), "Shell", space=GML)
-    for k, faces in enumerate(_faces(plan, low, high)):
-        _polygon(_new(shell, "surfaceMember", space=GML), f"{id}-face{k}", faces)
+def _add_solid(cell: Any, id: str, plan: shapely.Polygon, low: float, high: float) -> None:
+    shape = _add_element(_add_element(cell, "cellSpaceGeometry"), "Geometry3D")
+    shell = _add_element(
+        _add_element(_add_element(shape, "Solid", f"{id}-solid", GML), "exterior", space=GML), "Shell", space=GML
+    )
+    for k, faces in enumerate(_iter_faces(plan, low, high)):
+        _add_polygon(_add_element(shell, "surfaceMember", space=GML), f"{id}-face{k}", faces)
 
 
-def _wall(member: Any, id: str, wall: Any, plan: shapely.Polygon, low: float, high: float) -> None:
-    cell = _new(member, "CellSpace", id)
+def _add_wall(member: Any, id: str, wall: Any, plan: shapely.Polygon, low: float, high: float) -> None:
+    cell = _add_element(member, "CellSpace", id)
     rooms = " ".join(str(r) for r in wall["rooms"].tolist() if r >= 0)
     facts = {"kind": "wall", "storey": int(wall["storey"]), "rooms": rooms, "thickness": f"{wall['thickness']:.2f}"}
-    _head(cell, f"wall {id[1:]}", **facts, measured=str(int(wall["faces"]) == 2).lower())
-    _solid(cell, id, plan, low, high)
+    _add_description(cell, f"wall {id[1:]}", **facts, measured=str(int(wall["faces"]) == 2).lower())
+    _add_solid(cell, id, plan, low, high)
 
 
-def _wall_bodies(structure: PlanStructure) -> list[list[tuple[shapely.Polygon, float, float]]]:
+def _build_wall_bodies(structure: PlanStructure) -> list[list[tuple[shapely.Polygon, float, float]]]:
     """Of each wall its prisms: plan, foot and top, m. No two of a storey cover each other, and none a room."""
     bodies = []
-    tree, rooms = shapely.STRtree(shapes := [wall_part(wall) for wall in structure.walls]), shapely.STRtree(structure.rooms)
+    tree, rooms = (
+        shapely.STRtree(shapes := [build_wall_polygon(wall) for wall in structure.walls]),
+        shapely.STRtree(structure.rooms),
+    )
     for k, (wall, shape) in enumerate(zip(structure.walls, shapes, strict=True)):
         before = [j for j in tree.query(shape) if j < k and structure.walls["storey"][j] == wall["storey"]]
         levels = structure.storey_of_rooms[(near := rooms.query(shape))]
         covered = [*(shapes[j] for j in before), *(structure.rooms[r] for r in near[levels == wall["storey"]])]
         rest = shapely.difference(shape, shapely.union_all(covered))
         own = structure.openings[structure.openings["wall"] == k]
-        gaps = [wall_part(wall, opening, THROUGH) for opening in own]
+        gaps = [build_wall_polygon(wall, opening, THROUGH) for opening in own]
         parts = [(rest.difference(shapely.union_all(gaps)), float(wall["low"]))]
         lintels = [float(opening["centre"][2]) + (float(opening["height"]) or UNSEEN_LINTEL) for opening in own]
         parts += [(rest.intersection(gap), lintel) for gap, lintel in zip(gaps, lintels, strict=True)]
         high = float(wall["high"])
-        bodies.append([(p, low, high) for part, low in parts if low < high for p in _pieces(part)])
+        bodies.append([(p, low, high) for part, low in parts if low < high for p in _split_polygons(part)])
     return bodies
 
 
-def _pieces(shape: Any) -> list[shapely.Polygon]:
+def _split_polygons(shape: Any) -> list[shapely.Polygon]:
     parts = shapely.get_parts(shapely.set_precision(shape, BODY_GRID))
     return [shapely.geometry.polygon.orient(p) for p in parts if p.geom_type == "Polygon" and p.area > LEAST_BODY]
 
 
-def _faces(floor: shapely.Polygon, low: float, high: float) -> Iterator[list[Array]]:
+def _iter_faces(floor: shapely.Polygon, low: float, high: float) -> Iterator[list[Array]]:
     """The faces of a prism, each a list of closed rings (k, 3), seen counter-clockwise from outside."""
     rings = [np.asarray(ring.coords)[:, :2] for ring in (floor.exterior, *floor.interiors)]  # the inner ones run clockwise
-    yield [_at(ring[::-1], low) for ring in rings]
-    yield [_at(ring, high) for ring in rings]
+    yield [_lift_ring(ring[::-1], low) for ring in rings]
+    yield [_lift_ring(ring, high) for ring in rings]
     for ring in rings:
         for a, b in pairwise(ring):
             yield [np.array([(*a, low), (*b, low), (*b, high), (*a, high), (*a, low)])]
 
 
-def _at(ring: Array, z: float) -> Array:
+def _lift_ring(ring: Array, z: float) -> Array:
     return np.column_stack([ring, np.full(len(ring), z)])
 
 
-def _polygon(parent: Any, id: str, rings: list[Array]) -> None:
-    polygon = _new(parent, "Polygon", id, GML)
+def _add_polygon(parent: Any, id: str, rings: list[Array]) -> None:
+    polygon = _add_element(parent, "Polygon", id, GML)
     for k, ring in enumerate(rings):
-        line = _new(_new(polygon, "interior" if k else "exterior", space=GML), "LinearRing", space=GML)
+        line = _add_element(_add_element(polygon, "interior" if k else "exterior", space=GML), "LinearRing", space=GML)
         for point in ring:
-            _new(line, "pos", space=GML).text = _numbers(point)
+            _add_element(line, "pos", space=GML).text = _format_point(point)
 
 
-def _boundary(member: Any, i: int, edge: Any) -> None:
-    boundary = _new(member, "CellSpaceBoundary", f"B{i}")
+def _add_boundary(member: Any, i: int, edge: Any) -> None:
+    boundary = _add_element(member, "CellSpaceBoundary", f"B{i}")
     kind = str(edge["kind"])
     facts = {"kind": kind, "width": f"{edge['width']:.2f}", **{k: str(bool(edge[k])).lower() for k in ("open", "half")}}
-    _head(boundary, f"{kind} {i}", **facts, confidence=f"{edge['confidence']:.2f}")
-    _link(boundary, "duality", f"T{i}")
-    a, b = jambs(edge)
+    _add_description(boundary, f"{kind} {i}", **facts, confidence=f"{edge['confidence']:.2f}")
+    _add_link(boundary, "duality", f"T{i}")
+    a, b = compute_jambs(edge)
     up = np.array([0.0, 0.0, float(edge["height"]) or UNSEEN_LINTEL])
-    shape = _new(_new(boundary, "cellSpaceBoundaryGeometry"), "geometry3D")
-    _polygon(shape, f"B{i}-face", [np.array([a, b, b + up, a + up, a])])
+    shape = _add_element(_add_element(boundary, "cellSpaceBoundaryGeometry"), "geometry3D")
+    _add_polygon(shape, f"B{i}-face", [np.array([a, b, b + up, a + up, a])])
 
 
-def _pane(member: Any, k: int, window: Any, pane: Any) -> None:
-    boundary = _new(member, "CellSpaceBoundary", f"P{k}")
+def _add_window(member: Any, k: int, window: Any, pane: Any) -> None:
+    boundary = _add_element(member, "CellSpaceBoundary", f"P{k}")
     facts = {name: f"{window[name]:.2f}" for name in ("width", "sill", "head", "confidence") if np.isfinite(window[name])}
-    _head(boundary, f"window {k}", kind="window", **facts)
-    a, b = jambs(pane) + (0, 0, pane["sill"])
+    _add_description(boundary, f"window {k}", kind="window", **facts)
+    a, b = compute_jambs(pane) + (0, 0, pane["sill"])
     up = np.array([0.0, 0.0, float(pane["head"] - pane["sill"])])
-    shape = _new(_new(boundary, "cellSpaceBoundaryGeometry"), "geometry3D")
-    _polygon(shape, f"P{k}-face", [np.array([a, b, b + up, a + up, a])])
+    shape = _add_element(_add_element(boundary, "cellSpaceBoundaryGeometry"), "geometry3D")
+    _add_polygon(shape, f"P{k}-face", [np.array([a, b, b + up, a + up, a])])
 
 
-def _graph(root: Any, map: TopometricMap, points: list[Array]) -> None:
-    graph = _new(_new(root, "multiLayeredGraph"), "MultiLayeredGraph", "MG")
-    layer = _new(_new(_new(graph, "spaceLayers", "SL"), "spaceLayerMember"), "SpaceLayer", "L0")
-    _head(layer, "rooms")
-    nodes = _new(layer, "nodes", "N")
+def _add_graph(root: Any, map: TopometricMap, points: list[Array]) -> None:
+    graph = _add_element(_add_element(root, "multiLayeredGraph"), "MultiLayeredGraph", "MG")
+    layer = _add_element(_add_element(_add_element(graph, "spaceLayers", "SL"), "spaceLayerMember"), "SpaceLayer", "L0")
+    _add_description(layer, "rooms")
+    nodes = _add_element(layer, "nodes", "N")
     for r, point in enumerate(points):
-        state = _new(_new(nodes, "stateMember"), "State", f"S{r}")
-        _head(state, f"room {r}")
-        _link(state, "duality", f"C{r}")
+        state = _add_element(_add_element(nodes, "stateMember"), "State", f"S{r}")
+        _add_description(state, f"room {r}")
+        _add_link(state, "duality", f"C{r}")
         for t in np.flatnonzero((map.edges["rooms"] == r).any(axis=1)):
-            _link(state, "connects", f"T{t}")
-        _new(_new(_new(state, "geometry"), "Point", f"S{r}-point", GML), "pos", space=GML).text = _numbers(point)
+            _add_link(state, "connects", f"T{t}")
+        _add_element(
+            _add_element(_add_element(state, "geometry"), "Point", f"S{r}-point", GML), "pos", space=GML
+        ).text = _format_point(point)
     if len(map.edges):
-        edges = _new(layer, "edges", "E")
+        edges = _add_element(layer, "edges", "E")
         for i, edge in enumerate(map.edges):
-            _transition(_new(edges, "transitionMember"), i, edge, points)
+            _add_transition(_add_element(edges, "transitionMember"), i, edge, points)
 
 
-def _transition(member: Any, i: int, edge: Any, points: list[Array]) -> None:
+def _add_transition(member: Any, i: int, edge: Any, points: list[Array]) -> None:
     """The way from room to room through the middle of a door or along a flight; its weight is its length, m."""
     a, b = edge["rooms"].tolist()
     flight = [edge["lower"], edge["upper"]] if points[a][2] <= points[b][2] else [edge["upper"], edge["lower"]]
     way = np.array([points[a], *(flight if is_flight(edge) else [edge["centre"]]), points[b]])
-    transition = _new(member, "Transition", f"T{i}")
-    _head(transition, f"{edge['kind']} {i}", confidence=f"{edge['confidence']:.2f}")
-    _new(transition, "weight").text = f"{np.linalg.norm(np.diff(way, axis=0), axis=1).sum():.4f}"
+    transition = _add_element(member, "Transition", f"T{i}")
+    _add_description(transition, f"{edge['kind']} {i}", confidence=f"{edge['confidence']:.2f}")
+    _add_element(transition, "weight").text = f"{np.linalg.norm(np.diff(way, axis=0), axis=1).sum():.4f}"
     for r in (a, b):
-        _link(transition, "connects", f"S{r}")
+        _add_link(transition, "connects", f"S{r}")
     if not is_flight(edge):
-        _link(transition, "duality", f"B{i}")
-    line = _new(_new(transition, "geometry"), "LineString", f"T{i}-line", GML)
+        _add_link(transition, "duality", f"B{i}")
+    line = _add_element(_add_element(transition, "geometry"), "LineString", f"T{i}-line", GML)
     for point in way:
-        _new(line, "pos", space=GML).text = _numbers(point)
+        _add_element(line, "pos", space=GML).text = _format_point(point)

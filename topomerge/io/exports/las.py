@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from topomerge.io.atomic import replacing
-from topomerge.io.palette import NO_ROOM, room_colours
+from topomerge.io.archive import replace_on_success
+from topomerge.io.rooms_ply import NO_ROOM, assign_room_colours
 from topomerge.types import TopometricMap
 
 SCALE = 0.001  # m
@@ -25,7 +25,7 @@ def save(map: TopometricMap, path: Path) -> None:
     """
     import laspy
 
-    points = map.grid.centroids()
+    points = map.grid.compute_centroids()
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.generating_software = "topomerge"
     header.creation_date = NO_DATE
@@ -35,8 +35,8 @@ def save(map: TopometricMap, path: Path) -> None:
         header.add_extra_dim(laspy.ExtraBytesParams(name=name, type=np.int32))
     las = laspy.LasData(header)
     las.x, las.y, las.z = points.T
-    las.room, las.storey = map.room, map.storey_of_cells()
-    colours = np.concatenate([room_colours(map), np.array([NO_ROOM], np.uint8)])[map.room].astype(np.uint16) * 257
+    las.room, las.storey = map.room, map.find_cell_storeys()
+    colours = np.concatenate([assign_room_colours(map), np.array([NO_ROOM], np.uint8)])[map.room].astype(np.uint16) * 257
     las.red, las.green, las.blue = colours.T
-    with replacing(path) as beside, beside.open("wb") as file:
+    with replace_on_success(path) as beside, beside.open("wb") as file:
         las.write(file, do_compress=path.suffix.lower() == ".laz")

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as xml
 
-from topomerge.io.atomic import replacing
+from topomerge.io.archive import replace_on_success
 
 FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
-def text(value: str) -> str:
-    """A text without the characters that XML cannot hold."""
+def replace_forbidden(value: str) -> str:
+    """Return a text without the characters that XML cannot hold."""
     return FORBIDDEN.sub("\ufffd", value)
 
 
@@ -24,5 +24,5 @@ def write_xml(root: Any, path: Path) -> None:
         InputError: the path can't be written.
     """
     xml.indent(root)
-    with replacing(path) as beside:
+    with replace_on_success(path) as beside:
         xml.ElementTree(root).write(beside, encoding="UTF-8", xml_declaration=True)

@@ -16,9 +16,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from topomerge.io.atomic import replacing
-from topomerge.io.palette import room_colours
-from topomerge.structure.floors import floor_polygons, inside, jambs
+from topomerge.io.archive import replace_on_success
+from topomerge.io.rooms_ply import assign_room_colours
+from topomerge.structure.floors import build_floor_polygons, compute_jambs, find_inside_point
 from topomerge.types import Array, TopometricMap
 
 FRAME = "map"
@@ -41,42 +41,47 @@ def save(map: TopometricMap, path: Path) -> None:
     """
     from rosbags.rosbag2 import StoragePlugin, Writer
 
-    markers = _Markers()
+    markers = _MarkerFactory()
     with tempfile.TemporaryDirectory() as made:
         with Writer(Path(made) / "bag", version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as bag:
-            for topic, listed in _topics(map, markers):
-                to = bag.add_connection(f"/topomerge/{topic}", ARRAY, typestore=markers.store, offered_qos_profiles=[_latched()])
-                bag.write(to, TOLD_AT, markers.store.serialize_cdr(markers.array(listed), ARRAY))
+            for topic, listed in _iter_topics(map, markers):
+                to = bag.add_connection(
+                    f"/topomerge/{topic}", ARRAY, typestore=markers.store, offered_qos_profiles=[_build_latched_qos()]
+                )
+                bag.write(to, TOLD_AT, markers.store.serialize_cdr(markers.build_array(listed), ARRAY))
         (file,) = (Path(made) / "bag").glob("*.mcap")
-        with replacing(path) as beside:
+        with replace_on_success(path) as beside:
             beside.write_bytes(file.read_bytes())
 
 
-def _topics(map: TopometricMap, markers: _Markers) -> Iterator[tuple[str, list[Any]]]:
-    colours, floors = room_colours(map), floor_polygons(map)
+def _iter_topics(map: TopometricMap, markers: _MarkerFactory) -> Iterator[tuple[str, list[Any]]]:
+    colours, floors = assign_room_colours(map), build_floor_polygons(map)
     middles = np.array(
-        [[*inside(f, r["centroid"]), r["centroid"][2] + ABOVE_FLOOR] for f, r in zip(floors, map.rooms, strict=True)]
+        [[*find_inside_point(f, r["centroid"]), r["centroid"][2] + ABOVE_FLOOR] for f, r in zip(floors, map.rooms, strict=True)]
     )
     storeys = map.rooms["storey"].tolist()
-    points, size = map.navigable.centroids(), map.navigable.edge
+    points, size = map.navigable.compute_centroids(), map.navigable.edge
     flat = (size, size, CELL_HEIGHT)
     of_rooms = [(s, r) for r, s in enumerate(storeys)]
-    yield "rooms", [markers.one("CUBE_LIST", at, points[map.navigable_room == at[1]], colours[at[1]], flat) for at in of_rooms]
-    label = partial(markers.one, "TEXT_VIEW_FACING", points=np.zeros((0, 3)), colour=WHITE, scale=(0, 0, LETTERS))
+    yield (
+        "rooms",
+        [markers.build_marker("CUBE_LIST", at, points[map.navigable_room == at[1]], colours[at[1]], flat) for at in of_rooms],
+    )
+    label = partial(markers.build_marker, "TEXT_VIEW_FACING", points=np.zeros((0, 3)), colour=WHITE, scale=(0, 0, LETTERS))
     yield "names", [label(at, text=str(at[1]), middle=middles[at[1]]) for at in of_rooms]
     doors, ways = [], []
     for k, edge in enumerate(map.edges):
         a, b = edge["rooms"].tolist()
         at, centre = (storeys[a], k), edge["centre"] + (0, 0, ABOVE_FLOOR)
         colour = OPEN if edge["open"] else SHUT
-        doors.append(markers.one("LINE_LIST", at, jambs(edge) + (0, 0, ABOVE_FLOOR), colour, (2 * LINE, 0, 0)))
+        doors.append(markers.build_marker("LINE_LIST", at, compute_jambs(edge) + (0, 0, ABOVE_FLOOR), colour, (2 * LINE, 0, 0)))
         ends = np.array([middles[a], centre, centre, middles[b]])
-        ways.append(markers.one("LINE_LIST", at, ends, WAY, (LINE, 0, 0)))
+        ways.append(markers.build_marker("LINE_LIST", at, ends, WAY, (LINE, 0, 0)))
     yield "doors", doors
     yield "graph", ways
 
 
-def _latched() -> Any:
+def _build_latched_qos() -> Any:
     """Reliable and transient local: who comes late gets the newest message, as of a latched topic."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
@@ -85,7 +90,7 @@ def _latched() -> Any:
     return Qos(*newest, never, never, QosLiveliness.AUTOMATIC, never, False)
 
 
-class _Markers:
+class _MarkerFactory:
     """Makes messages of ROS 2."""
 
     @cached_property
@@ -95,11 +100,11 @@ class _Markers:
 
         return get_typestore(Stores.ROS2_HUMBLE)
 
-    def array(self, markers: list[Any]) -> Any:
+    def build_array(self, markers: list[Any]) -> Any:
         """A MarkerArray."""
-        return self._of(ARRAY, markers=markers)
+        return self._build_message(ARRAY, markers=markers)
 
-    def one(
+    def build_marker(
         self,
         kind: str,
         at: tuple[int, int],
@@ -121,37 +126,39 @@ class _Markers:
         """
         red, green, blue = (float(c) / 255 for c in colour)
         x, y, z = (0.0, 0.0, 0.0) if middle is None else (float(v) for v in middle)
-        still = self._of("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+        still = self._build_message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
         none = np.zeros(0, np.uint8)
-        picture = self._of("sensor_msgs/msg/CompressedImage", header=self._header(""), format="", data=none)
-        return self._of(
+        picture = self._build_message("sensor_msgs/msg/CompressedImage", header=self._build_header(""), format="", data=none)
+        return self._build_message(
             MARKER,
-            header=self._header(FRAME),
+            header=self._build_header(FRAME),
             ns=f"storey_{at[0]}",
             id=at[1],
             type=getattr(self.store.types[MARKER], kind),
             action=0,
-            pose=self._of("geometry_msgs/msg/Pose", position=self._point("Point", x, y, z), orientation=still),
-            scale=self._point("Vector3", *scale),
-            color=self._of("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=SOLID),
-            lifetime=self._of("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
+            pose=self._build_message("geometry_msgs/msg/Pose", position=self._build_point("Point", x, y, z), orientation=still),
+            scale=self._build_point("Vector3", *scale),
+            color=self._build_message("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=SOLID),
+            lifetime=self._build_message("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
             frame_locked=False,
-            points=[self._point("Point", *p) for p in points.tolist()],
+            points=[self._build_point("Point", *p) for p in points.tolist()],
             colors=[],
             texture_resource="",
             texture=picture,
             uv_coordinates=[],
             text=text,
             mesh_resource="",
-            mesh_file=self._of("visualization_msgs/msg/MeshFile", filename="", data=none),
+            mesh_file=self._build_message("visualization_msgs/msg/MeshFile", filename="", data=none),
             mesh_use_embedded_materials=False,
         )
 
-    def _header(self, frame: str) -> Any:
-        return self._of("std_msgs/msg/Header", stamp=self._of("builtin_interfaces/msg/Time", sec=0, nanosec=0), frame_id=frame)
+    def _build_header(self, frame: str) -> Any:
+        return self._build_message(
+            "std_msgs/msg/Header", stamp=self._build_message("builtin_interfaces/msg/Time", sec=0, nanosec=0), frame_id=frame
+        )
 
-    def _point(self, kind: str, x: float, y: float, z: float) -> Any:
-        return self._of(f"geometry_msgs/msg/{kind}", x=float(x), y=float(y), z=float(z))
+    def _build_point(self, kind: str, x: float, y: float, z: float) -> Any:
+        return self._build_message(f"geometry_msgs/msg/{kind}", x=float(x), y=float(y), z=float(z))
 
-    def _of(self, kind: str, **values: Any) -> Any:
+    def _build_message(self, kind: str, **values: Any) -> Any:
         return self.store.types[kind](**values)

@@ -19,8 +19,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from topomerge.errors import InputError
-from topomerge.io.atomic import replacing
-from topomerge.types import Array, Sim3, TopometricMap, is_level, levelling_of
+from topomerge.io.archive import replace_on_success
+from topomerge.types import Array, Sim3, TopometricMap, is_level, read_levelling
 
 LISTINGS = ("merge.json", "atlas.json")
 SAME_SCALE = 1e-6
@@ -48,12 +48,12 @@ def save(map: TopometricMap, path: Path, transforms: Sequence[FramePose] = ()) -
     """
     if not transforms:
         raise InputError("tf2: needs to know where maps lie; give the folder of a merge or an atlas that brought some together")
-    nodes = [_node(k, transform) for k, transform in enumerate(transforms)]
-    with replacing(path) as beside:
+    nodes = [_format_node(k, transform) for k, transform in enumerate(transforms)]
+    with replace_on_success(path) as beside:
         beside.write_text("\n".join(["<launch>", *nodes, "</launch>"]) + "\n", encoding="utf-8")
 
 
-def _node(number: int, transform: FramePose) -> str:
+def _format_node(number: int, transform: FramePose) -> str:
     pose = transform.pose
     if abs(pose.scale - 1) > SAME_SCALE:
         at = f"{transform.child} is {pose.scale:.4g} times as large in the frame of {transform.parent}"
@@ -71,8 +71,8 @@ def _node(number: int, transform: FramePose) -> str:
     return f"  <node {node} args={quoteattr(' '.join(words))}/>"
 
 
-def frame_poses(folder: Path, names: Sequence[str] = ()) -> list[FramePose]:
-    """What the listing of a merge or an atlas says.
+def read_frame_poses(folder: Path, names: Sequence[str] = ()) -> list[FramePose]:
+    """Read the poses of maps from the listing of a merge or an atlas.
 
     Args:
         folder: that of the merge or the atlas.
@@ -87,17 +87,17 @@ def frame_poses(folder: Path, names: Sequence[str] = ()) -> list[FramePose]:
     try:
         listing: Any = json.loads(file.read_text(encoding="utf-8"))
         sources = [str(m.get("name") or m["source"]) for m in listing["maps"]]
-        frames = _frames(sources, names)
-        levelled = [levelling_of(m) for m in listing["maps"]]
+        frames = _choose_frame_names(sources, names)
+        levelled = [read_levelling(m) for m in listing["maps"]]
         entries = sorted((int(k), int(t["into"]), t) for k, t in listing["transforms"].items())
-        return [_frame_pose((frames[into], frames[k]), t, (levelled[into], levelled[k])) for k, into, t in entries]
+        return [_parse_frame_pose((frames[into], frames[k]), t, (levelled[into], levelled[k])) for k, into, t in entries]
     except InputError:
         raise
     except (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"{file}: damaged ({' '.join(str(error).split())[:100]}); merge the maps again") from error
 
 
-def _frame_pose(frames: tuple[str, str], entry: Mapping[str, Any], levelled: tuple[Array, Array]) -> FramePose:
+def _parse_frame_pose(frames: tuple[str, str], entry: Mapping[str, Any], levelled: tuple[Array, Array]) -> FramePose:
     """The pose of the second frame in the first one, of an entry of `transforms` (docs/outputs.md)."""
     x, y, z = (float(row[3]) for row in entry["matrix"][:3])
     pose = Sim3(math.radians(float(entry["yaw_deg"])), (x, y, z), float(entry["scale"]))
@@ -105,7 +105,7 @@ def _frame_pose(frames: tuple[str, str], entry: Mapping[str, Any], levelled: tup
     return FramePose(*frames, pose, matrix)
 
 
-def _frames(sources: Sequence[str], names: Sequence[str]) -> list[str]:
+def _choose_frame_names(sources: Sequence[str], names: Sequence[str]) -> list[str]:
     """Names of frames, no two alike: letters, digits, `_` and `/`, as ROS has them."""
     if names and len(names) != len(sources):
         raise InputError(

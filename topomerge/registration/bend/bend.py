@@ -14,15 +14,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from topomerge.extraction.plans.storey_plan import StoreyPlan
-from topomerge.matching.plan_fields import PlanFields
-from topomerge.matching.refinement import storeys_at
+from topomerge.matching.poses import PlanFields, pair_storeys
 from topomerge.registration.bend.alignment import Alignment
-from topomerge.registration.bend.graph import Settled
+from topomerge.registration.bend.graph import SettledMoves
 from topomerge.registration.bend.measure import LINE_SIGMAS, Window
-from topomerge.registration.bend.pieces import Drift, drifts_of
+from topomerge.registration.bend.pieces import Drift, select_drifts
 from topomerge.registration.prepared import Prepared
 from topomerge.types import Array, Sim3
-from topomerge.types.deformation import Deformation, ShiftField
+from topomerge.types.placement import Deformation, ShiftField
 
 FIRST_WINDOW = Window(1.2, 0.3, float(np.radians(3.0)))  # in which the rigid pose is mended
 POSE_ROUNDS = 2
@@ -41,14 +40,21 @@ FOLDED = "bending would fold space"
 DOUBTED = 0.25  # weight of a measurement that is voted out
 
 
-def bent_plan(plan: StoreyPlan, forward: Callable[[Array], Array], back: Callable[[Array], Array]) -> StoreyPlan:
-    """The plan after its columns were moved.
+def bend_plan(plan: StoreyPlan, forward: Callable[[Array], Array], back: Callable[[Array], Array]) -> StoreyPlan:
+    """Return the plan after its columns were moved.
 
     Args:
         forward, back: places (n, 2) -> where they are moved to, and from where; inverses of each other.
     """
     nx, ny = plan.wall.shape
-    rim = np.concatenate([_line((0, 0), (nx, 0)), _line((nx, 0), (nx, ny)), _line((nx, ny), (0, ny)), _line((0, ny), (0, 0))])
+    rim = np.concatenate(
+        [
+            _sample_line((0, 0), (nx, 0)),
+            _sample_line((nx, 0), (nx, ny)),
+            _sample_line((nx, ny), (0, ny)),
+            _sample_line((0, ny), (0, 0)),
+        ]
+    )
     rim = forward(plan.origin + rim * plan.edge)
     low = np.floor((rim.min(axis=0) - plan.origin) / plan.edge).astype(np.int64)
     high = np.ceil((rim.max(axis=0) - plan.origin) / plan.edge).astype(np.int64)
@@ -71,7 +77,7 @@ def bent_plan(plan: StoreyPlan, forward: Callable[[Array], Array], back: Callabl
     )  # fmt: skip
 
 
-def _line(begin: tuple[int, int], end: tuple[int, int]) -> Array:
+def _sample_line(begin: tuple[int, int], end: tuple[int, int]) -> Array:
     """Points every column from a corner to the next one."""
     many = max(abs(end[0] - begin[0]), abs(end[1] - begin[1]), 1)
     out: Array = np.linspace(begin, end, many + 1)
@@ -97,25 +103,25 @@ class Bend:
     features: dict[str, float] = field(default_factory=dict)
     reason: str = ""
 
-    def relative(self, points: Array) -> Array:
+    def bend_points(self, points: Array) -> Array:
         """Points (n, 3) of b, moved so that the transform alone lays them where bending lays them on an unbent map a."""
         laid = self.transform.apply(self.deformations[1].apply(points))
         return self.transform.inverse().apply(self.deformations[0].undo(laid))
 
-    def back(self, points: Array) -> Array:
-        """The inverse of `relative`."""
+    def unbend_points(self, points: Array) -> Array:
+        """Return the inverse of `relative`."""
         laid = self.deformations[0].apply(self.transform.apply(points))
         return self.deformations[1].undo(self.transform.inverse().apply(laid))
 
     def inverse(self) -> Bend:
-        """The same bending seen from b."""
+        """Return the same bending seen from b."""
         return replace(self, transform=self.transform.inverse(), deformations=self.deformations[::-1])
 
-    def storeys(self, b: Sequence[PlanFields]) -> tuple[PlanFields, ...]:
-        """The storeys of b, bent so that the transform lays them on an unbent map a; to be judged."""
-        return tuple(self._bent(fields) for fields in b) if not self.reason else tuple(b)
+    def bend_storeys(self, b: Sequence[PlanFields]) -> tuple[PlanFields, ...]:
+        """Return the storeys of b, bent so that the transform lays them on an unbent map a; to be judged."""
+        return tuple(self._bend_fields(fields) for fields in b) if not self.reason else tuple(b)
 
-    def _bent(self, fields: PlanFields) -> PlanFields:
+    def _bend_fields(self, fields: PlanFields) -> PlanFields:
         level, plan = fields.plan.floor_guess, fields.plan
         span = np.array(plan.wall.shape) * plan.edge
         rim = SHIFT_STEPS * np.ceil(MOST_MOVED / SHIFT_STEPS)
@@ -123,9 +129,9 @@ class Bend:
         nodes = np.ceil((span + 2 * rim) / SHIFT_STEPS).astype(int) + 1
         places = low + SHIFT_STEPS * np.stack(np.meshgrid(*(np.arange(n) for n in nodes), indexing="ij"), axis=-1).reshape(-1, 2)
         raised = np.column_stack([places, np.full(len(places), level)])
-        moved = [(move(raised)[:, :2] - places).reshape(*nodes, 2) for move in (self.relative, self.back)]
+        moved = [(move(raised)[:, :2] - places).reshape(*nodes, 2) for move in (self.bend_points, self.unbend_points)]
         forward, back = (ShiftField(low, SHIFT_STEPS, shifts).apply for shifts in moved)
-        return PlanFields(bent_plan(plan, forward, back))
+        return PlanFields(bend_plan(plan, forward, back))
 
 
 def bend(a: Prepared, b: Prepared, pose: Sim3, *, drift: tuple[Drift, Drift] | None = None, scaled: bool = False) -> Bend:
@@ -139,22 +145,22 @@ def bend(a: Prepared, b: Prepared, pose: Sim3, *, drift: tuple[Drift, Drift] | N
     """
     if b.order < a.order:  # so that nothing depends on which comes first
         return bend(b, a, pose.inverse(), drift=drift and drift[::-1], scaled=scaled).inverse()
-    usual = drift or drifts_of((a.sensor, b.sensor))
-    reason = _why_rigid(a, b, pose, usual)
+    usual = drift or select_drifts((a.sensor, b.sensor))
+    reason = _explain_rigid(a, b, pose, usual)
     if reason:
-        return Bend(pose, (_rigid(a), _rigid(b)), reason=reason)
+        return Bend(pose, (_build_rigid(a), _build_rigid(b)), reason=reason)
     mended = Alignment((a, b), (Sim3(), pose), [(0, 1)], scaled)
     for _ in range(POSE_ROUNDS):
-        mended.mend_pose(FIRST_WINDOW)
-    for alignment, settled in _ever_stiffer((a, b), mended.poses, [(0, 1)], scaled, usual):
+        mended.correct_pose(FIRST_WINDOW)
+    for alignment, settled in _iter_stiffer((a, b), mended.poses, [(0, 1)], scaled, usual):
         if settled is None:
-            return Bend(pose, (_rigid(a), _rigid(b)), reason=NO_WALLS_NEAR)
+            return Bend(pose, (_build_rigid(a), _build_rigid(b)), reason=NO_WALLS_NEAR)
         features = _features(alignment, settled)
-        alignment.fold(shared=True)
-        bent = alignment.deformations(settled)
+        alignment.absorb_moves(shared=True)
+        bent = alignment.build_deformations(settled)
         if min(d.least_growth for d in bent) >= LEAST_GROWTH:
             return Bend(alignment.poses[1], (bent[0], bent[1]), features)
-    return Bend(pose, (_rigid(a), _rigid(b)), reason=FOLDED)
+    return Bend(pose, (_build_rigid(a), _build_rigid(b)), reason=FOLDED)
 
 
 def bend_together(
@@ -174,52 +180,52 @@ def bend_together(
     names = sorted(maps)
     place = {name: k for k, name in enumerate(names)}
     first = poses[names[0]]
-    usual = drifts_of([maps[name].sensor for name in names])
+    usual = select_drifts([maps[name].sensor for name in names])
     if all(d.rigid for d in usual):
         return dict(poses), {}, NEITHER_BENDS
     start = [first.inverse() @ poses[name] for name in names]
     seen = [(place[i], place[j]) for i, j in pairs]
-    for alignment, settled in _ever_stiffer([maps[name] for name in names], start, seen, scaled, usual):
+    for alignment, settled in _iter_stiffer([maps[name] for name in names], start, seen, scaled, usual):
         if settled is None:
             return dict(poses), {}, NO_WALLS_NEAR
-        alignment.fold(shared=True)
-        bent = alignment.deformations(settled)
+        alignment.absorb_moves(shared=True)
+        bent = alignment.build_deformations(settled)
         if min(d.least_growth for d in bent) >= LEAST_GROWTH:
             moved = {name: first @ alignment.poses[place[name]] for name in names}
             return moved, {name: bent[k] for name, k in place.items() if len(bent[k]) and not usual[k].rigid}, ""
     return dict(poses), {}, FOLDED
 
 
-def _ever_stiffer(
+def _iter_stiffer(
     maps: Sequence[Prepared], poses: Sequence[Sim3], pairs: Sequence[tuple[int, int]], scaled: bool, usual: Sequence[Drift]
-) -> Iterator[tuple[Alignment, Settled | None]]:
+) -> Iterator[tuple[Alignment, SettledMoves | None]]:
     """The maps settled with their usual drift, then with less and less of it, for as long as they are asked for."""
     for share in STIFFER:
         alignment = Alignment(maps, poses, pairs, scaled)
         yield alignment, settle_all(alignment, [Drift(share * d.shift, share * d.turn) for d in usual])
 
 
-def settle_all(alignment: Alignment, drifts: Sequence[Drift]) -> Settled | None:
+def settle_all(alignment: Alignment, drifts: Sequence[Drift]) -> SettledMoves | None:
     """Move the pieces of all maps in windows that shrink, last by the lines of walls; None where no map sees walls of another."""
     settled = None
     for window in WINDOWS:
-        parts = [alignment.by_plan(*pair, window) for pair in alignment.pairs]
+        parts = [alignment.measure_by_plan(*pair, window) for pair in alignment.pairs]
         if not sum(len(p.piece) for p in parts):
             return None
         settled = alignment.settle(parts, drifts)
-    alignment.fold()
+    alignment.absorb_moves()
     for k, sigma in enumerate(LINE_SIGMAS):
         alignment.misfit[:] = 0.0
-        parts = [alignment.by_lines(*pair, sigma) for pair in alignment.pairs]
+        parts = [alignment.measure_by_lines(*pair, sigma) for pair in alignment.pairs]
         settled = alignment.settle(parts, drifts, estimated=k >= COARSE_LINES)
     return settled
 
 
-def _why_rigid(a: Prepared, b: Prepared, pose: Sim3, drift: Sequence[Drift]) -> str:
+def _explain_rigid(a: Prepared, b: Prepared, pose: Sim3, drift: Sequence[Drift]) -> str:
     """Why two maps can't be bent onto each other; empty where they can."""
     if drift[0].rigid and drift[1].rigid:
         return NEITHER_BENDS
-    if not storeys_at(a.storeys, b.storeys, pose.translation[2], pose.scale):
+    if not pair_storeys(a.storeys, b.storeys, pose.translation[2], pose.scale):
         return "no storeys lie on one level"
     if min(len(a.pieces), len(b.pieces)) == 0:
         return "a map shows no walls"
@@ -228,14 +234,14 @@ def _why_rigid(a: Prepared, b: Prepared, pose: Sim3, drift: Sequence[Drift]) -> 
     return ""
 
 
-def _rigid(map: Prepared) -> Deformation:
+def _build_rigid(map: Prepared) -> Deformation:
     none = np.zeros(0, np.int64)
     floors = np.array([s.plan.floor_guess for s in map.storeys])
     return Deformation(np.zeros((0, 2)), none, floors, np.zeros((0, 4)), np.zeros((0, 3, 3)), none.astype(np.int32), 1.0)
 
 
-def _features(alignment: Alignment, settled: Settled) -> dict[str, float]:
-    moved = np.linalg.norm(alignment.relative(1, 0)[:, :2], axis=1)
+def _features(alignment: Alignment, settled: SettledMoves) -> dict[str, float]:
+    moved = np.linalg.norm(alignment.compute_relative_moves(1, 0)[:, :2], axis=1)
     return {
         "strain": float(np.sqrt(settled.strain.sum() / max(3 * len(settled.strain), 1))),
         "bent": float(np.sqrt((moved**2).mean())),

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
-from topomerge.kernels.selected_inverse import inverse_on_factor
+from topomerge.kernels.graphs import compute_selected_inverse
 from topomerge.types import Array
 
 UNKNOWNS = 4  # of a piece: shift x, y, turn, logarithm of the scale
@@ -54,7 +54,7 @@ class Measurements:
 
 
 @dataclass(frozen=True, eq=False)
-class Settled:
+class SettledMoves:
     """Moves that settled, and what is computed of them when it is asked for: inverting costs more than solving.
 
     Args:
@@ -99,11 +99,11 @@ class Settled:
     @cached_property
     def _inverse(self) -> sparse.csr_matrix:
         """(u, u) inverse of the normal equations where their factor has entries: at all joints, and at each piece."""
-        return _inverse_of(self.factor)
+        return _invert_factor(self.factor)
 
 
-def settle(anchors: Array, joints: Joints, measured: Measurements, prior: Array) -> Settled:
-    """The moves of all pieces.
+def settle(anchors: Array, joints: Joints, measured: Measurements, prior: Array) -> SettledMoves:
+    """Solve for the moves of all pieces.
 
     Args:
         anchors: (n, 2) m.
@@ -111,17 +111,17 @@ def settle(anchors: Array, joints: Joints, measured: Measurements, prior: Array)
     """
     n = len(anchors)
     free = np.flatnonzero(prior.ravel() > 0)
-    jointed = _joint_rows(anchors, joints)[:, free]
+    jointed = _build_joint_rows(anchors, joints)[:, free]
     held = jointed.T @ jointed + sparse.diags(1 / np.maximum(prior.ravel()[free], 1e-9) ** 2)
-    rows = _measured_rows(anchors, measured)[:, free]
-    roots = _roots(measured.information)
-    whitened = _blocks_times(roots, rows)
+    rows = _build_measured_rows(anchors, measured)[:, free]
+    roots = _compute_roots(measured.information)
+    whitened = _multiply_blocks(roots, rows)
     owner = np.repeat(np.arange(len(measured.piece)), np.diff(whitened.indptr[::3]))  # the measurement of each entry
     aims = np.einsum("mij,mj->mi", roots, measured.moves)
     weights, moves = np.ones(len(aims)), np.zeros(len(free))
     relaxed = 0.0
     for k in range(CONVEX_ROUNDS):
-        scaled = _with_values(whitened, whitened.data * weights[owner]).T
+        scaled = _replace_values(whitened, whitened.data * weights[owner]).T
         factor = _factor(held + scaled @ whitened)
         moves = factor.solve(scaled @ aims.ravel())
         misfit = (whitened @ moves).reshape(-1, 3) - aims
@@ -133,7 +133,7 @@ def settle(anchors: Array, joints: Joints, measured: Measurements, prior: Array)
     squares = (jointed @ moves).reshape(-1, UNKNOWNS) ** 2
     every = np.zeros(n * UNKNOWNS)
     every[free] = moves
-    return Settled(every.reshape(n, UNKNOWNS), weights, squares, factor, jointed, free)
+    return SettledMoves(every.reshape(n, UNKNOWNS), weights, squares, factor, jointed, free)
 
 
 def _factor(normal: sparse.spmatrix) -> SuperLU:
@@ -141,26 +141,26 @@ def _factor(normal: sparse.spmatrix) -> SuperLU:
     return splu(normal.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
-def _inverse_of(factor: SuperLU) -> sparse.csr_matrix:
+def _invert_factor(factor: SuperLU) -> sparse.csr_matrix:
     """The inverse of what was factored, where the factor has entries; everywhere if rows and columns were ordered differently."""
     lower, order = factor.L, factor.perm_c
     lower.sort_indices()
     if np.array_equal(order, factor.perm_r):
-        values = inverse_on_factor(lower.indptr, lower.indices, lower.data, factor.U.diagonal())
+        values = compute_selected_inverse(lower.indptr, lower.indices, lower.data, factor.U.diagonal())
         if not np.isnan(values[:1]).any():
             half = sparse.csc_matrix((values, lower.indices, lower.indptr), lower.shape)
             return (half + sparse.tril(half, -1).T).tocsr()[order][:, order]
     return sparse.csr_matrix(factor.solve(np.eye(len(order))))
 
 
-def _roots(information: Array) -> Array:
+def _compute_roots(information: Array) -> Array:
     """(m, 3, 3) R with R^T R the information."""
     values, vectors = np.linalg.eigh(information)
     out: Array = np.sqrt(np.maximum(values, 0))[:, :, None] * vectors.transpose(0, 2, 1)
     return out
 
 
-def _effect(place: Array, anchors: Array) -> Array:
+def _build_effect(place: Array, anchors: Array) -> Array:
     """(m, 4, 4) how moves of pieces show at places: shift there, turn, scale."""
     x, y = (place - anchors).T
     out = np.tile(np.eye(4), (len(x), 1, 1))
@@ -169,7 +169,7 @@ def _effect(place: Array, anchors: Array) -> Array:
     return out
 
 
-def _sparse(blocks: Array, rows: Array, pieces: Array, shape: tuple[int, int]) -> sparse.csr_matrix:
+def _build_sparse(blocks: Array, rows: Array, pieces: Array, shape: tuple[int, int]) -> sparse.csr_matrix:
     """Blocks (m, r, 4) as a sparse matrix: block k in rows r * rows[k].. and at piece pieces[k]; those at one place are added."""
     _, high, wide = blocks.shape
     i = (high * rows)[:, None, None] + np.arange(high)[None, :, None] + np.zeros((1, 1, wide), int)
@@ -177,7 +177,7 @@ def _sparse(blocks: Array, rows: Array, pieces: Array, shape: tuple[int, int]) -
     return sparse.csr_matrix((blocks.ravel(), (i.ravel(), j.ravel())), shape)
 
 
-def _blocks_times(blocks: Array, rows: sparse.csr_matrix) -> sparse.csr_matrix:
+def _multiply_blocks(blocks: Array, rows: sparse.csr_matrix) -> sparse.csr_matrix:
     """Blocks (m, 3, 3) along the diagonal, times a sparse matrix of 3 m rows."""
     many = len(blocks)
     first = 3 * np.arange(many)[:, None, None]
@@ -186,26 +186,26 @@ def _blocks_times(blocks: Array, rows: sparse.csr_matrix) -> sparse.csr_matrix:
     return sparse.csr_matrix((blocks.ravel(), columns.ravel(), starts), (3 * many, 3 * many)) @ rows
 
 
-def _with_values(matrix: sparse.csr_matrix, values: Array) -> sparse.csr_matrix:
+def _replace_values(matrix: sparse.csr_matrix, values: Array) -> sparse.csr_matrix:
     """Other values at the same places."""
     return sparse.csr_matrix((values, matrix.indices, matrix.indptr), matrix.shape)
 
 
-def _joint_rows(anchors: Array, joints: Joints) -> sparse.csr_matrix:
+def _build_joint_rows(anchors: Array, joints: Joints) -> sparse.csr_matrix:
     """Differences of moves at the places between pieces, in standard deviations."""
     many = len(joints.pieces)
     middle = anchors[joints.pieces].mean(axis=1).reshape(-1, 2)
     ends = joints.pieces.T.ravel()
     signs = np.repeat([1.0, -1.0], many)[:, None, None]
-    blocks = signs * _effect(np.tile(middle, (2, 1)), anchors[ends]) / np.tile(joints.sigma, (2, 1))[:, :, None]
-    return _sparse(blocks, np.tile(np.arange(many), 2), ends, (UNKNOWNS * many, UNKNOWNS * len(anchors)))
+    blocks = signs * _build_effect(np.tile(middle, (2, 1)), anchors[ends]) / np.tile(joints.sigma, (2, 1))[:, :, None]
+    return _build_sparse(blocks, np.tile(np.arange(many), 2), ends, (UNKNOWNS * many, UNKNOWNS * len(anchors)))
 
 
-def _measured_rows(anchors: Array, measured: Measurements) -> sparse.csr_matrix:
+def _build_measured_rows(anchors: Array, measured: Measurements) -> sparse.csr_matrix:
     """Shift and turn of the measured pieces against the others."""
     many, count = measured.others.shape
     pieces = np.concatenate([measured.piece, measured.others.T.ravel()])
     shares = np.concatenate([np.ones(many), -measured.shares.T.ravel()])
     places = np.tile(measured.places, (1 + count, 1))
-    blocks = shares[:, None, None] * _effect(places, anchors[pieces])[:, :3]
-    return _sparse(blocks, np.tile(np.arange(many), 1 + count), pieces, (3 * many, UNKNOWNS * len(anchors)))
+    blocks = shares[:, None, None] * _build_effect(places, anchors[pieces])[:, :3]
+    return _build_sparse(blocks, np.tile(np.arange(many), 1 + count), pieces, (3 * many, UNKNOWNS * len(anchors)))

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from topomerge.kernels.bend import line_normals, line_steps, move_scores, wall_gain
-from topomerge.matching.plan_fields import DISTANCE_CAP, PlanFields, distance_to
+from topomerge.kernels.bend import build_line_equations, compute_wall_gain, estimate_line_normals, score_moves
+from topomerge.matching.poses import DISTANCE_CAP, PlanFields, compute_distance
 from topomerge.registration.bend.pieces import Pieces
 from topomerge.types import Array, Sim3
 
@@ -51,24 +51,24 @@ class Target:
     def __init__(self, fields: PlanFields) -> None:
         self.fields = fields
         self.main = fields.main_direction
-        self._rasters = _rasters(fields, self.main)
+        self._rasters = _build_rasters(fields, self.main)
 
-    def gain(self, sigma: float) -> tuple[Array, Array]:
+    def compute_gain(self, sigma: float) -> tuple[Array, Array]:
         """(5, nx, ny) float32 what a wall column that faces each sector, or none, gains there; the corner of the raster, m."""
         likelihood = np.log(MISSED + (1 - MISSED) * np.exp(-(DISTANCE_STEPS**2) / (2 * sigma**2))) - np.log(INDIFFERENT)
         level, origin, on_free, seen = self._rasters
         table = np.zeros(256, np.float32)
         table[: len(likelihood)] = EVIDENCE * likelihood
-        return wall_gain(level, table, on_free, seen), origin
+        return compute_wall_gain(level, table, on_free, seen), origin
 
-    def sectors(self, faces: Array) -> Array:
-        """(n,) sector of the faces (n, 2), `SECTORS` where there is none."""
+    def find_sectors(self, faces: Array) -> Array:
+        """Return (n,) sector of the faces (n, 2), `SECTORS` where there is none."""
         angle = np.arctan2(faces[:, 1], faces[:, 0]) - self.main
         sector = np.round(angle / (2 * np.pi / SECTORS)).astype(np.int64) % SECTORS
         return np.where(np.abs(faces).max(axis=1) > 0, sector, SECTORS)
 
 
-def _rasters(fields: PlanFields, main: float) -> tuple[Array, Array, Array, Array]:
+def _build_rasters(fields: PlanFields, main: float) -> tuple[Array, Array, Array, Array]:
     """With a rim of `DISTANCE_CAP`: (5, nx, ny) uint8 steps of distance to walls that may face each sector, and to any; the
     corner of the raster, m; (nx, ny) float32 what a wall on free floor loses; and (nx, ny) bool, was it seen?"""
     rim = int(np.ceil(DISTANCE_CAP / fields.plan.edge))
@@ -79,13 +79,13 @@ def _rasters(fields: PlanFields, main: float) -> tuple[Array, Array, Array, Arra
         angle = main + k * 2 * np.pi / SECTORS
         alike = face @ np.array([np.cos(angle), np.sin(angle)], np.float32) > FACES_ALIKE
         walls.append(wall & (alike | two_sided))
-    distance = np.stack([distance_to(w, fields.plan.edge) for w in (*walls, wall)])
+    distance = np.stack([compute_distance(w, fields.plan.edge) for w in (*walls, wall)])
     level = np.round(distance * ((len(DISTANCE_STEPS) - 1) / DISTANCE_CAP)).astype(np.uint8)
     lost = (EVIDENCE * ON_FREE_FLOOR * np.pad(fields.core, rim)).astype(np.float32)
     return level, fields.plan.origin - rim * fields.plan.edge, lost, np.pad(fields.kind != 0, rim)
 
 
-def samples(pieces: Pieces) -> tuple[Array, Array]:
+def sample_walls(pieces: Pieces) -> tuple[Array, Array]:
     """Rows of walls by which each piece is registered, with those near it, and where each piece's begin: (n + 1,)."""
     rng = np.random.default_rng(0)
     along = np.argsort(pieces.walls[:, 0], kind="stable")  # so that a piece is compared with the walls of its own strip only
@@ -124,25 +124,25 @@ def measure(
     about = pieces.anchors[np.repeat(chosen, np.diff(firsts))]
     turn = np.array([[np.cos(into.yaw), -np.sin(into.yaw)], [np.sin(into.yaw), np.cos(into.yaw)]])
     points = into.scale * (pieces.walls[every] - about)
-    sector = target.sectors(pieces.faces[every] @ turn.T)
+    sector = target.find_sectors(pieces.faces[every] @ turn.T)
     placed = pieces.anchors[chosen] + moves[chosen, :2]
     places = into.apply(np.column_stack([placed, np.zeros(len(placed))]))[:, :2]
     shift = window.shift * into.scale
     step = max(shift / 8, SHIFT_STEP)
     shifts = np.arange(-np.round(shift / step), np.round(shift / step) + 1) * step
     yaws = np.linspace(-window.turn, window.turn, TURNS)
-    gain, origin = target.gain(window.sigma)
-    scores = move_scores(
+    gain, origin = target.compute_gain(window.sigma)
+    scores = score_moves(
         points, sector, firsts, places, into.yaw + moves[chosen, 2], yaws, shifts, gain, origin, target.fields.plan.edge
     )
-    mean, information = _gaussian(scores, shifts, yaws)
+    mean, information = _fit_gaussian(scores, shifts, yaws)
     back = np.eye(3)
     back[:2, :2] = turn.T / into.scale
     there = np.linalg.inv(back)
     return moves[chosen] + mean @ back.T, there.T @ information @ there
 
 
-def _gaussian(scores: Array, shifts: Array, yaws: Array) -> tuple[Array, Array]:
+def _fit_gaussian(scores: Array, shifts: Array, yaws: Array) -> tuple[Array, Array]:
     """Means (k, 3) and information (k, 3, 3) of the moves that scores (k, Y, S, S) leave likely, beyond that of the window."""
     y, x, z = np.meshgrid(yaws, shifts, shifts, indexing="ij")
     moves = np.column_stack([x.ravel(), z.ravel(), y.ravel()])
@@ -178,8 +178,8 @@ class WallLines:
     straight: Array
 
 
-def wall_lines(fields: PlanFields, middles: Array) -> WallLines:
-    """The walls of a storey.
+def build_wall_lines(fields: PlanFields, middles: Array) -> WallLines:
+    """Return the walls of a storey.
 
     Args:
         middles: (n, 3) m, middle of the points of each cell of the map.
@@ -197,7 +197,7 @@ def wall_lines(fields: PlanFields, middles: Array) -> WallLines:
     many = np.bincount(at[chosen], minlength=len(columns))[:, None]
     total = np.column_stack([np.bincount(at[chosen], middles[chosen, k], len(columns)) for k in (0, 1)])
     points = np.where(many > 0, total / np.maximum(many, 1), fields.walls)
-    normals, straight = line_normals(row, points, columns, LINE_REACH, LEAST_ON_LINE)
+    normals, straight = estimate_line_normals(row, points, columns, LINE_REACH, LEAST_ON_LINE)
     side = (normals * fields.face[plan.wall]).sum(axis=1)
     return WallLines(
         row, points, np.where(side[:, None] < 0, -normals, normals), np.abs(side) > 0.3, (straight >= STRAIGHT) & fields.tall
@@ -228,7 +228,7 @@ def measure_lines(
     places = into.apply(np.column_stack([placed, np.zeros(len(placed))]))[:, :2]
     straight = np.where(target.straight, np.arange(len(target.points)), -1).astype(np.int32)
     row = np.where(target.row >= 0, straight[target.row], -1)
-    h, g, partners, sums = line_steps(
+    h, g, partners, sums = build_line_equations(
         points, lines.normals[rows], lines.faced[rows], start, places, into.yaw + moves[chosen, 2], row, target.points,
         target.normals, target.faced, fields.plan.origin, fields.plan.edge, PARTNER_REACH, sigma,
     )  # fmt: skip
@@ -238,11 +238,11 @@ def measure_lines(
     there = np.linalg.inv(own)
     h, g = h[enough], g[enough]
     steps = -np.einsum("kij,kj->ki", np.linalg.pinv(h, rcond=1e-4, hermitian=True), g)
-    certain = _bounded(h / (INDEPENDENT * LINE_NOISE**2))
+    certain = _bound_information(h / (INDEPENDENT * LINE_NOISE**2))
     return chosen[enough], moves[chosen[enough]] + steps @ own.T, there.T @ certain @ there, sums[enough].sum(axis=0)
 
 
-def _bounded(information: Array) -> Array:
+def _bound_information(information: Array) -> Array:
     """Information (k, 3, 3) after the floor of what can be known is added to its covariance, in each of its own directions."""
     unit = np.diag([LINE_FLOOR[0], LINE_FLOOR[0], LINE_FLOOR[1]])
     back = np.linalg.inv(unit)

@@ -11,9 +11,9 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from topomerge.errors import InputError
-from topomerge.io.weight_files import read_weights_json
-from topomerge.matching.plan_fields import PlanFields
-from topomerge.registration.storeys import extruded, slices
+from topomerge.io.archive import read_weights_json
+from topomerge.matching.poses import PlanFields
+from topomerge.registration.storeys import find_slices, is_extruded
 from topomerge.types import Array, TopometricMap, VoxelGrid
 
 PIECE_SIZE = 5.0  # m, of a piece along a main direction; rooms up to `WHOLE_SIZE` are not cut
@@ -55,19 +55,19 @@ class Pieces:
         return len(self.anchors)
 
 
-def pieces_of(storeys: Sequence[PlanFields], map: TopometricMap | None = None) -> Pieces:
+def build_pieces(storeys: Sequence[PlanFields], map: TopometricMap | None = None) -> Pieces:
     """The pieces of a map's storeys: its rooms, in parts of some metres where they are large; of a map without rooms blocks along
     its main direction."""
     parts = []
     for number, fields in enumerate(storeys):
         if len(fields.walls) < LEAST_WALLS:
             continue
-        rooms = None if map is None else _rooms_of_walls(fields, map)
-        parts.append(_storey_pieces(fields, number, rooms))
-    return _stacked(parts)
+        rooms = None if map is None else _find_wall_rooms(fields, map)
+        parts.append(_build_storey_pieces(fields, number, rooms))
+    return _stack_pieces(parts)
 
 
-def _storey_pieces(fields: PlanFields, number: int, rooms: Array | None) -> Pieces:
+def _build_storey_pieces(fields: PlanFields, number: int, rooms: Array | None) -> Pieces:
     walls = fields.walls
     main = fields.main_direction
     turned = walls @ np.array([[np.cos(main), -np.sin(main)], [np.sin(main), np.cos(main)]])
@@ -80,18 +80,18 @@ def _storey_pieces(fields: PlanFields, number: int, rooms: Array | None) -> Piec
         count = np.where(span <= whole, 1, np.ceil(span / PIECE_SIZE))
         block[rows] = np.minimum((turned[rows] - low) / np.maximum(span, 1e-6) * count, count - 1).astype(np.int64)
     _, owner = np.unique(np.column_stack([room, block]), axis=0, return_inverse=True)
-    owner = _large_enough(walls, owner)
+    owner = _merge_small_pieces(walls, owner)
     many = int(owner.max()) + 1
     count = np.bincount(owner, minlength=many)
     anchors = np.column_stack([np.bincount(owner, walls[:, k], many) / count for k in (0, 1)])
     first = np.full(many, len(owner))
     np.minimum.at(first, owner, np.arange(len(owner)))
     faces = fields.face[fields.plan.wall].astype(np.float64)
-    joints, lengths = _joints(walls, owner, anchors)
+    joints, lengths = _find_joints(walls, owner, anchors)
     return Pieces(anchors, np.full(many, number), room[first], walls, faces, fields.tall, owner, joints, lengths)
 
 
-def _large_enough(walls: Array, owner: Array) -> Array:
+def _merge_small_pieces(walls: Array, owner: Array) -> Array:
     """Owners without pieces of fewer than `LEAST_WALLS` columns, whose walls go to the nearest other piece."""
     count = np.bincount(owner)
     small = count[owner] < LEAST_WALLS
@@ -101,17 +101,17 @@ def _large_enough(walls: Array, owner: Array) -> Array:
     return np.unique(owner, return_inverse=True)[1]
 
 
-def _joints(walls: Array, owner: Array, anchors: Array) -> tuple[Array, Array]:
+def _find_joints(walls: Array, owner: Array, anchors: Array) -> tuple[Array, Array]:
     """Pieces whose walls come near each other, and how far their middles lie apart, m."""
     near = cKDTree(walls).query_pairs(1.0, output_type="ndarray")
     ends = np.sort(owner[near], axis=1)
     ends, many = np.unique(ends[ends[:, 0] != ends[:, 1]], axis=0, return_counts=True)
     joints = ends[many >= 3].reshape(-1, 2)
-    joints = np.concatenate([joints, _bridges(joints, anchors)])
+    joints = np.concatenate([joints, _find_bridges(joints, anchors)])
     return joints, np.linalg.norm(anchors[joints[:, 0]] - anchors[joints[:, 1]], axis=1)
 
 
-def _bridges(joints: Array, anchors: Array) -> Array:
+def _find_bridges(joints: Array, anchors: Array) -> Array:
     """Joints that connect what is in several parts: each to the nearest piece of another part."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -130,11 +130,11 @@ def _bridges(joints: Array, anchors: Array) -> Array:
         new.append([int(inside[k]), int(outside[nearest[k]])])
 
 
-def _rooms_of_walls(fields: PlanFields, map: TopometricMap) -> Array:
+def _find_wall_rooms(fields: PlanFields, map: TopometricMap) -> Array:
     """(w,) int32 room whose floor is nearest to each wall column of a storey, -1 where none is within `ROOM_WALL_REACH`."""
     plan, labels = fields.plan, np.full(fields.plan.wall.shape, -1, np.int32)
     inside = map.navigable_room >= 0
-    places = map.navigable.centroids(map.navigable.cells[inside])
+    places = map.navigable.compute_centroids(map.navigable.cells[inside])
     rooms = map.navigable_room[inside]
     level = plan.floor_guess
     here = np.abs(places[:, 2] - level) < 1.5
@@ -149,7 +149,7 @@ def _rooms_of_walls(fields: PlanFields, map: TopometricMap) -> Array:
     return out
 
 
-def _stacked(parts: Sequence[Pieces]) -> Pieces:
+def _stack_pieces(parts: Sequence[Pieces]) -> Pieces:
     """The pieces of all storeys, each joined with the nearest one of the storey below."""
     if not parts:
         none = np.zeros(0, np.int64)
@@ -181,36 +181,36 @@ class Drift:
         return self.shift <= 0
 
 
-def sensor_drift(sensor: str, fitted: bool = False) -> Drift:
-    """The drift that joints of a sensor's maps are as stiff as; `fitted`: as it was fitted.
+def get_sensor_drift(sensor: str, fitted: bool = False) -> Drift:
+    """Return the drift that joints of a sensor's maps are as stiff as; `fitted`: as it was fitted.
 
     Raises:
         InputError: none that is listed in `drift.json`.
     """
-    sensors = _fitted_drifts()
+    sensors = _load_fitted_drifts()
     if sensor not in sensors:
         raise InputError(f"sensor must be one of {', '.join(sorted(sensors))}, not {sensor!r}")
     softer = 1.0 if sensor == "unknown" or fitted else SOFTER
     return Drift(softer * float(sensors[sensor]["shift"]), softer * float(sensors[sensor]["turn"]))
 
 
-def _fitted_drifts() -> dict[str, Any]:
+def _load_fitted_drifts() -> dict[str, Any]:
     return read_weights_json("topomerge.registration.bend", "drift.json")
 
 
-def map_sensor(map: TopometricMap | VoxelGrid) -> str:
+def detect_sensor(map: TopometricMap | VoxelGrid) -> str:
     """The sensor of a map: the one that its parameters name; else a drawing or a slice where it looks like one, or unknown. A
     name that nobody fitted a drift to says nothing."""
     named = map.parameters.get("sensor") if isinstance(map, TopometricMap) else None
-    if isinstance(named, str) and named in _fitted_drifts():
+    if isinstance(named, str) and named in _load_fitted_drifts():
         return named
     grid = map.grid if isinstance(map, TopometricMap) else map
-    if extruded(grid):
+    if is_extruded(grid):
         return "raised"
-    return "laser2d" if slices(grid) else "unknown"
+    return "laser2d" if find_slices(grid) else "unknown"
 
 
-def drifts_of(sensors: Sequence[str]) -> list[Drift]:
+def select_drifts(sensors: Sequence[str]) -> list[Drift]:
     """The drift of each of several maps. One that was raised from lines is taken for a drawing, which does not bend, among maps
     that were measured in space; among maps of lines alone, nobody knows which ones were measured.
 
@@ -218,4 +218,4 @@ def drifts_of(sensors: Sequence[str]) -> list[Drift]:
         InputError: a sensor that is not in `drift.json`.
     """
     flat = all(s == "raised" for s in sensors)
-    return [sensor_drift(("unknown" if flat else "drawing") if s == "raised" else s) for s in sensors]
+    return [get_sensor_drift(("unknown" if flat else "drawing") if s == "raised" else s) for s in sensors]
