@@ -52,7 +52,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
             return judged(maps, believed or force, {} if more.get("rigid") else bends, apart, **more)
 
         monkeypatch.setattr(topomerge, "merge", merge, raising=False)
-        monkeypatch.setattr("topomerge.cli.merge.map_from", lambda path, args: building(1, 1))
+        monkeypatch.setattr("topomerge.cli.merge.load_input_map", lambda path, args: building(1, 1))
         monkeypatch.setattr("topomerge.viz.merge_report.render_merge_html", lambda result: "a report")
         status = cli(["merge", *words])
         out, err = capsys.readouterr()
