@@ -30,7 +30,7 @@ ONCE = (
     (walls, "place_classes"),
     (pipeline, "find_passages"),
     (pipeline, "partition_rooms"),
-    (pipeline, "topometric_map"),
+    (pipeline, "build_topometric_map"),
     (pipeline, "estimate_attributes"),
 )
 CLOUD = three_doors().points()
