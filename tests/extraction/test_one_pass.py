@@ -23,13 +23,13 @@ from topomerge.io.archive import read_weights_json
 
 ONCE = (
     (pipeline, "rasterise_storeys"),
-    (segment, "column_probabilities"),
+    (segment, "compute_column_probabilities"),
     (pipeline, "segment_storey"),
     (pipeline, "unroll_walls"),
-    (walls, "place_classes"),
+    (walls, "classify_places"),
     (pipeline, "find_passages"),
     (pipeline, "partition_rooms"),
-    (pipeline, "topometric_map"),
+    (pipeline, "build_topometric_map"),
     (pipeline, "estimate_attributes"),
 )
 CLOUD = three_doors().points()
