@@ -6,6 +6,7 @@ alone fills a column up to the ceiling (findings.md, "Rooms").
 
 from __future__ import annotations
 
+import edt
 import numpy as np
 from scipy import ndimage
 
@@ -31,6 +32,7 @@ ROOFLESS_SHARE = 0.1  # of the floor that was seen, over which something is: les
 FURNITURE_HEIGHTS = 0.25, 1.9  # m above the floor
 OVER_FURNITURE = 2.05  # m: cupboards end below
 BLOCK = 0.5  # m: ceilings are measured on tiles of this size
+CLUTTER = 0.9  # m: free-standing pieces of wall shorter than this are pillars and the like
 FLOOR_REACH = 1.5  # m: so far from a seen floor a column still has its height
 COVERED_REACH = 3.0  # m: likewise where something is above it
 LOOKED_THROUGH = 0.4, 1.9  # m above the floor, where rays say that a column is empty
@@ -38,6 +40,7 @@ LONGEST_CROSSED = 0.3  # m: longer free cells reach from wall to wall
 OVER_LEVEL = 0.3  # m: what is higher above a storey's level does not lie in its floor
 LEAST_FLOOR = 0.5  # m2 of seen floor in a part
 HOLE = 4.0  # m2: gaps this small in what is known are filled
+TOUCHES = 0.25  # m: pieces this close to a longer wall belong to it
 PLAN_MARGIN = 0.6  # m
 LEAST_SLAB = 0.1  # m at least, between a ceiling and the floor above it
 
@@ -86,7 +89,7 @@ def build_storey_plan(
     clear = find_first_above(profile, bands)
     ceiling = _estimate_ceiling(np.where(wall_like, np.nan, clear), e)
     wall = wall_like & ~_is_below_ceiling(profile, ceiling, e)
-    wall |= ndimage.binary_closing(wall, np.ones((3, 3)), border_value=0)
+    wall = _remove_clutter(ndimage.binary_closing(wall, np.ones((3, 3)), border_value=0) | wall, e)
     on_floor = (profile & np.uint64(bands.build_mask(-0.3, 0.3))) != 0
     reach = np.where(_is_open_below(grid, cells[storey[floor] == k - 1], low, base), FLOOR_REACH, COVERED_REACH)
     covered = ~np.isnan(clear)
@@ -223,6 +226,18 @@ def _is_below_ceiling(profile: Array, ceiling: Array, edge: float) -> Array:
         empty = (profile & np.uint64(bands.build_mask(OVER_FURNITURE, max(top - 0.25, OVER_FURNITURE + 0.1)))) == 0
         out |= here & empty & ((profile & np.uint64(bands.build_mask(top - 0.15, top + 0.35))) != 0)
     return out
+
+
+def _remove_clutter(wall: Array, edge: float) -> Array:
+    """The walls without short pieces that stand free."""
+    piece, count = ndimage.label(wall, np.ones((3, 3)))
+    boxes = ndimage.find_objects(piece)
+    length = np.array([max(b[0].stop - b[0].start, b[1].stop - b[1].start) for b in boxes]) * edge
+    keep = np.concatenate([[False], length > CLUTTER])
+    if keep.any():
+        gap = edt.edt((~keep[piece]).view(np.uint8), parallel=1) * edge
+        keep[1:] |= np.asarray(ndimage.minimum(gap, piece, np.arange(1, count + 1))) < TOUCHES
+    return keep[piece]
 
 
 def _fill_holes(inside: Array, wall: Array, seen: Array, covered: Array, edge: float) -> Array:
