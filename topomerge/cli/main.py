@@ -7,12 +7,10 @@ this folder and enter it in `COMMANDS`; what it needs of the package it imports 
 from __future__ import annotations
 
 import argparse
-import logging
 import os
 import sys
 import tempfile
 import traceback
-import warnings
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -37,6 +35,7 @@ from topomerge.cli.console import (
     open_output_folder,
     print_line,
     print_text,
+    show_log,
     write_all,
 )
 from topomerge.cli.export import EXPORT
@@ -325,23 +324,9 @@ def _drop_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _show_log(verbose: int, debug: bool) -> None:
-    """Show what this package logs; what libraries log or warn of, in words of theirs, only to those who look for a fault."""
-    if not logging.getLogger().handlers:
-        handler = logging.StreamHandler()
-        handler.setFormatter(logging.Formatter("topomerge: %(message)s"))
-        if not debug:
-            handler.addFilter(logging.Filter("topomerge"))
-        logging.getLogger().addHandler(handler)
-    level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
-    logging.getLogger("topomerge").setLevel(level)
-    if not debug and not sys.warnoptions:
-        warnings.simplefilter("ignore")
-
-
 def _run(args: argparse.Namespace) -> int:
     debug = args.verbose > 1 or os.environ.get("TOPOMERGE_DEBUG", "") not in ("", "0")
-    _show_log(args.verbose, debug)
+    show_log(args.verbose, debug)
     try:
         check_memory_limit()
         status = int(args.run(args))
