@@ -54,9 +54,9 @@ class Verdict:
 
     def format_lines(self) -> list[str]:
         """Format a table, and in one line whether it helped."""
-        rows = [f"{'':9}{'old':20}{'new':20}gain"]
+        rows = [f"{'':10}{'old':22}{'new':22}gain"]
         for name in SCORES:
-            rows.append(f"{name:9}{_format(self.old[name]):20}{_format(self.new[name]):20}{_format(self.gain[name], '+')}")
+            rows.append(f"{name:10}{_format(self.old[name]):22}{_format(self.new[name]):22}{_format(self.gain[name], '+')}")
         of = f"{self.pairs} pairs left out, {self.rooms} rooms; intervals over {self.units} {self.unit}"
         change = f"the mean of recall@1 and F1 changed by {_format(self.overall, '+')}"
         if self.helped:
