@@ -38,45 +38,12 @@ from topomerge.cli.console import (
     show_log,
     write_all,
 )
+from topomerge.cli.dataset import DATASET, FINETUNE
 from topomerge.cli.export import EXPORT
 from topomerge.cli.extract import EMBED, EXPORT_EMBEDDER, EXTRACT, INFO
 from topomerge.cli.merge import MATCH, MERGE
-from topomerge.cli.options import build_output_option, build_quiet_option, collect_given, parse_count, parse_whole_number
+from topomerge.cli.options import build_output_option, build_quiet_option, collect_given, parse_whole_number
 from topomerge.errors import InputError, make_printable
-
-
-def dataset_command(args: argparse.Namespace) -> int:
-    """`topomerge dataset check`: print what the pairs of a folder have in common, and what is wrong with them."""
-    from topomerge.datasets.pairs.own_pairs import check_folder
-
-    def tell(text: str) -> None:
-        if not args.quiet:
-            print_line(text, sys.stderr)
-
-    lines, wrong = check_folder(args.folder, args.cache, args.jobs, tell)
-    print_text("\n".join(lines))
-    if wrong:
-        raise InputError(f"{args.folder}: captures and pairs that are wrong: {wrong}; correct what is marked WRONG above")
-    return 0
-
-
-DATASET = Command(
-    "dataset",
-    dataset_command,
-    "check a folder of your own captures and pairs, to train and to evaluate on",
-    "topomerge dataset check my_scans/",
-    (
-        build_option("verb", choices=("check",), help="extract the captures, and print what the pairs have in common"),
-        build_option("folder", metavar="DIR", help="a folder with a pairs.yaml, or such a file"),
-        build_option("--cache", default="cache", metavar="DIR", help="of the maps; that of train.py (default cache)"),
-        build_option("--jobs", type=parse_count, default=1, metavar="N", help="processes (default 1)"),
-        build_quiet_option("print only the table"),
-    ),
-    paths=("folder",),
-    description="Check the pairs.yaml of a folder of captures (docs: Training, Your own pairs): for each pair the rooms of both "
-    "maps, those that match, and the area in common; and what is wrong. Status 1: something is.",
-)
-
 
 KINDS_OF_BUILDINGS = ("office", "openplan", "apartment", "hotel", "hospital", "school", "lab", "house")  # of datasets/buildings
 
@@ -233,12 +200,27 @@ VIEW = Command(
 )
 
 
-COMMANDS = (EXTRACT, INFO, EMBED, MATCH, MERGE, SIMULATE, COMPLETION, ATLAS, WATCH, EXPORT, EXPORT_EMBEDDER, VIEW, DATASET)
+COMMANDS = (
+    EXTRACT,
+    INFO,
+    EMBED,
+    MATCH,
+    MERGE,
+    SIMULATE,
+    COMPLETION,
+    ATLAS,
+    WATCH,
+    EXPORT,
+    EXPORT_EMBEDDER,
+    VIEW,
+    DATASET,
+    FINETUNE,
+)
 EXIT_STATUSES = """\
 exit status:
   0    done
   1    bad input or a wrong command line: one line on stderr says which file and why; no output is written
-  2    no trustworthy merge: the reason is printed and stands in merge.json
+  2    no trustworthy merge: the reason is printed and stands in merge.json; of finetune: it did not help
   130  interrupted
   141  what read the output went away (`| head`)
   143  terminated
