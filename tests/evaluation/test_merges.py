@@ -67,11 +67,11 @@ def test_where_both_maps_are_from(module, monkeypatch) -> None:
     two = cached(building="school/Sabadell1", kind="other-building", sensors=["tls", "depth"], set=0, item=7)
     names = pairs.find_buildings(two, "test")
     assert names == ("school/Sabadell1", "school/Sabadell3")
-    assert pairs.places_of(names)["physical"] == pairs.places_of(names)["physical_other"] == "campus/school/sabadell"
+    assert pairs.describe_places(names)["physical"] == pairs.describe_places(names)["physical_other"] == "campus/school/sabadell"
     drawn = cached(
         building="school/Sabadell1 + school/Sabadell2 + lab-900002-1", kind="other-building", sensors=["tls", "drawing"]
     )
-    place = pairs.places_of(pairs.find_buildings(drawn, "test_drawings"))
+    place = pairs.describe_places(pairs.find_buildings(drawn, "test_drawings"))
     assert place["physical"] == "campus/school/sabadell" and place["other_source"] == "procedural"
 
 
