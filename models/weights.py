@@ -11,7 +11,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from safetensors import SafetensorError
@@ -20,19 +20,22 @@ from topomerge.models.embedder import Embedder
 from topomerge.models.export import Ordered, read_weights, run_with_torch
 from torch import Tensor
 
-from topomerge.embedding.learned import (
+from topomerge.embedding.network import build_embedder_signature
+from topomerge.embedding.weights import (
     STATE_FILE,
     STATE_SETTINGS,
-    LearnedEmbedder,
     check_settings,
     describe_embedder,
     find_embedder,
     find_state,
     read_embedder_card,
 )
-from topomerge.embedding.network import build_embedder_signature
 from topomerge.errors import InputError
 from topomerge.io.archive import replace_on_success
+
+if TYPE_CHECKING:
+    from topomerge.embedding.learned import LearnedEmbedder
+
 
 STATE_FORMAT = 2
 LARGEST_FILE = 1 << 28  # bytes
@@ -40,6 +43,8 @@ LARGEST_FILE = 1 << 28  # bytes
 
 def wrap_network(network: Embedder, about: Mapping[str, Any] | None = None) -> LearnedEmbedder:
     """A network that torch runs as a callable map -> (R, D): one that was just trained."""
+    from topomerge.embedding.learned import LearnedEmbedder  # here: it reads maps, which a machine that only trains does not
+
     run = run_with_torch(Ordered(network), build_embedder_signature(network.network))
     return LearnedEmbedder(run, network.network, float(network.temperature.detach()), about)
 
@@ -71,7 +76,7 @@ def read_embedder(path: str | Path | None = None) -> tuple[Embedder, dict[str, A
     """Read the network, ready to use, and on what it was trained.
 
     Args:
-        path: as of `embedding.learned.find_embedder`, or a folder with the state of a training.
+        path: as of `embedding.weights.find_embedder`, or a folder with the state of a training.
 
     Raises:
         InputError: no embedder there, or damaged, of another format or class.

@@ -47,7 +47,7 @@ def test_a_feature_more_makes_everything_wider(tmp_path):
 import json, torch, topomerge
 from topomerge.embedding.learned import load_embedder
 from topomerge.embedding.network import Geometry, Network, Node
-from topomerge.embedding.learned import CLIMB, KIND_COLUMNS
+from topomerge.embedding.graph import CLIMB, KIND_COLUMNS
 from topomerge.errors import InputError
 from topomerge.models.embedder import Embedder
 from topomerge.models.export import build_embedder_sample

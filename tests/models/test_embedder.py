@@ -17,8 +17,7 @@ from topomerge.models.weights import read_embedder, save_state, wrap_network
 from tests.graphs import graph, shuffled, turned
 from tests.scenes_map import building
 from topomerge.embedding.engineered import LAYOUT_REACH, compute_door_layout
-from topomerge.embedding.graph import build_graph_arrays
-from topomerge.embedding.learned import add_proximity_edges, is_door_edge
+from topomerge.embedding.graph import add_proximity_edges, build_graph_arrays, is_door_edge
 from topomerge.embedding.network import GEOMETRY_PARTS, TABLE_PARTS, Geometry, Network, Node, build_network, check
 from topomerge.embedding.quarter_turns import rotate_graph as numpy_quarter_turned
 from topomerge.embedding.surroundings import CROP_SHAPES

@@ -310,7 +310,9 @@ SIMULATED = {
     "plan_segmentation": [*NETWORKS["plan_segmentation"], "data.scans=4", "data.seed=0", "heldout.scans=1"],
     "door_classification": ["data=plan_scans", "data.scans=4", "data.seed=0", "epochs=2", "hold_out=2", "heldout.scans=1"],
     "wall_segmentation": [*NETWORKS["wall_segmentation"], "data.scans=4", "data.seed=0", "heldout.scans=1"],
-    "passages": ["data=plan_scans", "data.scans=6", "data.seed=0", "folds=2", "heldout=plan_scans_heldout", "heldout.scans=4"],
+    "passages": [
+        "data=plan_scans", "data.scans=6", "data.seed=0", "folds=2", "data@heldout=plan_scans_heldout", "heldout.scans=4"
+    ],
     "wall_doors": [
         *(f"{of}.scans=2" for of in ("data", "frameless", "flat", "heldout", "heldout_frameless", "heldout_flat")),
         *(f"{of}.seed=0" for of in ("data", "frameless", "flat")), "folds=2",

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.extraction.storeys import select_lowest_of_column
-from topomerge.types import Array, TopometricMap, is_mostly_unseen
+from topomerge.types import Array, TopometricMap, is_mostly_unseen, select_lowest_of_column
 
 if TYPE_CHECKING:
     from torch_geometric.data import Data
@@ -259,3 +258,37 @@ def _compute_angle(a: Array, b: Array) -> tuple[Array, Array]:
     safe = np.where(fine, product, 1.0)
     sine = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / safe
     return np.where(fine, sine, 0.0), np.where(fine, (a * b).sum(axis=1) / safe, 1.0)
+
+
+STOREY_CLIMB = 2.0  # m at most, between the middles of rooms of one storey
+DISTANCE, CLIMB, TURN_COS = (find_column("edge_attr", feature) for feature in ("distance", "climb", "turn_cos"))
+KIND_COLUMNS = [find_column("edge_attr", kind) for kind in EDGE_KINDS]
+
+
+def add_proximity_edges(graph: Mapping[str, Array], reach: float) -> dict[str, Array]:
+    """`edge_index`, `edge_attr` and `edge_pos` with an edge between any two rooms of a storey whose middles
+    are at most `reach` (m, seen from above) apart.
+
+    Its features are the distance and the climb; it is of no kind. Ways back stay half of all edges behind the ways there.
+    """
+    pos = np.asarray(graph["pos"], float)
+    away = np.linalg.norm(pos[:, None, :2] - pos[None, :, :2], axis=2)
+    first, second = np.nonzero(np.triu((away <= reach) & (abs(pos[:, None, 2] - pos[None, :, 2]) <= STOREY_CLIMB), 1))
+    features = np.zeros((len(first), count_columns("edge_attr")), np.float32)
+    features[:, DISTANCE], features[:, CLIMB], features[:, TURN_COS] = away[first, second], pos[second, 2] - pos[first, 2], 1.0
+    back = features.copy()
+    back[:, CLIMB] *= -1
+    middle = (pos[first] + pos[second]) / 2
+    index, attr, places = (np.asarray(graph[name]) for name in ("edge_index", "edge_attr", "edge_pos"))
+    half = index.shape[1] // 2
+    ways = np.concatenate([index[:, :half], [first, second], index[:, half:], [second, first]], axis=1)
+    return {
+        "edge_index": ways.astype(np.int64),
+        "edge_attr": np.concatenate([attr[:half], features, attr[half:], back]).astype(np.float32),
+        "edge_pos": np.concatenate([places[:half], middle, places[half:], middle]),
+    }
+
+
+def is_door_edge(graph: Mapping[str, Array]) -> Array:
+    """Return (2E,) bool: which edges are doors, openings or stairs."""
+    return np.asarray(np.asarray(graph["edge_attr"])[:, KIND_COLUMNS].any(axis=1))

@@ -6,8 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.extraction.convolution import Kernel, is_any_at
-from topomerge.extraction.storeys import select_lowest_of_column
-from topomerge.types import Array, VoxelGrid
+from topomerge.types import Array, VoxelGrid, select_lowest_of_column
 
 STEP_HEIGHT = 0.3  # m: floor beside a cell may be this much higher or lower
 WALL_SIGHT = (0.3, 1.5)  # m above the floor: where a wall has to be seen

@@ -247,7 +247,8 @@ def gather_evidence(
     """Cut the storeys into too many segments rather than too few, and gather what speaks for doors between them."""
     watch.begin("segments", 0.4)
     rasters, places = rasterise_storeys(scan, navigable, p.standing_height), scan.places
-    storeys = [segment_storey(rasters, i, min(p.narrow, p.door), parts, places) for i in range(len(rasters.numbers))]
+    narrow = min(p.narrow, p.slice_door if scan.flat else p.door)
+    storeys = [segment_storey(rasters, i, narrow, parts, places) for i in range(len(rasters.numbers))]
     watch.begin("walls", 0.6)
     walls = unroll_walls(scan, navigable, rasters, storeys) if p.walls else None
     return Evidence(rasters, find_passages(storeys, walls, p.walls and not parts), walls)
@@ -265,8 +266,8 @@ def cut_rooms(
     watch.begin("rooms", 0.75)
     weigh = p.walls and not parts
     score = choose_scorer(weigh and found.walls is not None)
-    least = LEAST_FLAT_ROOM if scan.flat else LEAST_ROOM
-    cut = [partition_rooms(storey, score, p.door, least) for storey in found.storeys]  # 2.6
+    door, least = (p.slice_door, LEAST_FLAT_ROOM) if scan.flat else (p.door, LEAST_ROOM)
+    cut = [partition_rooms(storey, score, door, least) for storey in found.storeys]  # 2.6
     floor = build_floor(scan.grid, navigable, found.rasters.storey, found.rasters.storeys, cut, found.rasters.factor)
     if found.walls is None:
         return floor, None

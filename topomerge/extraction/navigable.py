@@ -22,10 +22,10 @@ from topomerge.extraction.morphology import (
 from topomerge.extraction.parameters import SharedParameters
 from topomerge.extraction.scan import Scan, add_reasons
 from topomerge.extraction.slices import is_raised
-from topomerge.extraction.storeys import NOWHERE, measure_floor_to_ceiling, remove_ceilings, select_lowest_of_column
+from topomerge.extraction.storeys import NOWHERE, measure_floor_to_ceiling, remove_ceilings
 from topomerge.kernels.rasters import find_first_occupied
 from topomerge.kernels.rays import carve, sweep
-from topomerge.types import Array, VoxelGrid
+from topomerge.types import Array, VoxelGrid, select_lowest_of_column
 
 # Which connected parts of the navigable cells are floors.
 FLOOR_LEAST_AREA = 1.0  # m2

@@ -20,11 +20,11 @@ from scipy.spatial import cKDTree
 
 from topomerge.errors import InputError
 from topomerge.extraction.completeness import WALL_SIGHT
-from topomerge.extraction.storeys import measure_floor_to_ceiling, select_lowest_of_column
+from topomerge.extraction.storeys import measure_floor_to_ceiling
 from topomerge.io.archive import read_weights_json
 from topomerge.kernels.rays import is_seen_from
 from topomerge.numpy_nn import sigmoid
-from topomerge.types import ROOM_ODDS, Array, TopometricMap
+from topomerge.types import ROOM_ODDS, Array, TopometricMap, select_lowest_of_column
 
 # What tells a room that somebody was in from one that was only looked into: a row of numbers a room, and one of its poses.
 #

@@ -7,7 +7,7 @@ import numpy as np
 from topomerge.extraction.convolution import Kernel, build_moore, is_any_at
 from topomerge.extraction.morphology import is_surrounded, label_components
 from topomerge.kernels.rasters import count_levels_below, find_first_occupied, is_hollow_below
-from topomerge.types import STOREY_DTYPE, Array, VoxelGrid
+from topomerge.types import STOREY_DTYPE, Array, VoxelGrid, select_lowest_of_column
 
 # Storeys: levels at which much floor lies.
 
@@ -105,11 +105,6 @@ def estimate_ceiling_height(above: Array) -> float:
     """Median of the heights above a floor, 0 where less than a third of it has something above: lintels are no ceiling."""
     seen = above[above > 0]
     return float(np.median(seen)) if len(seen) * 3 >= len(above) > 0 else 0.0
-
-
-def select_lowest_of_column(navigable: VoxelGrid) -> Array:
-    """Ascending rows of the cells that have no navigable cell right below them: the floor proper, without its upward dilation."""
-    return np.flatnonzero(~navigable.contains(navigable.cells.astype(np.int64) - (0, 0, 1)))
 
 
 # Keeping ceilings out of the navigable volume (the thesis' worst fault: findings.md, "Why the thesis fails").

@@ -12,9 +12,9 @@ from topomerge.extraction.completeness import measure_completeness
 from topomerge.extraction.convolution import build_sphere
 from topomerge.extraction.morphology import label_components
 from topomerge.extraction.plans.storey_plan import Floor
-from topomerge.extraction.storeys import estimate_ceiling_height, measure_floor_to_ceiling, select_lowest_of_column
+from topomerge.extraction.storeys import estimate_ceiling_height, measure_floor_to_ceiling
 from topomerge.kernels.rasters import count_steps
-from topomerge.types import AREA_DTYPE, EDGE_DTYPE, ROOM_DTYPE, Array, TopometricMap, VoxelGrid
+from topomerge.types import AREA_DTYPE, EDGE_DTYPE, ROOM_DTYPE, Array, TopometricMap, VoxelGrid, select_lowest_of_column
 
 # Where two rooms meet: doors, openings and stairs (seeds 2.7).
 

@@ -21,8 +21,7 @@ from torch import Tensor
 
 from topomerge.datasets.core.building import find_physical_building
 from topomerge.embedding.engineered import compute_door_layout
-from topomerge.embedding.graph import count_columns
-from topomerge.embedding.learned import add_proximity_edges
+from topomerge.embedding.graph import add_proximity_edges, count_columns
 from topomerge.errors import InputError
 from topomerge.io import archive
 from topomerge.types import Array

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from topomerge.embedding.learned import is_door_edge
+from topomerge.embedding.graph import is_door_edge
 from topomerge.embedding.quarter_turns import Rows, TurnedRows, align_rows, rotate_to_walls
 from topomerge.matching.assignment import assign_certain, compute_certainty, count_pairs, has_twin, rank_partners
 from topomerge.models.embedder import Embedder, match_scores

@@ -4,7 +4,7 @@ Conventions: z is up, lengths are metres, angles radians. Poses are float64, poi
 points of map b into the frame of map a. A room label of -1 means "no room".
 """
 
-from topomerge.types.grid import Array, PointCloud, Sim3, TrueRoom, VoxelGrid
+from topomerge.types.grid import Array, PointCloud, Sim3, TrueRoom, VoxelGrid, select_lowest_of_column
 from topomerge.types.placement import Deformation, Placement
 from topomerge.types.topometric_map import (
     AREA_DTYPE,
@@ -57,6 +57,7 @@ __all__ = [
     "is_mostly_unseen",
     "parse_levelling",
     "read_levelling",
+    "select_lowest_of_column",
     "select_rooms",
     "transform_points",
 ]

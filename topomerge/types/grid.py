@@ -273,3 +273,8 @@ class Sim3:
         x, y, z = self.apply(np.array([other.translation]))[0].tolist()
         yaw = (self.yaw + other.yaw + np.pi) % (2 * np.pi) - np.pi
         return Sim3(float(yaw), (x, y, z), self.scale * other.scale)
+
+
+def select_lowest_of_column(navigable: VoxelGrid) -> Array:
+    """Ascending rows of the cells that have no cell right below them: the floor proper, without its upward dilation."""
+    return np.flatnonzero(~navigable.contains(navigable.cells.astype(np.int64) - (0, 0, 1)))

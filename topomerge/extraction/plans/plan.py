@@ -22,9 +22,9 @@ from topomerge.extraction.plans.storey_plan import (
     is_observed_band,
 )
 from topomerge.extraction.slices import SIGHT_DIRECTIONS, count_walled_directions, find_enclosed_columns
-from topomerge.extraction.storeys import CARRIED, HIGHEST_CEILING, NOWHERE, STOREY_LEAST_HEIGHT, select_lowest_of_column
+from topomerge.extraction.storeys import CARRIED, HIGHEST_CEILING, NOWHERE, STOREY_LEAST_HEIGHT
 from topomerge.kernels.rasters import PROFILE_BELOW, PROFILE_LEVELS, fill_profiles, find_first_occupied, is_hollow_below
-from topomerge.types import Array, VoxelGrid
+from topomerge.types import Array, VoxelGrid, select_lowest_of_column
 
 ROOM_WALLS = WallRule(least_bands=3)  # fewer bands show the upper side of a ceiling, beside higher ones
 THIN = 0.4  # share of the usual wall's levels: what has fewer is no wall

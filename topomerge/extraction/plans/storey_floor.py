@@ -12,8 +12,7 @@ from topomerge.extraction.plans.passages import Pair
 from topomerge.extraction.plans.plan import locate_columns
 from topomerge.extraction.plans.storey_plan import Floor, StoreyPlan
 from topomerge.extraction.segment import PartitionedStorey
-from topomerge.extraction.storeys import select_lowest_of_column
-from topomerge.types import Array, VoxelGrid
+from topomerge.types import Array, VoxelGrid, select_lowest_of_column
 
 WALL_REACH = 0.5  # m: so far into walls and what stands before them the cells of a room go
 OVER_CEILING = 0.4  # m
