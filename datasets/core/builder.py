@@ -23,12 +23,11 @@ from topomerge.errors import InputError
 from topomerge.io import archive
 from topomerge.io.archive import replace_on_success
 from topomerge.io.listing import convert_to_plain
-from topomerge.types import Array
+from topomerge.types import Array, LogFn
 
 PATIENCE = 20.0  # s to wait for the scheduler of a cluster
 OLD = 3600.0  # s; half-written files of a build that was killed are deleted when they are older
 Task = tuple[Any, Any, str]  # an item, which has a name; what it is made from; the folder of its file
-LogFn = Callable[[str], None]
 
 
 class BuildSettings(Protocol):

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
-from topomerge.datasets.core.builder import LogFn, make_item, read_refusal
+from topomerge.datasets.core.builder import make_item, read_refusal
 from topomerge.datasets.core.building import Building, Plan
 from topomerge.datasets.pairs.drawing import draw
 from topomerge.datasets.pairs.evaluation_pair import convert_to_sim3
@@ -49,7 +49,7 @@ from topomerge.datasets.simulation.session import simulate_session
 
 from topomerge.errors import InputError
 from topomerge.io import archive
-from topomerge.types import Array, PointCloud, Sim3
+from topomerge.types import Array, LogFn, PointCloud, Sim3
 
 LONGEST_BENT_PAIR = 900.0  # s
 LEAST_SPACING = 0.06  # m between points: cells are of 0.1 m

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
-from topomerge.datasets.core.builder import BuildReport, BuildRow, BuildSettings, LogFn, build_set, make_item
+from topomerge.datasets.core.builder import BuildReport, BuildRow, BuildSettings, build_set, make_item
 from topomerge.datasets.core.building import Building
 from topomerge.datasets.pairs.drawing import draw
 from topomerge.datasets.pairs.evaluation_pair import convert_to_sim3
@@ -40,7 +40,7 @@ from topomerge.datasets.pairs.pairs import choose_visited_places, draw_frames
 
 from topomerge.errors import InputError
 from topomerge.io import archive
-from topomerge.types import Array, Sim3
+from topomerge.types import Array, LogFn, Sim3
 
 UNSCALED_EVERY = 3  # every third drawing has no scale
 WALL_CELL = 0.1  # m

@@ -14,7 +14,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from topomerge.datasets.core.builder import BuildReport, BuildRow, BuildSettings, LogFn, build_set, check_sharing, make_item
+from topomerge.datasets.core.builder import BuildReport, BuildRow, BuildSettings, build_set, check_sharing, make_item
 from topomerge.datasets.pairs.evaluation_pair import convert_to_sim3
 from topomerge.datasets.pairs.example import _make_first_pair
 from topomerge.datasets.pairs.items import Item, Library, Recipe, check, draw_items, load_library, select_plans
@@ -24,7 +24,7 @@ from topomerge.errors import InputError
 from topomerge.extraction.cleaning import add_means
 from topomerge.extraction.voxels import voxelise
 from topomerge.io import archive
-from topomerge.types import Array, PointCloud, Sim3, VoxelGrid
+from topomerge.types import Array, LogFn, PointCloud, Sim3, VoxelGrid
 
 GRID_FORMAT = 2  # raise it when the same item gives other bytes: it is part of the files' names
 GRID_EDGE = 0.1  # m

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 from topomerge.datasets.buildings.furniture import compute_footprints
-from topomerge.datasets.core.builder import BuildReport, BuildRow, BuildSettings, LogFn, build_set, check_sharing, make_item
+from topomerge.datasets.core.builder import BuildReport, BuildRow, BuildSettings, build_set, check_sharing, make_item
 from topomerge.datasets.core.building import Building, Difficulty
 from topomerge.datasets.core.solids import build_rotation
 from topomerge.datasets.pairs.grid_pairs import GRID_FORMAT, LONGEST_GRID_PAIR, WEIGHTS, build_pair_arrays, unpack_pair
@@ -25,7 +25,7 @@ from topomerge.datasets.simulation.sensors import get_sensor
 from topomerge.datasets.simulation.session import simulate_session
 
 from topomerge.errors import InputError
-from topomerge.types import Array, Sim3, VoxelGrid
+from topomerge.types import Array, LogFn, Sim3, VoxelGrid
 
 RULE_CELL = 0.1  # m
 WALL_INSIDE, THING_APART = 0.3, 0.3  # m

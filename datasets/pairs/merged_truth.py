@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,9 +24,8 @@ from topomerge.io.maps import load_map
 from topomerge.io.points import OCTREES, list_suffixes
 from topomerge.registration.pipeline import register
 from topomerge.registration.prepared import prepare
-from topomerge.types import Array, Sim3, TopometricMap, convert_pose_to_files
+from topomerge.types import Array, LogFn, Sim3, TopometricMap, convert_pose_to_files
 
-LogFn = Callable[[str], None]
 LEAST_BELIEVED = 0.99  # probability of a pose that is taken for true
 DECIMALS = 6  # of the transforms that are written
 MAP_SUFFIX = ".tmap"

@@ -43,9 +43,8 @@ from topomerge.io.listing import convert_to_plain
 from topomerge.io.maps import load_map, save_map
 from topomerge.io.points import OCTREES, read_chunks
 from topomerge.matching.assignment import has_twin
-from topomerge.types import Array, TopometricMap
+from topomerge.types import Array, LogFn, TopometricMap
 
-LogFn = Callable[[str], None]
 OWN_DATA = "folder"  # name of the set on the command line: configs/data/folder.yaml
 OWN_SOURCE, OWN_FOLDER = "own", "own"  # source of the pairs; folder of the cache
 LONGEST_CAPTURE, LONGEST_OWN_PAIR = 7200.0, 600.0  # s

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from topomerge.datasets.core.builder import BuildRow, BuildSettings, LogFn, make_item
+from topomerge.datasets.core.builder import BuildRow, BuildSettings, make_item
 from topomerge.datasets.core.building import Plan
 from topomerge.datasets.pairs.plan_examples import LONGEST_SCAN, PlanItem, PlanRecipe, build_scans, draw_item, simulate_item_scan
 from topomerge.datasets.pairs.plan_truth import compute_plan_truth
@@ -25,7 +25,7 @@ from topomerge.extraction.plans.passages import DOOR_FEATURES, compute_door_feat
 from topomerge.extraction.segment import GrowingRooms, SegmentedStorey, log_odds, score_by_plan
 from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.io import archive
-from topomerge.types import Array
+from topomerge.types import Array, LogFn
 
 PASSAGE_FORMAT = 3  # raise it when the same item gives other bytes: it is part of the files' names
 MAP_CELL = 0.1  # m

@@ -14,7 +14,7 @@ import numpy as np
 from topomerge.datasets.buildings.construction import build_building
 from topomerge.datasets.buildings.layouts import BUILDING_KINDS
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.core.builder import BuildReport, BuildRow, BuildSettings, LogFn, build_set, check_sharing, make_item
+from topomerge.datasets.core.builder import BuildReport, BuildRow, BuildSettings, build_set, check_sharing, make_item
 from topomerge.datasets.core.building import Building, Difficulty, Plan
 from topomerge.datasets.pairs.flat_maps import simulate_robot_grid
 from topomerge.datasets.pairs.items import compute_plan_digest
@@ -34,7 +34,7 @@ from topomerge.extraction.slices import is_slice, raise_slice
 from topomerge.extraction.storeys import find_storeys, measure_floor_to_ceiling
 from topomerge.io import archive
 from topomerge.io.listing import convert_to_plain
-from topomerge.types import Array, PointCloud, Sim3
+from topomerge.types import Array, LogFn, PointCloud, Sim3
 
 PLAN_FORMAT = 4  # raise it when the same item gives other bytes: it is part of the files' names
 SOURCE_SHARES = {"procedural": 0.55, "r2v": 0.3, "campus": 0.15}

@@ -14,7 +14,7 @@ from topomerge.datasets.buildings.construction import build_building
 from topomerge.datasets.buildings.layouts import BUILDING_KINDS
 from topomerge.datasets.buildings.outdoors import DROP, add_outdoors, compute_footprint
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.core.builder import BuildRow, BuildSettings, LogFn, make_item
+from topomerge.datasets.core.builder import BuildRow, BuildSettings, make_item
 from topomerge.datasets.core.building import Building, Plan
 from topomerge.datasets.pairs.flat_maps import simulate_robot_grid
 from topomerge.datasets.pairs.plan_examples import (
@@ -46,7 +46,7 @@ from topomerge.extraction.room_odds import (
 )
 from topomerge.extraction.scan import read_scan
 from topomerge.io import archive
-from topomerge.types import Array, PointCloud, Sim3
+from topomerge.types import Array, LogFn, PointCloud, Sim3
 
 OPEN_SHARE = 0.85  # of the buildings that anything stands around
 OPEN_SENSORS = {"tls": 0.4, "lidar": 0.3, "depth": 0.15, "tablet": 0.15}

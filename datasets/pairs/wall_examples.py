@@ -16,7 +16,7 @@ from topomerge.datasets.buildings.construction import build_building
 from topomerge.datasets.buildings.layouts import BUILDING_KINDS
 from topomerge.datasets.buildings.openings import list_windows
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.core.builder import BuildReport, BuildRow, BuildSettings, LogFn, make_item
+from topomerge.datasets.core.builder import BuildReport, BuildRow, BuildSettings, make_item
 from topomerge.datasets.core.building import Building, Plan
 from topomerge.datasets.pairs.flat_maps import compute_cells, encode_rows
 from topomerge.datasets.pairs.items import compute_plan_digest, select_points
@@ -45,7 +45,7 @@ from topomerge.extraction.topology import build_topometric_map
 from topomerge.extraction.voxels import voxelise
 from topomerge.io import archive
 from topomerge.io.listing import convert_to_plain
-from topomerge.types import ROOM_DTYPE, Array, PointCloud, Sim3, TopometricMap, VoxelGrid
+from topomerge.types import ROOM_DTYPE, Array, LogFn, PointCloud, Sim3, TopometricMap, VoxelGrid
 
 CUPBOARDS = ("shelf", "cabinet", "wardrobe", "kitchen", "locker")  # kinds of furniture that stand before walls
 LEAST_CUPBOARD = 0.75  # m, height

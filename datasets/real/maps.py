@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from topomerge.datasets.core.builder import LogFn, limit_time
+from topomerge.datasets.core.builder import limit_time
 from topomerge.datasets.pairs.evaluation_pair import build_evaluation_arrays, compute_pair_statistics, save_maps
 from topomerge.datasets.pairs.example import build_pair_arrays
 from topomerge.datasets.pairs.grid_pairs import (
@@ -27,6 +27,7 @@ from topomerge.code_digest import compute_code_digest
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.io import archive
+from topomerge.types import LogFn
 
 LONGEST_PAIR = 600.0  # s a pair
 POINTS_A_ROOM = 512  # a room

@@ -26,13 +26,13 @@ from topomerge.datasets.pairs.pairs import Atlas
 from topomerge.datasets.plans.splits import get_seed_range
 from topomerge.errors import InputError
 from topomerge.evaluation.documents import write_table
-from topomerge.evaluation.tasks import LogFn, Row, TaskSettings, measure_missing
+from topomerge.evaluation.tasks import Row, TaskSettings, measure_missing
 from topomerge.extraction.extract import extract
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.solve import build_atlas
 from topomerge.io.maps import save_map
 from topomerge.matching.poses import pose_difference
-from topomerge.types import Array, Sim3
+from topomerge.types import Array, LogFn, Sim3
 
 MAKERS = ("topomerge.extraction.extract", "topomerge.fusion.atlas.solve", "topomerge.datasets.pairs.atlases")
 RIGHT = (0.5, np.radians(5.0))  # m, rad

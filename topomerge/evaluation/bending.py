@@ -21,14 +21,14 @@ from topomerge.datasets.pairs.grid_pairs import GridPair
 from topomerge.evaluation.documents import write_table
 from topomerge.evaluation.false_merges import get_physical_building
 from topomerge.evaluation.merge_report import format_share
-from topomerge.evaluation.tasks import LogFn, Row, TaskSettings, describe_places, find_buildings, find_real_data, measure_missing
+from topomerge.evaluation.tasks import Row, TaskSettings, describe_places, find_buildings, find_real_data, measure_missing
 from topomerge.registration.bend.bend import bend
 from topomerge.registration.bend.pieces import Drift, get_sensor_drift
 from topomerge.registration.pipeline import register
 from topomerge.registration.prepared import Prepared, prepare
 from topomerge.statistics import FEWEST_GROUPS, OUTSIDE, format_interval
 from topomerge.training.belief_hypotheses import compute_pose_error, is_hypothesis_right
-from topomerge.types import Array, Sim3
+from topomerge.types import Array, LogFn, Sim3
 
 MATCHED = 0.75  # m between places of both maps that are compared
 LEAST_COMMON = 2.0  # m2 of a room that both maps show

@@ -24,10 +24,10 @@ from topomerge.datasets.simulation.floor_truth import evaluate_map
 from topomerge.evaluation.cases import BUILDING_KINDS
 from topomerge.evaluation.documents import write_share, write_table
 from topomerge.evaluation.scans import Case, Scan, load_scan
-from topomerge.evaluation.tasks import LogFn, Row, TaskSettings, find_optional_data, limit_cases, measure_missing
+from topomerge.evaluation.tasks import Row, TaskSettings, find_optional_data, limit_cases, measure_missing
 from topomerge.extraction.extract import extract
 from topomerge.metrics import match_places
-from topomerge.types import Array, TopometricMap
+from topomerge.types import Array, LogFn, TopometricMap
 
 MAKERS = ("topomerge.extraction.extract", "topomerge.metrics", "topomerge.evaluation.scans")
 DOOR_SEEDS, TRAINING = 800_720, 5_700  # first seeds

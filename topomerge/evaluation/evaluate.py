@@ -41,8 +41,8 @@ from topomerge.evaluation.tables import (
     write_section,
 )
 from topomerge.io.archive import replace_on_success
+from topomerge.types import LogFn
 
-LogFn = Callable[[str], None]
 OF_MERGES = ("merging", "kinds", "decides", "sites", "independence", "reliability")  # tables that there are where maps are merged
 
 

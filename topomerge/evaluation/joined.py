@@ -23,13 +23,13 @@ from topomerge.datasets.simulation.floor_truth import FloorTruth, build_truth, e
 from topomerge.errors import InputError
 from topomerge.evaluation.documents import write_table
 from topomerge.evaluation.score import measure_doubled_walls
-from topomerge.evaluation.tasks import LogFn, Row, TaskSettings, find_real_data, measure_missing
+from topomerge.evaluation.tasks import Row, TaskSettings, find_real_data, measure_missing
 from topomerge.fusion.fuse import fuse
 from topomerge.registration.bend.bend import bend
 from topomerge.registration.bend.pieces import get_sensor_drift
 from topomerge.registration.pipeline import refine_by_surfaces
 from topomerge.registration.prepared import prepare
-from topomerge.types import Placement, Sim3, TopometricMap
+from topomerge.types import LogFn, Placement, Sim3, TopometricMap
 
 MAKERS = (
     "topomerge.extraction.extract",

@@ -32,7 +32,6 @@ from topomerge.evaluation.merge_report import compute_headline, tabulate_merges
 from topomerge.evaluation.tasks import (
     DRAWN,
     SCALELESS,
-    LogFn,
     Row,
     TaskSettings,
     describe_places,
@@ -47,7 +46,7 @@ from topomerge.metrics import is_on_storey
 from topomerge.registration.pipeline import Registration, register
 from topomerge.registration.prepared import Prepared, prepare
 from topomerge.training.belief_hypotheses import compute_pose_error, is_hypothesis_right
-from topomerge.types import Sim3
+from topomerge.types import LogFn, Sim3
 
 MAKERS = ("topomerge.registration.pipeline", "topomerge.datasets.pairs.grid_pairs", "topomerge.metrics")
 FINE = (0.1, 1.0)  # m, degrees

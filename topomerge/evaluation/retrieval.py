@@ -22,7 +22,7 @@ from topomerge.datasets.real.maps import build_real_pairs
 from topomerge.datasets.real.sources import REAL_SOURCES
 from topomerge.embedding.learned import build_embedder
 from topomerge.embedding.quarter_turns import Descriptor, Rows
-from topomerge.evaluation.tasks import LogFn, Row, TaskSettings, find_real_data
+from topomerge.evaluation.tasks import Row, TaskSettings, find_real_data
 from topomerge.fusion.atlas.find import SHORTLIST, rank_sightings, select_shortlist
 from topomerge.fusion.atlas.partners import (
     compute_queries,
@@ -33,6 +33,7 @@ from topomerge.fusion.atlas.partners import (
     list_owners,
 )
 from topomerge.statistics import format_interval
+from topomerge.types import LogFn
 
 FIRST = (1, 5, 10)
 PARTNER_PAIRS, PARTNER_DRAWS = 15, 40  # pairs in an atlas of which partners are asked for, and how often they are drawn

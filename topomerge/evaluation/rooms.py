@@ -24,9 +24,10 @@ from topomerge.errors import InputError
 from topomerge.evaluation.cases import GROUPS, SELECTIONS, select_cases
 from topomerge.evaluation.documents import compute_mean, write_mean, write_table
 from topomerge.evaluation.scans import Case, Scan, load_scan
-from topomerge.evaluation.tasks import LogFn, Row, TaskSettings, find_optional_data, measure_missing
+from topomerge.evaluation.tasks import Row, TaskSettings, find_optional_data, measure_missing
 from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS
+from topomerge.types import LogFn
 
 MAKERS = ("topomerge.extraction.extract", "topomerge.metrics", "topomerge.evaluation.scans")
 VOXEL = 0.1  # m, edge of the cells

@@ -32,10 +32,9 @@ from topomerge.evaluation.documents import build_stamp, write_blocks
 from topomerge.evaluation.headline import write_headline
 from topomerge.io.archive import replace_on_success
 from topomerge.training.tasks import compose_settings
-from topomerge.types import Array, Sim3
+from topomerge.types import Array, LogFn, Sim3
 
 Row = dict[str, Any]
-LogFn = Callable[[str], None]
 MODULES = {
     "rooms": "rooms",
     "doors": "doors",

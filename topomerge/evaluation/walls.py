@@ -24,10 +24,10 @@ from scipy.spatial import cKDTree
 from topomerge.evaluation.cases import dev
 from topomerge.evaluation.documents import write_table
 from topomerge.evaluation.scans import Case, Scan, load_scan
-from topomerge.evaluation.tasks import LogFn, Row, TaskSettings, find_optional_data, limit_cases
+from topomerge.evaluation.tasks import Row, TaskSettings, find_optional_data, limit_cases
 from topomerge.extraction.extract import extract
 from topomerge.structure.floors import FACE_HEIGHTS
-from topomerge.types import Array, TopometricMap
+from topomerge.types import Array, LogFn, TopometricMap
 
 MAKERS = ("topomerge.extraction.extract", "topomerge.structure.plan_structure", "topomerge.evaluation.scans")
 STEP = 0.05  # m between places on faces

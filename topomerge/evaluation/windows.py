@@ -24,9 +24,9 @@ from topomerge.evaluation import doors
 from topomerge.evaluation.cases import BUILDING_KINDS
 from topomerge.evaluation.documents import write_medians, write_share, write_table
 from topomerge.evaluation.scans import Case, Scan, load_scan
-from topomerge.evaluation.tasks import LogFn, Row, TaskSettings, find_optional_data, limit_cases, measure_missing
+from topomerge.evaluation.tasks import Row, TaskSettings, find_optional_data, limit_cases, measure_missing
 from topomerge.extraction.extract import extract
-from topomerge.types import Array, TopometricMap
+from topomerge.types import Array, LogFn, TopometricMap
 
 MAKERS = doors.MAKERS
 ERRORS = ("off", "width", "sill", "head")

@@ -39,10 +39,10 @@ from topomerge.extraction.plans.plan_network import (
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.io.archive import find_weights_file, replace_on_success
 from topomerge.numpy_nn import apply_mlp, sigmoid
-from topomerge.training.loop import LogFn, NetworkJob, State, derive_seed, descend_gradient, run_network
+from topomerge.training.loop import NetworkJob, State, derive_seed, descend_gradient, run_network
 from topomerge.training.packed_pairs import number_buildings, read_scan_building
 from topomerge.training.scan_settings import DoorClassification
-from topomerge.types import Array
+from topomerge.types import Array, LogFn
 
 PURE = 0.7  # share of a region in its true room; regions between rooms are no example
 LEAST_FEATURE_SPREAD = 1e-3  # of a feature: weights are written with four digits

@@ -6,7 +6,7 @@ import logging
 import os
 import shutil
 import sys
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,7 @@ from topomerge.training.run_folder import MetricsLog, begin_run, export_files
 from topomerge.training.settings import FREEZE, VALIDATION, Augment, Training, check, convert_to_dict
 from topomerge.training.tasks import check_start
 from topomerge.training.validate import embed, validate
+from topomerge.types import LogFn
 
 PROJECTED_PAIRS = 12  # in the embedding projector
 
@@ -89,9 +90,6 @@ def plot_matches(network: Embedder, pair: GraphPair, a: tuple[Any, Any], b: tupl
     counts = f"{len(matches & true)} right, {len(matches - true)} wrong, {len(true - matches)} missing"
     axes.set_title(f"{pair.about.get('building', '')}: {counts}")
     return out
-
-
-LogFn = Callable[[str], None]
 
 
 def fit(settings: Training, log_line: LogFn = lambda text: print(text, file=sys.stderr, flush=True)) -> dict[str, float]:

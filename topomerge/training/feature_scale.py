@@ -20,11 +20,10 @@ from topomerge.embedding.engineered import FEATURES, compute_raw_features
 from topomerge.errors import InputError
 from topomerge.matching.assignment import rank_partners
 from topomerge.training.closed_form import FitResult, run_fit
-from topomerge.training.loop import LogFn
 from topomerge.training.match_odds import build_map_pairs
 from topomerge.training.packed_pairs import name_building
 from topomerge.training.task_settings import FeatureScale
-from topomerge.types import Array, is_mostly_unseen
+from topomerge.types import Array, LogFn, is_mostly_unseen
 
 CLIPPED = 4.0  # standard deviations that a difference counts for at most
 FOLDS = 5  # of buildings, for the scores

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,8 @@ from topomerge.training.embedding import adopt_network, fit, load_read_pairs
 from topomerge.training.run_folder import export_files
 from topomerge.training.settings import Training, check
 from topomerge.training.validate import PairScores, score_pairs
-from topomerge.types import Array
+from topomerge.types import Array, LogFn
 
-LogFn = Callable[[str], None]
 SCORES = ("recall@1", "recall@5", "F1")
 BOOTSTRAPS = 5000
 RUN = "run"  # folder of the training in the output

@@ -27,9 +27,9 @@ from topomerge.networks.network import Run, Signature
 from topomerge.training.run_folder import EtaClock, MetricsLog, begin_run, export_files, write_card
 from topomerge.training.settings import NetworkTask
 from topomerge.training.tasks import TASKS, check_accelerator
+from topomerge.types import LogFn
 
 STEPS_BETWEEN_CHECKS = 20  # of whether the losses are finite: each waits for the device
-LogFn = Callable[[str], None]
 T = TypeVar("T")
 K = TypeVar("K")
 

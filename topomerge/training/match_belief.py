@@ -24,11 +24,10 @@ from topomerge.matching.match import match
 from topomerge.numpy_nn import sigmoid
 from topomerge.statistics import measure_calibration
 from topomerge.training.closed_form import FitResult, run_fit
-from topomerge.training.loop import LogFn
 from topomerge.training.match_odds import STRANGER, build_map_pairs
 from topomerge.training.packed_pairs import name_building
 from topomerge.training.task_settings import MatchBelief
-from topomerge.types import Array
+from topomerge.types import Array, LogFn
 
 SURE = (0.5, 0.8)  # probabilities from which precision is told
 BEFORE, AFTER = "before", "after"  # places were compared

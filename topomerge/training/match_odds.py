@@ -23,11 +23,10 @@ from topomerge.fusion.fuse import match_common_rooms
 from topomerge.matching.consistency import HYPOTHESIS, MATCH, ODDS_LENGTHS, compute_hypothesis_features, compute_match_features
 from topomerge.matching.match import match
 from topomerge.training.closed_form import FitResult, compute_calibration_error, run_fit
-from topomerge.training.loop import LogFn
 from topomerge.training.packed_pairs import name_building
 from topomerge.training.settings import TaskSettings
 from topomerge.training.task_settings import MatchOdds
-from topomerge.types import Array, Sim3
+from topomerge.types import Array, LogFn, Sim3
 
 RIGHT_POSE = (0.5, np.radians(5))  # m in the middle of what both maps saw, rad
 STRANGER = 7  # pairs further on is a map of another building, mostly

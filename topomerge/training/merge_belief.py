@@ -40,10 +40,9 @@ from topomerge.training.belief_hypotheses import (
     score_lookalikes,
 )
 from topomerge.training.closed_form import FitResult, compute_calibration_error, run_fit
-from topomerge.training.loop import LogFn
 from topomerge.training.packed_pairs import name_building
 from topomerge.training.task_settings import MergeBelief
-from topomerge.types import Array
+from topomerge.types import Array, LogFn
 
 LEAST_SPREAD = 1e-4  # the file of weights holds five decimals: less would be 0 there
 SAME_PLAN_KINDS = {"storeys": "storey", "point-symmetric": "half"}  # kind of look-alikes -> what they are

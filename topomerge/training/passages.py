@@ -21,10 +21,9 @@ from topomerge.errors import InputError
 from topomerge.extraction.extract import KINDS, SCORE_INPUTS, compute_inputs
 from topomerge.numpy_nn import sigmoid
 from topomerge.training.closed_form import FitResult, compute_calibration_error, run_fit
-from topomerge.training.loop import LogFn
 from topomerge.training.packed_pairs import number_buildings, read_scan_building
 from topomerge.training.scan_settings import Passages
-from topomerge.types import Array
+from topomerge.types import Array, LogFn
 
 PRIOR = np.array([float(name == "plan") for name in SCORE_INPUTS])  # weights are pulled to the plan alone
 STIFF = np.array([1.0 if name == "constant" else 4.0 for name in SCORE_INPUTS])  # of each pull

@@ -30,10 +30,10 @@ from topomerge.registration.evidence.places import (
     read_weights,
 )
 from topomerge.training.belief_hypotheses import assign_half, build_hypothesis_files, derive_hypothesis_files, is_distinguishable
-from topomerge.training.loop import Exported, ExportedJob, LogFn, State, derive_seed, run_network
+from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, run_network
 from topomerge.training.packed_pairs import name_building
 from topomerge.training.task_settings import PlaceAugment, PlaceEvidence
-from topomerge.types import Array
+from topomerge.types import Array, LogFn
 
 
 @dataclass(frozen=True, eq=False)

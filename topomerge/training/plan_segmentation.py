@@ -25,10 +25,10 @@ from topomerge.extraction.plans.plan_network import (
 from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES
 from topomerge.models.convolutional import PlanProbabilities, PlanUNet
 from topomerge.networks.network import Run
-from topomerge.training.loop import Exported, ExportedJob, LogFn, State, derive_seed, prefetch_batches, run_network
+from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, prefetch_batches, run_network
 from topomerge.training.packed_pairs import mark_watched, read_scan_building
 from topomerge.training.scan_settings import GridSegmentation, PlanAugment, PlanLoss, PlanSegmentation
-from topomerge.types import Array
+from topomerge.types import Array, LogFn
 
 SQUARE = np.ones((3, 3))
 MOST_THINGS = 14

@@ -29,12 +29,12 @@ from topomerge.models.losses import NEVER_LOGIT
 from topomerge.models.room_matcher import Partners, RoomMatcher, build_stages
 from topomerge.models.weights import read_embedder
 from topomerge.training.batches import add_views, augment_graph, augment_sheet, compute_quarter_turns, mirror_graph
-from topomerge.training.loop import Exported, ExportedJob, LogFn, State, derive_seed, run_network
+from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, run_network
 from topomerge.training.packed_pairs import Graph, GraphPair, load_pairs
 from topomerge.training.settings import Augment
 from topomerge.training.task_settings import RoomMatching
 from topomerge.training.validate import LEAST_CERTAINTIES, SIZE_COLUMNS, score_matches
-from topomerge.types import Array
+from topomerge.types import Array, LogFn
 
 WRONG_TURNS = (1, 2, 2, 3)  # quarter turns off the true one: half a turn is the one that is mistaken most
 MIRROR = np.array([1.0, -1.0])

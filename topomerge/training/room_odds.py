@@ -28,10 +28,9 @@ from topomerge.extraction.room_odds import (
 )
 from topomerge.numpy_nn import sigmoid
 from topomerge.training.closed_form import FitResult, compute_calibration_error, run_fit
-from topomerge.training.loop import LogFn
 from topomerge.training.packed_pairs import number_buildings, read_scan_building
 from topomerge.training.scan_settings import RoomOdds
-from topomerge.types import Array
+from topomerge.types import Array, LogFn
 
 CLIPPED = (0.005, 0.995)  # quantiles that features are clipped to
 ANSWER_OF = {"confidence": "one", "whole": "whole", "entered": "entered", "outside": "outside", ENTERED_BY_POSES: "posed.entered"}

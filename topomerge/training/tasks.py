@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
@@ -12,8 +12,7 @@ from typing import Any
 
 from topomerge.errors import InputError
 from topomerge.io.archive import find_weights_file, replace_on_success
-
-LogFn = Callable[[str], None]
+from topomerge.types import LogFn
 
 
 @dataclass(frozen=True)

@@ -34,10 +34,9 @@ from topomerge.extraction.walls import find_doorways
 from topomerge.io.archive import read_weights_json
 from topomerge.metrics import match_places
 from topomerge.training.closed_form import FitResult, compute_calibration_error, run_fit
-from topomerge.training.loop import LogFn
 from topomerge.training.packed_pairs import number_buildings, read_scan_building
 from topomerge.training.scan_settings import WallDoors
-from topomerge.types import Array, TopometricMap
+from topomerge.types import Array, LogFn, TopometricMap
 
 FEWEST_DOORS = 5  # among the candidates of a source
 NEAR_DOOR = 0.7  # m: of a door that lies farther off than the metrics allow (0.5 m) the rooms that it joins may still be right

@@ -28,10 +28,10 @@ from topomerge.extraction.elevations.elevation import (
 )
 from topomerge.models.convolutional import WallNetwork, WallProbabilities
 from topomerge.networks.network import Run
-from topomerge.training.loop import Exported, ExportedJob, LogFn, State, derive_seed, run_network
+from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, run_network
 from topomerge.training.packed_pairs import mark_watched, read_scan_building
 from topomerge.training.scan_settings import WallAugment, WallSegmentation
-from topomerge.types import Array
+from topomerge.types import Array, LogFn
 
 COARSE_CLASSES = ("wall", "open", "shut", "window")
 # Index of each of `WALL_CLASSES` among them: half-open doors are open, niches and cupboards are wall.

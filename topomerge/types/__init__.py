@@ -4,7 +4,7 @@ Conventions: z is up, lengths are metres, angles radians. Poses are float64, poi
 points of map b into the frame of map a. A room label of -1 means "no room".
 """
 
-from topomerge.types.grid import Array, PointCloud, Sim3, TrueRoom, VoxelGrid, select_lowest_of_column
+from topomerge.types.grid import Array, LogFn, PointCloud, Sim3, TrueRoom, VoxelGrid, select_lowest_of_column
 from topomerge.types.placement import Deformation, Placement
 from topomerge.types.topometric_map import (
     AREA_DTYPE,
@@ -42,6 +42,7 @@ __all__ = [
     "WINDOW_DTYPE",
     "Array",
     "Deformation",
+    "LogFn",
     "Placement",
     "PointCloud",
     "Sim3",

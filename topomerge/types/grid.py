@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from topomerge.kernels import stencil, voxels
 
 Array = NDArray[Any]
+LogFn = Callable[[str], None]  # is called with a line of progress
 
 
 def require(condition: bool, message: str) -> None:
