@@ -113,7 +113,8 @@ def test_tasks_keep_their_runs_too(tmp_path, monkeypatch):
         train(compose_settings([*words, "resume=true", "pull=0.1"]), quiet)
 
 
-def test_a_run_and_what_it_exports_say_where_they_come_from(settings, tmp_path, cache):
+def test_a_run_and_what_it_exports_say_where_they_come_from(settings, tmp_path, cache, monkeypatch):
+    monkeypatch.setattr(sys, "orig_argv", ["python", "train.py", "name=a b"])
     fit(replace(settings, export=str(tmp_path / "exported")), quiet)
     run = read_run(tmp_path / "run")
     (start,) = run["starts"]
@@ -122,7 +123,7 @@ def test_a_run_and_what_it_exports_say_where_they_come_from(settings, tmp_path, 
         start["versions"].values()
     )
     assert (start["seed"], start["threads"], start["device"]) == (0, torch.get_num_threads(), "1 x cpu, 32-true")
-    assert "pytest" in start["command"] and start["began"].endswith("Z")
+    assert start["command"] == "python train.py 'name=a b'" and start["began"].endswith("Z")
     assert (start["commit"], start["changed_sources"]) == read_commit()
     assert run["data"]["data"]["recipe"] == {"name": "some", "seed": 3} and run["data"]["validation"]["recipe"] is None
     assert run["data"]["data"]["sha256"] != run["data"]["validation"]["sha256"]
