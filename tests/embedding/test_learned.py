@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from tests.scenes_map import building
-from topomerge.embedding import network as parts
 from topomerge.embedding.graph import build_graph_arrays
 from topomerge.embedding.learned import EMBEDDER_FILE, find_embedder, load_embedder, read_embedder_card
 from topomerge.embedding.network import Geometry, Network, Node
@@ -126,8 +125,7 @@ def test_every_encoder_is_as_with_torch(torch, name, tmp_path):
 
 
 def test_a_node_encoder_of_somebody_else_trains_is_exported_and_loads(torch, tmp_path, monkeypatch):
-    """Registered by two lines. Those who load it need not know it."""
-    from topomerge.models.nodes import ROOM_LAYERS
+    """Registered by one line. Those who load it need not know it."""
     from topomerge.models.weights import read_embedder
     from torch_geometric.nn import TransformerConv
 
@@ -140,8 +138,7 @@ def test_a_node_encoder_of_somebody_else_trains_is_exported_and_loads(torch, tmp
 
     write_set(tmp_path, "some", 6)
     with monkeypatch.context() as registered:
-        registered.setitem(ROOM_LAYERS, "transformer", build)
-        registered.setattr(parts, "NODES", (*parts.NODES, "transformer"))
+        registered.setitem(NODES._registered, "transformer", build)
         network = Network(Geometry(["scalars"], width=16), Node("transformer", 2, width=8), size=8)
         common = {"runs": str(tmp_path), "cache": str(tmp_path), "data": "some", "validation": "", "tensorboard": False}
         settings = Training(**common, epochs=2, batch=2, network=network)

@@ -43,6 +43,7 @@ from topomerge.training.closed_form import FitResult, compute_calibration_error,
 from topomerge.training.loop import LogFn
 from topomerge.training.packed_pairs import name_building
 from topomerge.training.task_settings import MergeBelief
+from topomerge.training.tasks import Task
 from topomerge.types import Array
 
 LEAST_SPREAD = 1e-4  # the file of weights holds five decimals: less would be 0 there
@@ -465,3 +466,6 @@ def _round_values(value: Any) -> Any:
     if isinstance(value, list):
         return [_round_values(v) for v in value]
     return {k: _round_values(v) for k, v in value.items()} if isinstance(value, dict) else value
+
+
+TASK = Task(MergeBelief, fit, ("right_believed", "right_first"), judge, "topomerge.registration", "calibration.json", hours=4.0)

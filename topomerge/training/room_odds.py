@@ -31,6 +31,7 @@ from topomerge.training.closed_form import FitResult, compute_calibration_error,
 from topomerge.training.loop import LogFn
 from topomerge.training.packed_pairs import number_buildings, read_scan_building
 from topomerge.training.scan_settings import RoomOdds
+from topomerge.training.tasks import Task
 from topomerge.types import Array
 
 CLIPPED = (0.005, 0.995)  # quantiles that features are clipped to
@@ -193,3 +194,8 @@ def judge(settings: RoomOdds, file: Path, log_line: LogFn) -> dict[str, Any]:
         _append_predictions(weights[family.key] if family.key else weights, family, scans, guesses)
         scores |= _score_family(family, guesses)
     return scores
+
+
+TASK = Task(
+    RoomOdds, fit, ("entered_auc", "whole_auc", "confidence_auc"), judge, "topomerge.extraction", "room_odds.json", hours=0.5
+)
