@@ -85,7 +85,7 @@ class Registry(Mapping[str, Any]):
         yield from dict.fromkeys([*self._shipped, *self._registered, *self._find_announced()])
 
     def __len__(self) -> int:
-        return len(list(self))
+        return sum(1 for _ in self)
 
     def __contains__(self, name: object) -> bool:
         return name in self._shipped or name in self._registered or name in self._find_announced()

@@ -22,6 +22,7 @@ from topomerge.embedding.sheets import build_sheet_arrays
 from topomerge.embedding.surroundings import CROP_SHAPES
 from topomerge.errors import InputError
 from topomerge.networks.network import card_of
+from topomerge.registry import NODES
 
 ROOT = Path(__file__).parent.parent.parent
 EARLIER = Path(__file__).parent / "earlier"

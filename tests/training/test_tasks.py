@@ -212,7 +212,7 @@ def test_fits_learn_what_is_so(words) -> None:
 @pytest.mark.parametrize(
     ("given", "key"),
     [
-        (["task=door"], "task=door"),
+        (["task=door"], "task: unknown .door."),
         (["task=plan_segmentation", "data.scan=3"], "data.scan"),
         (["task=plan_segmentation", "epochs=many"], "epochs"),
         (["task=plan_segmentation", "crop=30"], "crop"),

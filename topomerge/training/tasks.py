@@ -204,7 +204,7 @@ def evaluate_task(task: str, words: Sequence[str], log_line: LogFn) -> Evaluatio
     file = find_weights(task, named.get("run", ""))
     scores = dict(TASKS[task].judge(settings, file, log_line))
     own = getattr(settings, "path", "")
-    heldout = Path(own).resolve().name if own else settings.heldout.name
+    heldout = Path(own).resolve().name if own else getattr(getattr(settings, "heldout", None), "name", "own")
     folder = Path(named.get("folder", "runs/eval")) / f"{task}-{heldout}"
     digest = hashlib.sha256(file.read_bytes()).hexdigest()
     record = {"task": task, "weights": str(file), "sha256": digest, "heldout": heldout, "scores": scores}
