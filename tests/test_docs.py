@@ -81,7 +81,7 @@ def run_page(page: Path, folder: Path) -> None:
             if example.kind == "console":
                 run_commands(example, where)
             else:
-                exec(compile(example.text, where, "exec"), names)
+                exec(compile(example.text, where, "exec", dont_inherit=True), names)  # as in a file of its own
 
 
 @pytest.mark.parametrize("page", [pytest.param(p, id=p.name, marks=mark_of(p)) for p in pages()])

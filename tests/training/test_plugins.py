@@ -226,9 +226,11 @@ def test_a_registry_knows_what_packages_announce(monkeypatch: pytest.MonkeyPatch
 def test_a_set_of_somebody_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from topomerge.datasets.pairs.pairs_file import read_pairs_file
 
-    monkeypatch.setitem(DATASETS._registered, "twins", lambda folder: {
-        "captures": [{"name": p.stem, "file": p.name, "building": p.stem[:-1], "frame": "one"} for p in sorted(folder.glob("*.ply"))]
-    })  # fmt: skip
+    def list_twins(folder: Path) -> dict[str, object]:
+        files = sorted(folder.glob("*.ply"))
+        return {"captures": [{"name": p.stem, "file": p.name, "building": p.stem[:-1], "frame": "one"} for p in files]}
+
+    monkeypatch.setitem(DATASETS._registered, "twins", list_twins)
     for name in ("h1a", "h1b", "h2a", "h2b"):
         (tmp_path / f"{name}.ply").write_text("")
     assert [(p.a, p.b) for p in read_pairs_file(tmp_path, "twins").pairs] == [("h1a", "h1b"), ("h2a", "h2b")]
