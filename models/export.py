@@ -38,7 +38,8 @@ def export_network(module: nn.Module, signature: Signature, sample: Sequence[Ten
     check_exporter()
     if not all(torch.isfinite(value).all() for value in module.state_dict().values()):
         raise InputError(f"{path}: weights are no finite numbers; training diverged, take another run")
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    for name in ("torch.onnx", "onnxscript", "onnx_ir"):  # Hydra shows what any library tells
+        logging.getLogger(name).setLevel(logging.ERROR)
     with warnings.catch_warnings(), replace_on_success(path) as beside:
         warnings.simplefilter("ignore")
         if isinstance(module, Branches):

@@ -11,9 +11,9 @@ CALLS = """
 from tests.compiling import compile_once
 compile_once()
 import numpy as np
-from topomerge.kernels import morton
-morton.encode(np.array([[1, 1, 1]]))
-print(sum(morton._encode.stats.cache_misses.values()))
+from topomerge.kernels import voxels
+voxels.encode(np.array([[1, 1, 1]]))
+print(sum(voxels._encode.stats.cache_misses.values()))
 """
 ROOT = Path(__file__).parent.parent
 

@@ -237,7 +237,7 @@ def _is_fitting(plan: Plan, rooms: int, area: float) -> bool:
 
 
 # Raise it when the same item gives other bytes, by whatever step: simulation, extraction, truth. It is part of the files' names.
-PAIR_FORMAT = 14
+PAIR_FORMAT = 15
 EXTRACTION = "topomerge.extraction.extract"
 MAKER = "topomerge.datasets.pairs.example"  # what makes the files
 UNDRAWN = ("niches",)  # of the difficulty: younger than the names of cached pairs, which hold what is drawn

@@ -109,12 +109,13 @@ def _find_file(path: Path) -> Path:
     return path / PAIRS_FILE if path.is_dir() else path
 
 
-def read_pairs_file(path: str | Path, data: str = OWN_DATA) -> PairsFile:
+def read_pairs_file(path: str | Path, data: str = OWN_DATA, paired: bool = True) -> PairsFile:
     """Read the pairs of a folder and check them.
 
     Args:
         data: of `topomerge.registry.DATASETS`: function of the folder that returns the table of a `pairs.yaml`, with files
             relative to it; `OWN_DATA` reads that file itself, or one of another name.
+        paired: two of its captures must share a place.
 
     Raises:
         InputError: one line that names the file, the entry, and what is wrong.
@@ -141,7 +142,7 @@ def read_pairs_file(path: str | Path, data: str = OWN_DATA) -> PairsFile:
     if again := next((k for k, names in enumerate(twice) if names in twice[:k]), None):
         raise InputError(f"{where}: pairs[{again}]: {pairs[again].a} and {pairs[again].b} are listed before; keep one of the two")
     pairs += tuple(_pairs_of_frames(captures, set(twice)))
-    if not any(not pair.different for pair in pairs):
+    if paired and not any(not pair.different for pair in pairs):
         raise InputError(f"{where}: no two captures share a place; list pairs, or name the frame that captures have in common")
     negatives = _number(given.get("negatives", 0.25), f"{where}: negatives", 0.0, 10.0)
     voxel_size = _number(given.get("voxel_size", 0.1), f"{where}: voxel_size", 0.02, 1.0)

@@ -19,7 +19,7 @@ from topomerge.datasets.pairs.plan_examples import LONGEST_SCAN, PlanItem, PlanR
 from topomerge.datasets.pairs.plan_truth import compute_plan_truth
 from topomerge.datasets.simulation.scanner import transform_cloud
 
-from topomerge.extraction.extract import EVIDENCE, gather_evidence, read_navigable
+from topomerge.extraction.extract import gather_evidence, read_navigable
 from topomerge.extraction.parameters import PRESETS, DefaultParameters
 from topomerge.extraction.plans.passages import DOOR_FEATURES, compute_door_features
 from topomerge.extraction.segment import GrowingRooms, SegmentedStorey, log_odds, score_by_plan
@@ -27,7 +27,7 @@ from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.io import archive
 from topomerge.types import Array
 
-PASSAGE_FORMAT = 2  # raise it when the same item gives other bytes: it is part of the files' names
+PASSAGE_FORMAT = 3  # raise it when the same item gives other bytes: it is part of the files' names
 MAP_CELL = 0.1  # m
 PURE = 0.7  # share of a segment in its true room; segments between rooms are no example
 
@@ -49,7 +49,7 @@ class PassageExamples:
     Args:
         features: (n, 17) `DOOR_FEATURES`.
         plan: (n,) log odds of a door by the plan alone.
-        evidence: (n, 3) `EVIDENCE`.
+        shown: (n,) log odds of a door by the walls.
         parted: (n,) bool, do they part two true rooms?
         kind: "walls", or "" of a scan that shows none at heights (`passages.choose_scorer`).
         building: the physical one, where that is known.
@@ -57,7 +57,7 @@ class PassageExamples:
 
     features: Array
     plan: Array
-    evidence: Array
+    shown: Array
     parted: Array
     kind: str
     building: str = ""
@@ -80,7 +80,7 @@ def load_passages(path: Path) -> PassageExamples:
         InputError: it is damaged.
     """
     arrays = archive.read(path, "cached passages")
-    values: dict[str, Any] = {name: arrays[name] for name in ("features", "plan", "evidence", "parted")}
+    values: dict[str, Any] = {name: arrays[name] for name in ("features", "plan", "shown", "parted")}
     return PassageExamples(**values, kind=str(arrays["kind"]))
 
 
@@ -91,7 +91,7 @@ def make_passages(item: PlanItem, plan: Plan | None) -> PassageExamples:
     scan, navigable = read_navigable(transform_cloud(made.cloud, made.frame), MAP_CELL, p, watch)
     found = gather_evidence(scan, navigable, p, watch)
     visited = set(made.visited.tolist())
-    rows: list[tuple[Array, float, tuple[float, ...], bool]] = []
+    rows: list[tuple[Array, float, float, bool]] = []
     for storey in found.storeys:
         columns = np.stack(np.meshgrid(*(np.arange(n) for n in storey.segment.shape), indexing="ij"), axis=-1)
         flat = storey.plan.origin + (columns + 0.5) * storey.plan.edge
@@ -100,21 +100,20 @@ def make_passages(item: PlanItem, plan: Plan | None) -> PassageExamples:
             storey, compute_plan_truth(made.building, storey.plan, places, made.frame, made.shift)[0], visited
         )
     count, kind = len(rows), "walls" if found.walls is not None else ""
-    features, odds, evidence, parted = zip(*rows, strict=True) if rows else ((), (), (), ())
+    features, odds, shown, parted = zip(*rows, strict=True) if rows else ((), (), (), ())
     return PassageExamples(
         np.array(features, float).reshape(count, len(DOOR_FEATURES)),
         np.array(odds, float),
-        np.array(evidence, float).reshape(count, len(EVIDENCE)),
+        np.array(shown, float),
         np.array(parted, bool),
         kind,
     )
 
 
-def collect_storey_passages(
-    storey: SegmentedStorey, truth: Array, visited: set[int]
-) -> list[tuple[Array, float, tuple[float, ...], bool]]:
-    """Features, log odds by the plan, evidence and answer of the passages of a storey, before and while segments of one true room
-    are merged.
+def collect_storey_passages(storey: SegmentedStorey, truth: Array, visited: set[int]) -> list[tuple[Array, float, float, bool]]:
+    """Features, log odds by the plan and by the walls, and answer of the passages of a storey.
+
+    They are collected before and while segments of one true room are merged.
 
     Args:
         truth: (nx, ny) true room of each column, -1 none.
@@ -126,14 +125,14 @@ def collect_storey_passages(
     room = np.where(votes.max(axis=1, initial=0) >= PURE * votes.sum(axis=1), votes.argmax(axis=1), -1)
     room[room == votes.shape[1] - 1] = -1
     growing = GrowingRooms(storey.segment, storey.clearance, storey.passages, storey.plan.edge, score_by_plan)
-    rows: list[tuple[Array, float, tuple[float, ...], bool]] = []
+    rows: list[tuple[Array, float, float, bool]] = []
 
     def add(pairs: list[tuple[int, int]]) -> None:
         for a, b in pairs:
             if room[a] >= 0 and room[b] >= 0 and (room[a] in visited or room[b] in visited):
                 passage, odds = growing.passages[a, b], float(log_odds(np.array(growing.door_probability[a, b])))
                 features = compute_door_features(passage, growing.peak[[a, b]], growing.area[[a, b]])
-                rows.append((features, odds, passage.evidence, bool(room[a] != room[b])))
+                rows.append((features, odds, passage.shown, bool(room[a] != room[b])))
 
     add(list(growing.passages))
     while same := [pair for pair in growing.passages if room[pair[0]] >= 0 and room[pair[0]] == room[pair[1]]]:
@@ -150,5 +149,5 @@ def _draw(seed: int, plans: Any, flat: bool) -> PassageItem:
 def _arrays(item: PlanItem, examples: PassageExamples) -> dict[str, Array]:
     """The arrays of a file."""
     about = {"file": f"{item.name}.npz", **asdict(item)}
-    values = {name: getattr(examples, name) for name in ("features", "plan", "evidence", "parted")}
+    values = {name: getattr(examples, name) for name in ("features", "plan", "shown", "parted")}
     return {**values, "kind": np.array(examples.kind), "about": np.frombuffer(json.dumps(about).encode(), np.uint8)}

@@ -36,7 +36,7 @@ from topomerge.io import archive
 from topomerge.io.listing import convert_to_plain
 from topomerge.types import Array, PointCloud, Sim3
 
-PLAN_FORMAT = 3  # raise it when the same item gives other bytes: it is part of the files' names
+PLAN_FORMAT = 4  # raise it when the same item gives other bytes: it is part of the files' names
 SOURCE_SHARES = {"procedural": 0.55, "r2v": 0.3, "campus": 0.15}
 SENSOR_SHARES = {"tls": 0.16, "lidar": 0.16, "depth": 0.12, "tablet": 0.12, "mono": 0.08, "laser2d": 0.2, "drawn": 0.16}
 # Of what robots and draughtsmen leave: grids of 2D lasers, drawings, and slices.

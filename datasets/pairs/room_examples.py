@@ -120,7 +120,7 @@ def is_outdoor_pose(cloud: PointCloud, building: Building) -> Array:
     return ~shapely.contains_xy(compute_footprint(building), cloud.poses[:, :2, 3])
 
 
-ROOM_EXAMPLE_FORMAT = 5  # raise it when the same item gives other bytes: it is part of the files' names
+ROOM_EXAMPLE_FORMAT = 6  # raise it when the same item gives other bytes: it is part of the files' names
 ANSWERS = ("one", "whole", "entered", "outside")
 
 

@@ -114,7 +114,7 @@ def _list_doors(building: Building, states: Sequence[str]) -> Sequence[tuple[flo
     return [(*d["centre"].tolist(), *(float(d[k]) for k in ("direction", "width", "thickness"))) for d in doors]
 
 
-WALL_FORMAT = 8  # raise it when the same item gives other bytes: it is part of the files' names
+WALL_FORMAT = 9  # raise it when the same item gives other bytes: it is part of the files' names
 SOURCE_SHARES = {"procedural": 0.6, "r2v": 0.25, "campus": 0.15}
 SENSOR_SHARES = {"tls": 0.35, "depth": 0.25, "lidar": 0.2, "tablet": 0.12, "mono": 0.08}
 MAP_CELL = 0.1  # m

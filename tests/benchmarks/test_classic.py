@@ -151,6 +151,6 @@ def test_a_grid_from_above(occupancy) -> None:
     cloud = PointCloud(np.concatenate([floor, wall, lamp, sill]).astype(np.float32))
     (grid,) = occupancy.build_floor_grids(scans.Scan(cloud, truth, ()))
     assert grid.free.sum() == 80 * 60 - 60 and grid.seen.sum() == 80 * 60
-    assert grid.centres(grid.free)[:, :2].min(axis=0) == pytest.approx([0.025, 0.025], abs=1e-6)
+    assert grid.compute_centres(grid.free)[:, :2].min(axis=0) == pytest.approx([0.025, 0.025], abs=1e-6)
     columns, count = occupancy.segment_scan(scans.Scan(cloud, truth, ()), "morphological", [grid])
     assert count == 2 and len(np.unique(columns[0, :, :18])) == len(np.unique(columns[0, :, 24:])) == 1

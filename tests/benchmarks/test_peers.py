@@ -137,29 +137,29 @@ def test_verdicts_are_chosen_over_variants_scores_and_residuals(module, tmp_path
     assert verdicts["kiss03"].variant == "kiss03" and verdicts["kiss03"].at_least == 8.5  # 8 is wrong
     fpfh = verdicts["fpfh"]
     assert fpfh.score == "fitness" and 0.06 <= fpfh.residual_at_most < 0.2 and fpfh.recall == 2 / 3
-    assert [fpfh.believes(r["methods"]["fpfh"]) for r in rows[:3]] == [True, True, False]
+    assert [fpfh.is_accepted(r["methods"]["fpfh"]) for r in rows[:3]] == [True, True, False]
     path = tmp_path / "thresholds.json"
-    path.write_text(json.dumps(thresholds.written(rows, verdicts)))
+    path.write_text(json.dumps(thresholds.serialise_verdicts(rows, verdicts)))
     assert thresholds.load_verdicts(path) == verdicts
     assert json.loads(path.read_text())["names"] == ["p0", "p1", "p2"]
 
 
 def test_what_is_believed_nowhere_stays_so(module) -> None:
     verdict = module("thresholds").PeerVerdict("fgr", "fitness", None, None, 0.0, 0.0, 0)
-    assert not verdict.believes(peer_outcome(fitness=1.0, residual=0.0))
-    assert not verdict.believes({"scores": {}})
+    assert not verdict.is_accepted(peer_outcome(fitness=1.0, residual=0.0))
+    assert not verdict.is_accepted({"scores": {}})
 
 
 def test_rows_know_the_refined_pose_and_the_time_it_took(module) -> None:
     rows, verdict = module("tables"), module("thresholds").PeerVerdict("kiss02q", "inliers", 4.5, None, 1.0, 1.0, 1)
     line = pair_row(ours=our_outcome(), kiss02=peer_outcome(False, inliers=9), kiss02q=peer_outcome(inliers=5))
-    ours, kiss = rows.answers([line], {"kiss02": verdict})
+    ours, kiss = rows.build_answers([line], {"kiss02": verdict})
     assert (ours["method"], ours["score"], ours["believed"]) == ("ours", 0.9, True)
     assert (kiss["method"], kiss["score"], kiss["believed"], kiss["seconds"]) == ("kiss02", 5, True, 3.0)
-    columns = dict(zip(rows.ANSWER_HEADS, rows.answer_columns([kiss]), strict=True))
+    columns = dict(zip(rows.ANSWER_HEADS, rows.format_answer_columns([kiss]), strict=True))
     assert columns["within 0.1 m, 1° %"].startswith("100") and columns["before ICP"] == "0"
     assert (columns["right and believed"], columns["wrong and believed"], columns["over the cap"]) == (1, 0, 0)
-    assert rows.answer_columns([]) == [0, *["–"] * (len(rows.ANSWER_HEADS) - 1)]
+    assert rows.format_answer_columns([]) == [0, *["–"] * (len(rows.ANSWER_HEADS) - 1)]
 
 
 def invented(module):
@@ -177,7 +177,7 @@ def invented(module):
 
 def test_every_cell_of_a_crossed_table_stands_and_empty_ones_are_dashes(module) -> None:
     rows = module("tables")
-    lines = rows.crossed([r for r in invented(module) if r["kind"] == "overlap"]).splitlines()
+    lines = rows.tabulate_crossed([r for r in invented(module) if r["kind"] == "overlap"]).splitlines()
     assert len(lines) == 2 + 9 and lines[0].endswith("| topomerge | FGR |")
     cells = {tuple(line.split(" | ")[:2]): line for line in lines[2:]}
     assert cells["| ≥80 m²", "≥0.5"].endswith("| 1 | 1 · 1 · 0 | 1 · 1 · 0 |")
@@ -193,21 +193,21 @@ def test_pairs_that_must_not_merge_are_counted_by_kind(module) -> None:
 def test_curves_count_wrong_poses_and_strangers_against_precision(module) -> None:
     rows = module("tables")
     fgr = [r for r in invented(module) if r["method"] == "fgr"]
-    precision, recall = rows.curve(fgr)  # by fitness: .8 right, .7 a stranger, .6 wrong
+    precision, recall = rows.compute_curve(fgr)  # by fitness: .8 right, .7 a stranger, .6 wrong
     assert precision.tolist() == [1, 1 / 2, 1 / 3] and recall.tolist() == [0.5, 0.5, 0.5]
-    assert rows.points_of(precision, recall) == [0.5, 0.5, 0.5, 0.5]
-    two = rows.points_of(np.array([1.0, 0.96, 0.9]), np.array([0.2, 0.5, 0.6]))
+    assert rows.interpolate_curve(precision, recall) == [0.5, 0.5, 0.5, 0.5]
+    two = rows.interpolate_curve(np.array([1.0, 0.96, 0.9]), np.array([0.2, 0.5, 0.6]))
     assert two[:3] == [0.2, 0.2, 0.5] and two[3] == pytest.approx(0.2 + 0.96 * 0.3 + 0.9 * 0.1)
     silent = [{**r, "score": -np.inf} for r in fgr]
-    assert rows.points_of(*rows.curve(silent)) == [0, 0, 0, 0]
+    assert rows.interpolate_curve(*rows.compute_curve(silent)) == [0, 0, 0, 0]
 
 
 def test_where_another_has_more_right_is_told(module) -> None:
     rows = module("tables")
     mine = [r for r in invented(module) if r["name"] == "one"]
-    assert rows.behind(mine, [lambda r: "all"]) == "nowhere"
+    assert rows.tabulate_behind(mine, [lambda r: "all"]) == "nowhere"
     off = [{**r, "err": [9.0, 0.0, 0.0]} if r["method"] == "ours" else r for r in mine]
-    assert rows.behind(off, [lambda r: "all"]).startswith("all, within 0.5 m: FGR 1, topomerge 0")
+    assert rows.tabulate_behind(off, [lambda r: "all"]).startswith("all, within 0.5 m: FGR 1, topomerge 0")
 
 
 def test_the_figure_is_written(module, tmp_path) -> None:
@@ -218,8 +218,8 @@ def test_the_figure_is_written(module, tmp_path) -> None:
 def test_cells_come_in_turn_and_some_more_often(module) -> None:
     pairs = module("pairs")
     groups = {("3D–3D", "a"): list("ABCDE"), ("3D–3D", "b"): list("xy"), ("with a slice", "a"): ["s"]}
-    assert "".join(pairs.in_turn(groups, lambda key: 2 if key[1] == "a" and key[0] == "3D–3D" else 1)) == "ABxsCDyE"
-    assert list(pairs.in_turn({}, lambda key: 1)) == []
+    assert "".join(pairs.iter_in_turn(groups, lambda key: 2 if key[1] == "a" and key[0] == "3D–3D" else 1)) == "ABxsCDyE"
+    assert list(pairs.iter_in_turn({}, lambda key: 1)) == []
 
 
 def test_pairs_that_must_not_merge_are_cells_of_their_kind(module) -> None:
@@ -236,8 +236,8 @@ def test_peers_get_the_second_map_at_the_scale_of_the_first(module) -> None:
     a, b = (grid.assign_properties(mean=grid.compute_centroids().astype(np.float32)) for _ in range(2))
     truth = Sim3(0.3, (1.0, 2.0, 0.0), 2.0)
     pair = module("pairs").GridPair("p", a, b, (None, None), truth, 1.0, {"kind": "overlap", "sensors": ["phone", "phone"]})
-    given = pairs.thinned(pair)
-    judged = pairs.scaled(pair)
+    given = pairs.thin_pair(pair)
+    judged = pairs.scale_pair(pair)
     assert judged.truth.scale == 1 and np.allclose(judged.truth.apply(given.b), truth.apply(grid.compute_centroids()), atol=1e-6)
     assert np.allclose(given.a, grid.compute_centroids(), atol=1e-6)
 
@@ -256,18 +256,18 @@ def test_thirty_ordinary_pairs_come_first_and_unknown_scales_not_at_all(module, 
     grids += [about_file(tmp_path / "x.npz", sensors=["tls", "tls"], kind="twin-wing", common=0.0)]
     drawn = [about_file(tmp_path / f"d{k}.npz", sensors=["tls", "drawing"], scaled=k == 1, **alike) for k in range(2)]
     monkeypatch.setattr(pairs, "list_pair_files", lambda split: drawn if split.endswith("_drawings") else grids)
-    test, train, raw = ([path.stem for path in pairs.cached_order(what)] for what in ("test", "train", "raw"))
+    test, train, raw = ([path.stem for path in pairs.list_cached_order(what)] for what in ("test", "train", "raw"))
     assert test[:30] == [f"a{k:02d}" for k in range(30)] and len(test) == 44 == len(set(test)) and "d1" not in test
     assert sorted(test[30:37]) == ["a30", "a31", "a32", "a33", "d0", "s0", "x"]
     assert sorted(train[:7]) == ["a00", "a01", "a02", "a03", "d0", "s0", "x"]
-    assert raw == [f"a{k:02d}" for k in range(30)] == [path.stem for path in pairs.cached_order("thinned")]
+    assert raw == [f"a{k:02d}" for k in range(30)] == [path.stem for path in pairs.list_cached_order("thinned")]
 
 
 def test_poses_are_judged_upright_and_misses_are_told(module, monkeypatch) -> None:
     peers, pairs, answer = module("run"), module("pairs"), module("methods").PeerAnswer
     grid = VoxelGrid(np.array([[0, 0, 0], [30, 10, 20]], np.int32), np.zeros(3), 0.1, (40, 40, 40))
     about = {"kind": "overlap", "sensors": ["tls", "tls"], "source": "procedural", "building": "office-1-1"}
-    given = pairs.thinned(pairs.GridPair("p", grid, grid, (None, None), Sim3(0.0, (1.0, 0.0, 0.0)), 1.0, about))
+    given = pairs.thin_pair(pairs.GridPair("p", grid, grid, (None, None), Sim3(0.0, (1.0, 0.0, 0.0)), 1.0, about))
     off, exact = np.eye(4), np.eye(4)
     off[0, 3], exact[0, 3] = 1.3, 1.0
     over = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -297,7 +297,7 @@ def test_ours_is_measured_anew_and_what_peers_answered_stays(module, monkeypatch
     given = [SimpleNamespace(pair=SimpleNamespace(name=name)) for name in ("p", "other")]
     monkeypatch.setattr(peers, "iter_peer_pairs", lambda what, done: iter(given))
     monkeypatch.setattr(peers, "run_ours", lambda given: {"err": [0.1, 0.0, 0.0]})
-    peers.again("test")
+    peers.measure_ours_anew("test")
     after = [json.loads(line) for line in target.read_text().splitlines()]
     assert after[0]["methods"] == {"ours": {"err": [0.1, 0.0, 0.0]}, "kiss02": {"err": [9.0, 0.0, 1.0]}}
     assert after[1] == lines[1] and list(tmp_path.iterdir()) == [target]
@@ -316,4 +316,4 @@ def test_points_of_pairs_of_another_version_are_not_simulated(module, monkeypatc
     monkeypatch.setattr(pairs, "list_cached_order", lambda what: [tmp_path / "old.npz"])
     monkeypatch.setattr(pairs, "load_raw_items", lambda names: {})
     with pytest.raises(InputError, match="old.npz: was made by another version.*task=merges data=test"):
-        next(pairs.peer_pairs("raw", set()))
+        next(pairs.iter_peer_pairs("raw", set()))

@@ -68,7 +68,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("keys", "wanted"), CASES)
+@pytest.mark.parametrize(("keys", "requested"), CASES)
 def test_bash_completes(folder: Path, keys: str, requested: str) -> None:
     if shutil.which("bash") is None:
         pytest.skip("no bash")
@@ -76,7 +76,7 @@ def test_bash_completes(folder: Path, keys: str, requested: str) -> None:
     assert requested in shown
 
 
-@pytest.mark.parametrize(("keys", "wanted"), CASES)
+@pytest.mark.parametrize(("keys", "requested"), CASES)
 def test_zsh_completes(folder: Path, keys: str, requested: str) -> None:
     if shutil.which("zsh") is None:
         pytest.skip("no zsh")
@@ -84,7 +84,7 @@ def test_zsh_completes(folder: Path, keys: str, requested: str) -> None:
     assert " ".join(requested.split()) in " ".join(shown.split())
 
 
-@pytest.mark.parametrize(("keys", "wanted"), CASES)
+@pytest.mark.parametrize(("keys", "requested"), CASES)
 def test_fish_completes(folder: Path, keys: str, requested: str) -> None:
     if shutil.which("fish") is None:
         pytest.skip("no fish")

@@ -11,13 +11,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import topomerge
 from tests.cli.processes import Run, process
+from tests.scenes import two_rooms
 from tests.scenes_map import building, same
+from topomerge.cli.inputs import check_cloud_options
 from topomerge.cli.main import COMMANDS
-from topomerge.cli.options import check_cloud_options
 from topomerge.errors import InputError
 from topomerge.io.maps import load_map
 
@@ -56,6 +58,36 @@ sys.exit(f"imported {heavy}" if heavy else 0)
 """
     done = process(code=code)
     assert done.returncode == 0, done.stderr
+
+
+NEVER_FOR_ONE_MAP = (
+    "matplotlib",
+    "sklearn",
+    "torch",
+    "hydra",
+    "open3d",
+    "pandas",
+    "PIL",
+    "scipy.optimize",
+    "scipy.stats",
+    "rich",
+)
+ONLY_TO_EXTRACT = ("scipy.spatial", "scipy.ndimage", "scipy.sparse", "shapely", "onnxruntime", "topomerge.extraction")
+
+
+def test_a_command_imports_only_what_it_uses(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", two_rooms().points())
+    code = """
+import sys
+from topomerge.cli.main import main
+assert main(sys.argv[1:]) == 0
+print(*sys.modules)
+"""
+    extract = process("extract", "a.npy", "-o", "a.tmap", "-q", code=code, cwd=tmp_path)
+    assert extract.returncode == 0 and not set(NEVER_FOR_ONE_MAP) & set(extract.stdout.split()), extract.stderr
+    assert set(ONLY_TO_EXTRACT) <= set(extract.stdout.split())
+    info = process("info", "a.tmap", "--json", code=code, cwd=tmp_path)
+    assert info.returncode == 0 and not {*NEVER_FOR_ONE_MAP, *ONLY_TO_EXTRACT} & set(info.stdout.split()), info.stderr
 
 
 def test_package_is_lazy_and_whole() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from tests.samples import write_e57, write_las
 from tests.scenes import two_rooms
 from tests.scenes_map import building
 from tests.types.test_deformation import deformation
+from topomerge.cli.inputs import LoadedMap
 from topomerge.cli.main import main as cli
 from topomerge.cli.merge import choose_point_files
 from topomerge.fusion.result import MergeResult
@@ -52,7 +54,8 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
             return judged(maps, believed or force, {} if more.get("rigid") else bends, apart, **more)
 
         monkeypatch.setattr(topomerge, "merge", merge, raising=False)
-        monkeypatch.setattr("topomerge.cli.merge.map_from", lambda path, args: building(1, 1))
+        loaded = LoadedMap(replace(building(1, 1), warnings=()), 0.0)
+        monkeypatch.setattr("topomerge.cli.inputs._load_map", lambda path, args, start_task: loaded)
         monkeypatch.setattr("topomerge.viz.merge_report.render_merge_html", lambda result: "a report")
         status = cli(["merge", *words])
         out, err = capsys.readouterr()

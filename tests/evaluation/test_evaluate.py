@@ -126,7 +126,7 @@ def test_marks_are_replaced(tmp_path: Path) -> None:
 
 
 def test_a_table_as_latex() -> None:
-    text = Table("50 % of m²", ["a_b", "x"], [["one", "0.5 [0.4, 0.6]"]]).latex()
+    text = Table("50 % of m²", ["a_b", "x"], [["one", "0.5 [0.4, 0.6]"]]).format_latex()
     assert r"a\_b & x \\" in text and r"50 \% of m$^2$" in text and r"\begin{tabular}{lr}" in text
 
 

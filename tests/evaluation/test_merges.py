@@ -60,18 +60,18 @@ def cached(**about: object) -> SimpleNamespace:
 
 
 def test_where_both_maps_are_from(module, monkeypatch) -> None:
-    pairs = module("grid_pairs")
+    pairs = module("tasks")
     monkeypatch.setattr(pairs, "map_other_buildings", lambda split: {(0, 7): "school/Sabadell3"})
     one = cached(building="office-900001-2", kind="overlap", sensors=["tls", "depth"], set=0, item=3)
-    assert pairs.buildings_of(one, "test") == ("office-900001-2", "office-900001-2")
+    assert pairs.find_buildings(one, "test") == ("office-900001-2", "office-900001-2")
     two = cached(building="school/Sabadell1", kind="other-building", sensors=["tls", "depth"], set=0, item=7)
-    names = pairs.buildings_of(two, "test")
+    names = pairs.find_buildings(two, "test")
     assert names == ("school/Sabadell1", "school/Sabadell3")
-    assert pairs.places_of(names)["physical"] == pairs.places_of(names)["physical_other"] == "campus/school/sabadell"
+    assert pairs.describe_places(names)["physical"] == pairs.describe_places(names)["physical_other"] == "campus/school/sabadell"
     drawn = cached(
         building="school/Sabadell1 + school/Sabadell2 + lab-900002-1", kind="other-building", sensors=["tls", "drawing"]
     )
-    place = pairs.places_of(pairs.buildings_of(drawn, "test_drawings"))
+    place = pairs.describe_places(pairs.find_buildings(drawn, "test_drawings"))
     assert place["physical"] == "campus/school/sabadell" and place["other_source"] == "procedural"
 
 
@@ -89,7 +89,7 @@ def test_pairs_of_the_tables_are_not_made_without_the_real_plans(monkeypatch, tm
 
 
 def test_what_makes_a_pair_hard(module) -> None:
-    hard = module("grid_pairs").list_difficulties
+    hard = module("tasks").list_difficulties
     assert hard(cached(difficulty={"moved": 0.6, "gone": 0.25, "glass": 0.1})) == ["much moved furniture"]
     assert hard(cached(difficulty={"moved": 0.3, "glass": 0.5})) == ["glass walls"] and hard(cached()) == []
 

@@ -232,7 +232,7 @@ def test_twins() -> None:
 
 def test_mutual_matches() -> None:
     class Learned:
-        def probabilities(self, a: object, b: object) -> tuple[np.ndarray, np.ndarray]:
+        def compute_probabilities(self, a: object, b: object) -> tuple[np.ndarray, np.ndarray]:
             rows = np.array([[0.9, 0.05, 0.05], [0.6, 0.3, 0.1], [0.1, 0.2, 0.7]])  # of 3 rooms of a: two rooms of b, none
             columns = np.array([[0.7, 0.2, 0.05, 0.05], [0.1, 0.5, 0.1, 0.3]])  # of 2 rooms of b: three rooms of a, none
             return rows, columns

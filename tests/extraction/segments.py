@@ -7,10 +7,8 @@ import numpy as np
 from topomerge.extraction.plans.passages import Pair, Passage
 from topomerge.extraction.plans.plan import build_profile_bands
 from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES, ClassifiedStorey, StoreyPlan
-from topomerge.extraction.segment import LeastSize, Scorer, SegmentedStorey, partition_rooms
+from topomerge.extraction.segment import Scorer, SegmentedStorey, partition_rooms
 from topomerge.types import Array
-
-ANY_WIDTH = LeastSize(0.8, 0.8, 0.0, 0.0)
 
 
 def storey_of(
@@ -31,7 +29,7 @@ def find_rooms_of_segments(
     clearance: Array,
     passages: dict[Pair, Passage],
     score: Scorer,
-    least: LeastSize = ANY_WIDTH,
+    least: float = 0.8,
     edge: float = 0.1,
 ) -> Array:
     """(n,) room of each segment."""

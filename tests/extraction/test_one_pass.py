@@ -16,25 +16,24 @@ from topomerge.errors import InputError
 from topomerge.extraction import extract as evidence
 from topomerge.extraction import extract as pipeline
 from topomerge.extraction import segment, walls
-from topomerge.extraction.elevations.doorways import DOORWAY_DTYPE
-from topomerge.extraction.extract import EVIDENCE, PASSAGES_FILE, SCORE_INPUTS, choose_scorer
+from topomerge.extraction.extract import PASSAGES_FILE, SCORE_INPUTS, choose_scorer
 from topomerge.extraction.plans.passages import Passage
-from topomerge.extraction.segment import find_segments, split_segments
+from topomerge.extraction.segment import find_segments
 from topomerge.io.archive import read_weights_json
 
 ONCE = (
     (pipeline, "rasterise_storeys"),
-    (segment, "column_probabilities"),
+    (segment, "compute_column_probabilities"),
     (pipeline, "segment_storey"),
     (pipeline, "unroll_walls"),
-    (walls, "place_classes"),
+    (walls, "classify_places"),
     (pipeline, "find_passages"),
     (pipeline, "partition_rooms"),
-    (pipeline, "topometric_map"),
+    (pipeline, "build_topometric_map"),
     (pipeline, "estimate_attributes"),
 )
 CLOUD = three_doors().points()
-PASSAGE = Passage((10, 20), 0.8, (0.0, 1.0), (0.0,) * 12, evidence=(0.0,) * len(EVIDENCE))
+PASSAGE = Passage((10, 20), 0.8, (0.0, 1.0), (0.0,) * 12)
 
 
 def test_each_step_is_taken_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -66,26 +65,6 @@ def test_a_cloud_enters_few_files_of_the_extraction() -> None:
 MOST_FILES = 31  # of the extraction's 37
 
 
-def doorway(x: float, y: float, width: float = 0.9) -> np.ndarray:
-    out = np.zeros(1, DOORWAY_DTYPE)
-    out["centre"], out["out"], out["width"] = (x, y, 0.0), (1.0, 0.0), width
-    return out
-
-
-def test_a_doorway_splits_the_segment_that_it_lies_in_where_walls_close_the_rest() -> None:
-    columns = np.zeros((40, 20), np.int64)
-    columns[20, :6] = columns[20, 14:] = -1  # a wall with a gap of 0.8 m
-    storey = storey_of(columns, {}, np.where(columns >= 0, 0.5, 0.0))
-    split = split_segments(storey, doorway(2.05, 1.0))
-    assert split.count == 2 and len(np.unique(split.segment[:19][split.segment[:19] >= 0])) == 1
-    assert split.split == frozenset({(0, 1)}) == frozenset(split.passages)
-    assert split.areas.sum() == pytest.approx(storey.areas.sum())
-    assert (
-        split_segments(storey_of(np.zeros((40, 20), np.int64), {}), doorway(2.05, 1.0)).count == 1
-    )  # the floor goes on beside it
-    assert split_segments(storey, doorway(2.05, 1.0)[:0]) is storey
-
-
 def test_places_lie_in_the_segment_of_the_nearest_floor_below_or_above() -> None:
     columns = np.repeat([[0], [1]], 10, axis=0).repeat(4, axis=1)
     lower = storey_of(columns, {})
@@ -97,11 +76,10 @@ def test_places_lie_in_the_segment_of_the_nearest_floor_below_or_above() -> None
 def test_doorways_that_walls_show_raise_the_score() -> None:
     score, x = (
         choose_scorer(True),
-        np.tile(np.array([0.8, 0.4, 0.3, 0.5, 1, 1, 0.2, 0.3, 1, 1, 0, 1, 1, 0.8, 0.9, 2, 3.0]), (4, 1)),
+        np.tile(np.array([0.8, 0.4, 0.3, 0.5, 1, 1, 0.2, 0.3, 1, 1, 0, 1, 1, 0.8, 0.9, 2, 3.0]), (3, 1)),
     )
-    rows = [(0.0, 0, 0), (1.0, 0, 0), (3.0, 0, 0), (0.0, 1, 0)]
-    none, shown, surely, within = score(x, [replace(PASSAGE, evidence=row) for row in rows]).tolist()
-    assert none < shown < surely and none < within
+    none, shown, surely = score(x, [replace(PASSAGE, shown=odds) for odds in (0.0, 1.0, 3.0)]).tolist()
+    assert none < shown < surely
 
 
 def test_all_that_speaks_for_a_door_has_a_weight_above_0() -> None:
@@ -111,5 +89,5 @@ def test_all_that_speaks_for_a_door_has_a_weight_above_0() -> None:
 
 def test_damaged_weights_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(evidence, "read_weights_json", lambda *_: {"walls": [0.0, np.nan]})
-    with pytest.raises(InputError, match=r"passages.json: walls must be 4 numbers"):
+    with pytest.raises(InputError, match=r"passages.json: walls must be 3 numbers"):
         choose_scorer(True)

@@ -15,7 +15,7 @@ from topomerge.extraction.parameters import PRESETS, DefaultParameters, SharedPa
 
 def test_each_preset_has_only_what_it_uses() -> None:
     own = [{f.name for f in fields(PRESETS[name])} - {f.name for f in fields(SharedParameters)} for name in ("default", "thesis")]
-    assert own[0] == {"door", "slice_door", "narrow", "walls"} and not own[0] & own[1]
+    assert own[0] == {"door", "narrow", "walls"} and not own[0] & own[1]
 
 
 @pytest.mark.parametrize(("preset", "key", "owner"), [("thesis", "door", "default"), ("default", "view_radius", "thesis")])

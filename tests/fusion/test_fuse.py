@@ -69,7 +69,7 @@ def test_bits_of_joined_maps_follow(halves, joined):
 def test_what_one_map_saw_empty_and_the_other_did_not_is_occupied(halves, joined):
     west, east = halves
     place = truth(0, 2).inverse().apply(joined.grid.compute_centroids()[joined.provenance == 1])
-    assert east.free.rows(east.free.locate(place)).max() >= 0  # cells of the one stand in empty space of the other
+    assert east.free.find_rows(east.free.locate(place)).max() >= 0  # cells of the one stand in empty space of the other
     assert np.array_equal(joined.free.origin, joined.grid.origin) and joined.free.edge == 2 * joined.grid.edge
     assert not joined.grid.coarsen(2).contains(joined.free.cells).any()
     assert len(joined.free) > max(len(west.free), len(east.free))

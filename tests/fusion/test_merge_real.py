@@ -14,7 +14,7 @@ from topomerge.registration.pipeline import register
 
 @pytest.mark.slow  # of simulated maps: test_registration
 @pytest.mark.data
-@pytest.mark.parametrize("wanted", ["carmen/orebro-first-last", "utexas/gdc1-1s"])
+@pytest.mark.parametrize("requested", ["carmen/orebro-first-last", "utexas/gdc1-1s"])
 def test_a_stated_storey_never_lowers_a_right_pose_of_real_maps(data_dir: Path, requested: str) -> None:
     source, name = requested.split("/")
     pair = dict(sources.iter_pair_makers(source, data_dir))[name]()

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from topomerge.models.weights import read_embedder
 
 from tests.graphs import write_set
 from topomerge import code_digest
@@ -67,7 +68,7 @@ def test_a_run_with_other_settings_does_not_go_on(settings, tmp_path):
     assert starts[1]["changed"] == {"epochs": [1, 2], "threads": [1, 2]} and not starts[0]["changed"]
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["epochs"] == 2 and not config["resume"]  # another run may begin with it
-    assert len(load_embedder(tmp_path / "run" / "last").about["provenance"]["starts"]) == 2
+    assert len(read_embedder(tmp_path / "run" / "last")[1]["provenance"]["starts"]) == 2
 
 
 def test_keys_that_one_version_lacks_count_for_nothing():

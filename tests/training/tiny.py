@@ -16,7 +16,6 @@ from topomerge.datasets.pairs.wall_examples import WallExample, WallItem, build_
 from topomerge.embedding.engineered import FEATURES
 from topomerge.embedding.quarter_turns import FACTS, TurnedRows
 from topomerge.extraction.elevations.elevation import ALONG, BANDS, DEPTHS, FACE_DTYPE, STRIP_CHANNELS
-from topomerge.extraction.extract import EVIDENCE
 from topomerge.extraction.plans.passages import Passage
 from topomerge.extraction.plans.plan import build_profile_bands
 from topomerge.extraction.plans.storey_plan import StoreyPlan
@@ -235,7 +234,7 @@ def room_examples(count: int) -> list[MatcherExample]:
 
 def passages(count: int) -> list[Passage]:
     """Passages of which nothing but the plan speaks."""
-    return [Passage((0, 0), 0.8, (1.0, 0.0), (0.0,) * 12, evidence=(0.0,) * len(EVIDENCE))] * count
+    return [Passage((0, 0), 0.8, (1.0, 0.0), (0.0,) * 12)] * count
 
 
 def passage_scans(count: int) -> list[PassageExamples]:
@@ -243,8 +242,8 @@ def passage_scans(count: int) -> list[PassageExamples]:
     scans = []
     for k in range(count):
         rng = np.random.default_rng(k)
-        evidence = np.column_stack([np.maximum(rng.normal(0, 3, 40), 0), rng.random(40) < 0.3, np.zeros(40)]).astype(float)
-        parted = evidence[:, 0] + rng.normal(0, 0.5, 40) > 0.5
+        shown = np.maximum(rng.normal(0, 3, 40), 0)
+        parted = shown + rng.normal(0, 0.5, 40) > 0.5
         plan = np.where(parted, 1.0, -1.0) + rng.normal(0, 2, 40)
-        scans.append(PassageExamples(rng.random((40, 17)), plan, evidence, parted, "walls", f"b{k}"))
+        scans.append(PassageExamples(rng.random((40, 17)), plan, shown, parted, "walls", f"b{k}"))
     return scans

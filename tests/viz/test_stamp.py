@@ -15,7 +15,7 @@ from topomerge.fusion.atlas.store import add
 
 @pytest.mark.longer
 def test_an_open_page_shows_the_atlas_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("topomerge.fusion.atlas.solve.hypotheses", lambda *_: ())
+    monkeypatch.setattr("topomerge.fusion.atlas.solve.find_hypotheses", lambda *_: ())
     add(tmp_path / "house", [("one", room(0))], tm.render_atlas_html)
     with Page(tmp_path / "house" / "report.html", tmp_path / "profile") as page:
         page.run("window.opened = true")
@@ -27,7 +27,7 @@ def test_an_open_page_shows_the_atlas_as_it_is(tmp_path: Path, monkeypatch: pyte
 
 @pytest.mark.longer
 def test_a_page_alone_stays_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("topomerge.fusion.atlas.solve.hypotheses", lambda *_: ())
+    monkeypatch.setattr("topomerge.fusion.atlas.solve.find_hypotheses", lambda *_: ())
     add(tmp_path / "house", [("one", room(0))], tm.render_atlas_html)
     shutil.copy(tmp_path / "house" / "report.html", tmp_path / "sent.html")
     assert 'id="stamp"' not in tm.render_atlas_html(tm.build_atlas([room(0), room(1)]), {})

@@ -7,6 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,16 +25,15 @@ from topomerge.cli.console import (
     warn,
     write_out,
 )
+from topomerge.cli.inputs import check_cloud_options, iter_input_maps, load_input_map
 from topomerge.cli.options import (
     ATLAS_OPTIONS,
     CLOUD_OPTIONS,
     build_json_option,
     build_output_option,
     build_quiet_option,
-    check_cloud_options,
     collect_atlas_options,
     collect_given,
-    load_input_map,
     parse_count,
     parse_positive,
 )
@@ -73,17 +73,19 @@ def _add(args: argparse.Namespace) -> int:
     choices, workers = collect_atlas_options(args), _build_workers(args)
     check_inputs(args.items)
     check_cloud_options(args.items, args)
-    maps = ((Path(path).stem, replace(load_input_map(path, args), source=path)) for path in args.items)  # one in memory at a time
-    return _report_result(add(args.folder, maps, render_atlas_html, workers, **choices), args)
+    with closing(iter_input_maps(args.items, args)) as loaded:  # few are in memory at a time
+        maps = ((Path(path).stem, replace(one.map, source=path)) for path, one in zip(args.items, loaded, strict=True))
+        return _report_result(add(args.folder, maps, render_atlas_html, workers, **choices), args)
 
 
 def _build_workers(args: argparse.Namespace) -> Workers | None:
     """Who registers pairs: None is this process."""
     from topomerge.fusion.atlas.partners import connect_cluster, start_processes
 
-    if args.cluster and args.jobs > 1:
+    jobs = getattr(args, "jobs", 1)
+    if args.cluster and jobs > 1:
         raise InputError("--cluster and --jobs: give one of them; the workers of a cluster are its own")
-    return connect_cluster(args.cluster) if args.cluster else start_processes(args.jobs) if args.jobs > 1 else None
+    return connect_cluster(args.cluster) if args.cluster else start_processes(jobs) if jobs > 1 else None
 
 
 def _remove(args: argparse.Namespace) -> int:
@@ -175,7 +177,13 @@ ATLAS = Command(
         build_option("folder", metavar="DIR", help="the atlas"),
         build_option("items", nargs="*", metavar="MAP", help="add, find: clouds or .tmap; remove: names as `list` prints them"),
         build_option("--first", type=parse_count, default=5, metavar="N", help="find: how many maps to name (default 5)"),
-        build_option("--jobs", type=parse_count, default=1, metavar="N", help="add: register pairs in N processes (default 1)"),
+        build_option(
+            "--jobs",
+            type=parse_count,
+            metavar="N",
+            help="add: register pairs in N processes (default 1), and extract at most N large clouds at once (default: what "
+            "cores and memory allow)",
+        ),
         build_option(
             "--cluster", default="", metavar="ADDRESS", help="add: register pairs on a Dask cluster, e.g. tcp://host:8786"
         ),

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -129,6 +131,20 @@ def warn(messages: Iterable[str]) -> None:
     """Print warnings to stderr, one line each."""
     for message in messages:
         print_text(f"topomerge: warning: {' '.join(message.split())}", sys.stderr)
+
+
+def show_log(verbose: int, debug: bool) -> None:
+    """Show what this package logs; what libraries log or warn of, in words of theirs, only to those who look for a fault."""
+    if not logging.getLogger().handlers:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("topomerge: %(message)s"))
+        if not debug:
+            handler.addFilter(logging.Filter("topomerge"))
+        logging.getLogger().addHandler(handler)
+    level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
+    logging.getLogger("topomerge").setLevel(level)
+    if not debug and not sys.warnoptions:
+        warnings.simplefilter("ignore")
 
 
 def _is_at_memory_limit() -> bool:

@@ -22,6 +22,7 @@ from topomerge.cli.console import (
     write_all,
     write_out,
 )
+from topomerge.cli.inputs import check_cloud_options, load_input_map
 from topomerge.cli.options import (
     CLOUD_OPTIONS,
     CONTEXT_STEPS,
@@ -32,15 +33,11 @@ from topomerge.cli.options import (
     build_json_option,
     build_output_option,
     build_quiet_option,
-    check_cloud_options,
     check_descriptor,
     collect_given,
-    load_input_map,
     parse_positive,
 )
-from topomerge.embedding.learned import EMBEDDER_FILE, find_state, read_embedder_card
 from topomerge.errors import InputError
-from topomerge.networks.network import card_of
 
 OTHER_OUTPUTS = "--json, --ply, --figure, --report"
 FIGURE_FORMATS = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
@@ -199,6 +196,9 @@ EMBED = Command(
 
 def run_export_embedder(args: argparse.Namespace) -> int:
     """`topomerge export-embedder`: the best embedder of a run, or what an earlier version wrote, as ONNX with its card."""
+    from topomerge.embedding.learned import EMBEDDER_FILE, find_state, read_embedder_card  # here: it imports SciPy
+    from topomerge.networks.network import card_of
+
     state = find_state(args.run_folder)
     if state is None:
         card = read_embedder_card(args.run_folder)

@@ -7,12 +7,10 @@ this folder and enter it in `COMMANDS`; what it needs of the package it imports 
 from __future__ import annotations
 
 import argparse
-import logging
 import os
 import sys
 import tempfile
 import traceback
-import warnings
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -37,47 +35,15 @@ from topomerge.cli.console import (
     open_output_folder,
     print_line,
     print_text,
+    show_log,
     write_all,
 )
+from topomerge.cli.dataset import DATASET, FINETUNE
 from topomerge.cli.export import EXPORT
 from topomerge.cli.extract import EMBED, EXPORT_EMBEDDER, EXTRACT, INFO
 from topomerge.cli.merge import MATCH, MERGE
-from topomerge.cli.options import build_output_option, build_quiet_option, collect_given, parse_count, parse_whole_number
+from topomerge.cli.options import build_output_option, build_quiet_option, collect_given, parse_whole_number
 from topomerge.errors import InputError, make_printable
-
-
-def dataset_command(args: argparse.Namespace) -> int:
-    """`topomerge dataset check`: print what the pairs of a folder have in common, and what is wrong with them."""
-    from topomerge.datasets.pairs.own_pairs import check_folder
-
-    def tell(text: str) -> None:
-        if not args.quiet:
-            print_line(text, sys.stderr)
-
-    lines, wrong = check_folder(args.folder, args.cache, args.jobs, tell)
-    print_text("\n".join(lines))
-    if wrong:
-        raise InputError(f"{args.folder}: captures and pairs that are wrong: {wrong}; correct what is marked WRONG above")
-    return 0
-
-
-DATASET = Command(
-    "dataset",
-    dataset_command,
-    "check a folder of your own captures and pairs, to train and to evaluate on",
-    "topomerge dataset check my_scans/",
-    (
-        build_option("verb", choices=("check",), help="extract the captures, and print what the pairs have in common"),
-        build_option("folder", metavar="DIR", help="a folder with a pairs.yaml, or such a file"),
-        build_option("--cache", default="cache", metavar="DIR", help="of the maps; that of train.py (default cache)"),
-        build_option("--jobs", type=parse_count, default=1, metavar="N", help="processes (default 1)"),
-        build_quiet_option("print only the table"),
-    ),
-    paths=("folder",),
-    description="Check the pairs.yaml of a folder of captures (docs: Training, Your own pairs): for each pair the rooms of both "
-    "maps, those that match, and the area in common; and what is wrong. Status 1: something is.",
-)
-
 
 KINDS_OF_BUILDINGS = ("office", "openplan", "apartment", "hotel", "hospital", "school", "lab", "house")  # of datasets/buildings
 
@@ -234,12 +200,27 @@ VIEW = Command(
 )
 
 
-COMMANDS = (EXTRACT, INFO, EMBED, MATCH, MERGE, SIMULATE, COMPLETION, ATLAS, WATCH, EXPORT, EXPORT_EMBEDDER, VIEW, DATASET)
+COMMANDS = (
+    EXTRACT,
+    INFO,
+    EMBED,
+    MATCH,
+    MERGE,
+    SIMULATE,
+    COMPLETION,
+    ATLAS,
+    WATCH,
+    EXPORT,
+    EXPORT_EMBEDDER,
+    VIEW,
+    DATASET,
+    FINETUNE,
+)
 EXIT_STATUSES = """\
 exit status:
   0    done
   1    bad input or a wrong command line: one line on stderr says which file and why; no output is written
-  2    no trustworthy merge: the reason is printed and stands in merge.json
+  2    no trustworthy merge: the reason is printed and stands in merge.json; of finetune: it did not help
   130  interrupted
   141  what read the output went away (`| head`)
   143  terminated
@@ -325,23 +306,9 @@ def _drop_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _show_log(verbose: int, debug: bool) -> None:
-    """Show what this package logs; what libraries log or warn of, in words of theirs, only to those who look for a fault."""
-    if not logging.getLogger().handlers:
-        handler = logging.StreamHandler()
-        handler.setFormatter(logging.Formatter("topomerge: %(message)s"))
-        if not debug:
-            handler.addFilter(logging.Filter("topomerge"))
-        logging.getLogger().addHandler(handler)
-    level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
-    logging.getLogger("topomerge").setLevel(level)
-    if not debug and not sys.warnoptions:
-        warnings.simplefilter("ignore")
-
-
 def _run(args: argparse.Namespace) -> int:
     debug = args.verbose > 1 or os.environ.get("TOPOMERGE_DEBUG", "") not in ("", "0")
-    _show_log(args.verbose, debug)
+    show_log(args.verbose, debug)
     try:
         check_memory_limit()
         status = int(args.run(args))

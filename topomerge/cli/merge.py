@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from time import perf_counter
 from typing import TYPE_CHECKING
 
 import topomerge
@@ -27,20 +26,19 @@ from topomerge.cli.console import (
     warn,
     write_out,
 )
+from topomerge.cli.inputs import check_cloud_options, collect_reading_options, is_map, iter_input_maps
 from topomerge.cli.options import (
     BELIEF_OPTIONS,
     CLOUD_OPTIONS,
     CONTEXT_STEPS,
     DESCRIPTOR,
+    JOBS,
     build_json_option,
     build_output_option,
     build_quiet_option,
-    check_cloud_options,
     check_descriptor,
     collect_belief_options,
     collect_given,
-    collect_reading_options,
-    load_input_map,
     name_option_in_errors,
 )
 from topomerge.errors import InputError
@@ -49,7 +47,6 @@ if TYPE_CHECKING:
     import numpy as np
 
     from topomerge.fusion.result import MergeResult
-    from topomerge.types import TopometricMap
 
 
 def choose_point_files(inputs: Sequence[str], folder: Path) -> dict[int, Path]:
@@ -85,7 +82,7 @@ def write_points(result: MergeResult, folder: Path, args: argparse.Namespace) ->
         for k, name in result.points.items():
             _write(result, k, stack.enter_context(replace_on_success(folder / name)), args)
         for k, source in enumerate(args.inputs if args.points and result.placements else ()):
-            if Path(source).suffix.lower() == ".tmap":
+            if is_map(source):
                 warn([f"{source}: is a map, which has no points; give the scan that it was made of for --points"])
             elif k not in result.placements:
                 warn([f"{source}: stands apart, its points are not written"])
@@ -156,14 +153,12 @@ def run_merge(args: argparse.Namespace) -> int:
 def _merge(args: argparse.Namespace, folder: Path, files: Mapping[int, Path]) -> int:
     belief = collect_belief_options(args)
     _check_choices(args)
-    maps, read_seconds, extract_seconds = [], 0.0, 0.0
-    for path in args.inputs:
-        topomap, read, extract = _load_timed_map(path, args)
-        maps.append(topomap)
-        read_seconds, extract_seconds = read_seconds + read, extract_seconds + extract
+    loaded = list(iter_input_maps(args.inputs, args))
+    maps = [replace(one.map, source=path) for one, path in zip(loaded, args.inputs, strict=True)]
     choices = collect_given(args, "force", "rigid")
     result = topomerge.merge(maps, scale=args.scale_of_b, embedder=args.descriptor, poses=args.poses, **choices, **belief)
-    result = replace(result, seconds={**result.seconds, "read": read_seconds, "extract": extract_seconds})
+    seconds = {"read": sum(one.read_seconds for one in loaded), "extract": sum(one.extract_seconds for one in loaded)}
+    result = replace(result, seconds={**result.seconds, **seconds})
     warn(result.warnings)
     result = add_point_files(result, files)
     with write_points(result, folder, args):
@@ -192,16 +187,6 @@ def _check_choices(args: argparse.Namespace) -> None:
         check_poses(args.poses, len(args.inputs), args.scale_of_b)
         if args.poses == "surfaces":
             check_open3d()
-
-
-def _load_timed_map(path: str, args: argparse.Namespace) -> tuple[TopometricMap, float, float]:
-    """The map that a path names, and the seconds of reading and of extracting it; of a .tmap, all is reading."""
-    began = perf_counter()
-    topomap = load_input_map(path, args)
-    seconds, extracting = perf_counter() - began, 0.0
-    if Path(path).suffix.lower() != ".tmap":
-        extracting = min(sum(s for step, s in topomap.seconds.items() if not step.startswith("read")), seconds)
-    return replace(topomap, source=path), seconds - extracting, extracting
 
 
 MERGE = Command(
@@ -239,6 +224,7 @@ MERGE = Command(
         *BELIEF_OPTIONS,
         DESCRIPTOR,
         *CLOUD_OPTIONS,
+        JOBS,
         build_quiet_option("print nothing but warnings and a refusal"),
     ),
     paths=("inputs", "output"),
@@ -262,7 +248,7 @@ def run_match(args: argparse.Namespace) -> int:
     if args.report:
         check_outputs([args.report], [args.a, args.b])
         check_suffix("--report", args.report, PAGE_SUFFIXES)
-    a, b = load_input_map(args.a, args), load_input_map(args.b, args)
+    a, b = (loaded.map for loaded in iter_input_maps([args.a, args.b], args))
     check(a, b)
     alone = [path for path, topomap in ((args.a, a), (args.b, b)) if len(topomap.rooms) == 1]
     warn(f"{path}: has one room: only its shape and doors can be compared" for path in alone)
@@ -304,6 +290,7 @@ MATCH = Command(
         DESCRIPTOR,
         CONTEXT_STEPS,
         *CLOUD_OPTIONS,
+        JOBS,
     ),
     paths=("a", "b", "report"),
     description="Print which rooms of two maps are the same, with probabilities, and the transforms that would make them so.",

@@ -1,19 +1,14 @@
-"""What several commands share: options, the types of their values, and the map that an input and its options stand for."""
+"""What several commands share: options and the types of their values."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from topomerge.cli.console import Argument, ProgressBars, build_option, warn
+from topomerge.cli.console import Argument, build_option
 from topomerge.errors import InputError
-
-if TYPE_CHECKING:
-    from topomerge.types import TopometricMap
 
 
 def _parse_number(text: str, allowed: Callable[[float], bool], range_text: str) -> float:
@@ -170,6 +165,12 @@ ATLAS_OPTIONS = (
     ),
 )
 SENSORS = ("tls", "lidar", "depth", "tablet", "laser2d", "drawing")  # those of registration/bend/drift.json
+JOBS = build_option(
+    "--jobs",
+    type=parse_count,
+    metavar="N",
+    help="extract at most N large clouds at once (default: what cores and memory allow)",
+)
 CONTEXT_STEPS = build_option(
     "--k", type=parse_whole_number, default=0, metavar="K", help="steps of context around each room (default 0)"
 )
@@ -184,54 +185,3 @@ CLOUD_OPTIONS = (
         help="sensor of the clouds: sets how much drift merge may bend away (default: unknown, as much as for a phone)",
     ),
 )
-
-
-# Advice of the readers that only `extract` can take: --scale and --poses of `merge` are others.
-EXTRACT_ADVICE = ("--resolution", "--poses", "--topic", "--scale", "--spacing")
-
-
-def check_cloud_options(paths: Sequence[str], args: argparse.Namespace) -> None:
-    """Refuse `CLOUD_OPTIONS` where no input is a cloud.
-
-    Raises:
-        InputError: names the first of them; or the files of one frame, where no input is a folder.
-    """
-    useless = collect_given(args, "voxel_size", "up", "unit", "sensor")
-    if useless and all(Path(path).suffix.lower() == ".tmap" for path in paths):
-        name = next(iter(useless)).replace("_", "-")
-        raise InputError(f"--{name}: is for clouds, of no use to a .tmap; give the scan that it was made of, or leave it out")
-    if collect_given(args, "one_frame") and not any(Path(path).is_dir() for path in paths):
-        raise InputError("--one-frame: is for folders of files; give such a folder, or leave it out")
-
-
-def collect_reading_options(path: str, args: argparse.Namespace) -> dict[str, Any]:
-    """Collect the `CLOUD_OPTIONS` of reading one input, of which some are for folders only."""
-    return collect_given(args, "up", "unit", *(["one_frame"] if Path(path).is_dir() else []))
-
-
-def load_input_map(path: str, args: argparse.Namespace) -> TopometricMap:
-    """Load the map in a .tmap, or the one that is extracted from anything else with the `CLOUD_OPTIONS` that were given.
-
-    Raises:
-        InputError: it can't be read or extracted; the line names the file.
-    """
-    from topomerge.io.maps import load_map
-
-    try:
-        if Path(path).suffix.lower() == ".tmap":
-            topomap = load_map(path)
-        else:
-            from topomerge.extraction.extract import extract
-            from topomerge.io.points import read_chunks
-
-            with ProgressBars(enabled=not getattr(args, "quiet", False)) as bars:
-                chunks = read_chunks(path, **collect_reading_options(path, args), progress=bars.start_task("read"))
-                topomap = extract(chunks, **collect_given(args, "voxel_size"), name=path, progress=bars.start_task("extract"))
-            topomap = replace(topomap, parameters={**topomap.parameters, **collect_given(args, "sensor")})
-    except InputError as error:
-        text = str(error) if path in str(error) else f"{path}: {error}"
-        if advised := [name for name in EXTRACT_ADVICE if name in text]:
-            text += f" ({', '.join(advised)}: of `topomerge extract`, whose .tmap can be given here)"
-        raise InputError(text) from error
-    warn(topomap.warnings)
-    return topomap

@@ -127,7 +127,7 @@ class DescriptorCache:
 
 
 WALLS_ALONE = "walls alone"  # way of merging
-CODE = tuple(f"topomerge.{name}" for name in ("embedding.embedders", "matching.costs", "matching.match", "fusion.pipeline"))
+CODE = tuple(f"topomerge.{name}" for name in ("embedding.learned", "matching.assignment", "matching.match", "fusion.pipeline"))
 
 
 def predict(path: Path, target: Path, settings: Evaluation) -> str:

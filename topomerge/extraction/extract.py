@@ -13,7 +13,7 @@ from topomerge.blas import limit_blas_threads
 from topomerge.errors import InputError
 from topomerge.extraction.attributes import estimate_attributes
 from topomerge.extraction.elevations.doorways import StoreyWalls
-from topomerge.extraction.elevations.wall_doors import SUREST, WALL_DOOR_FEATURES, build_door_candidates, compute_door_probability
+from topomerge.extraction.elevations.wall_doors import WALL_DOOR_FEATURES, build_door_candidates
 from topomerge.extraction.navigable import add_crossed_cells, compute_navigable_volume, find_free_space
 from topomerge.extraction.parameters import DefaultParameters, Parameters, ThesisParameters, resolve_parameters
 from topomerge.extraction.plans.part_rooms import PartRooms
@@ -22,8 +22,8 @@ from topomerge.extraction.plans.storey_floor import build_floor
 from topomerge.extraction.plans.storey_plan import Floor
 from topomerge.extraction.scan import Scan, read_scan
 from topomerge.extraction.segment import (
-    FLAT_LEAST,
-    ROOM_LEAST,
+    LEAST_FLAT_ROOM,
+    LEAST_ROOM,
     RasterisedStoreys,
     Scorer,
     SegmentedStorey,
@@ -38,35 +38,34 @@ from topomerge.extraction.slices import is_slice, raise_slice
 from topomerge.extraction.stopwatch import Progress, Stopwatch
 from topomerge.extraction.topology import build_topometric_map, select_rooms_with_floor
 from topomerge.extraction.views.view_rooms import segment_views
-from topomerge.extraction.walls import relabel_walls, split_at_doorways, unroll_walls
+from topomerge.extraction.walls import relabel_walls, unroll_walls
 from topomerge.io.archive import read_weights_json
 from topomerge.numpy_nn import sigmoid
 from topomerge.types import EDGE_DTYPE, LEVELLED, Array, PointCloud, TopometricMap, VoxelGrid, add_outline_odds
 
-# Of a passage, beside the plan: log odds of a doorway that walls show there, on average along it, 0 where they show none or speak
-# against one; 0 or 1: a doorway split the segment; log odds of a door by plan and plan network, of scans that show no walls.
-EVIDENCE = ("shown", "within", "door")
-SCORE_INPUTS = ("constant", "plan", "shown", "within")  # what the score weighs; of the plan its log odds
+# What the score of a passage weighs: the log odds of a door by the plan, and by the walls, on average along a doorway that they
+# show there; 0 where they show none or speak against one.
+SCORE_INPUTS = ("constant", "plan", "shown")
 KINDS = ("walls",)  # of scans that have a model: walls show at heights
 PASSAGES_FILE = "passages.json"
 MOST_LOG_ODDS = 8.0
 
 
 def find_passages(storeys: Sequence[SegmentedStorey], walls: StoreyWalls | None, weigh: bool = True) -> list[SegmentedStorey]:
-    """Gather the evidence of every passage of all storeys; they come back with it.
+    """Gather what walls show of every passage of all storeys; they come back with it.
 
     Args:
         walls: None of a scan that shows none at heights.
-        weigh: do walls and plan network have a say? Of joined maps the rooms of their parts have it.
+        weigh: do walls have a say? Of joined maps the rooms of their parts have it.
     """
-    told = _score_doors(storeys, walls) if weigh else {}
+    if walls is None or not weigh:
+        return list(storeys)
+    shown = _find_shown_doors(storeys, walls)
     out, first = [], 0
     for storey in storeys:
-        passages = {}
-        for (a, b), passage in storey.passages.items():
-            pair = (a + first, b + first)
-            odds, within = told.get(pair, 0.0), float((a, b) in storey.split)
-            passages[a, b] = replace(passage, evidence=(0.0, within, odds) if walls is None else (odds, within, 0.0))
+        passages = {
+            (a, b): replace(passage, shown=shown.get((a + first, b + first), 0.0)) for (a, b), passage in storey.passages.items()
+        }
         out.append(replace(storey, passages=passages))
         first += storey.count
     return out
@@ -77,10 +76,10 @@ def score_passages(x: Array, passages: Sequence[Passage], weights: Array) -> Arr
 
     Args:
         x: (n, 17) `DOOR_FEATURES` of the sides as they have grown.
-        weights: (4,) of `SCORE_INPUTS`.
+        weights: (3,) of `SCORE_INPUTS`.
     """
-    evidence = np.array([passage.evidence for passage in passages], float)
-    return sigmoid(compute_inputs(log_odds(predict_door(x)), evidence) @ weights)
+    shown = np.array([passage.shown for passage in passages], float)
+    return sigmoid(compute_inputs(log_odds(predict_door(x)), shown) @ weights)
 
 
 def choose_scorer(walls: bool) -> Scorer:
@@ -101,34 +100,30 @@ def choose_scorer(walls: bool) -> Scorer:
     return partial(score_passages, weights=weights)
 
 
-def compute_inputs(plan: Array, evidence: Array) -> Array:
-    """(n, 4) `SCORE_INPUTS` of passages.
+def compute_inputs(plan: Array, shown: Array) -> Array:
+    """(n, 3) `SCORE_INPUTS` of passages.
 
     Args:
         plan: (n,) log odds of a door by the plan alone.
-        evidence: (n, 3) `EVIDENCE`.
+        shown: (n,) by the walls.
     """
     plan = np.clip(plan, -MOST_LOG_ODDS, MOST_LOG_ODDS)
-    return np.column_stack([np.ones(len(plan)), plan, evidence[:, :2]])
+    return np.column_stack([np.ones(len(plan)), plan, shown])
 
 
-def _score_doors(storeys: Sequence[SegmentedStorey], walls: StoreyWalls | None) -> dict[Pair, float]:
-    """Log odds of the surest doorway that walls show between each two segments, none below 0; of the likeliest door by plan and
-    plan network, where no walls show."""
+def _find_shown_doors(storeys: Sequence[SegmentedStorey], walls: StoreyWalls) -> dict[Pair, float]:
+    """Log odds of the surest doorway that walls show between each two segments, none below 0."""
     edges, first = [np.zeros(0, EDGE_DTYPE)], 0
     for storey in storeys:
         edges.append(_edges_of(storey, first))
         first += storey.count
     complete = np.concatenate([np.zeros(0), *(storey.completeness for storey in storeys)])
     candidates = build_door_candidates(np.concatenate(edges), complete, [storey.classes for storey in storeys], walls)
-    if walls is None:
-        odds = log_odds(np.clip(compute_door_probability(candidates), SUREST, 1 - SUREST))
-    else:
-        odds = np.maximum(candidates.features[:, WALL_DOOR_FEATURES.index("wall_mean")], 0)
-    told: dict[Pair, float] = {}
+    odds = np.maximum(candidates.features[:, WALL_DOOR_FEATURES.index("wall_mean")], 0)
+    shown: dict[Pair, float] = {}
     for rooms, value in zip(candidates.edges["rooms"].tolist(), odds.tolist(), strict=True):
-        told[sort_pair(*rooms)] = max(told.get(sort_pair(*rooms), -np.inf), value)
-    return told
+        shown[sort_pair(*rooms)] = max(shown.get(sort_pair(*rooms), 0.0), value)
+    return shown
 
 
 def _edges_of(storey: SegmentedStorey, first: int) -> Array:
@@ -252,12 +247,9 @@ def gather_evidence(
     """Cut the storeys into too many segments rather than too few, and gather what speaks for doors between them."""
     watch.begin("segments", 0.4)
     rasters, places = rasterise_storeys(scan, navigable, p.standing_height), scan.places
-    narrow = min(p.narrow, p.slice_door if scan.flat else p.door)
-    storeys = [segment_storey(rasters, i, narrow, parts, places) for i in range(len(rasters.numbers))]
+    storeys = [segment_storey(rasters, i, min(p.narrow, p.door), parts, places) for i in range(len(rasters.numbers))]
     watch.begin("walls", 0.6)
     walls = unroll_walls(scan, navigable, rasters, storeys) if p.walls else None
-    if walls is not None:
-        storeys, walls = split_at_doorways(storeys, walls)
     return Evidence(rasters, find_passages(storeys, walls, p.walls and not parts), walls)
 
 
@@ -273,9 +265,8 @@ def cut_rooms(
     watch.begin("rooms", 0.75)
     weigh = p.walls and not parts
     score = choose_scorer(weigh and found.walls is not None)
-    door = p.slice_door if scan.flat else p.door
-    least = FLAT_LEAST if scan.flat else ROOM_LEAST
-    cut = [partition_rooms(storey, score, door, least) for storey in found.storeys]  # 2.6
+    least = LEAST_FLAT_ROOM if scan.flat else LEAST_ROOM
+    cut = [partition_rooms(storey, score, p.door, least) for storey in found.storeys]  # 2.6
     floor = build_floor(scan.grid, navigable, found.rasters.storey, found.rasters.storeys, cut, found.rasters.factor)
     if found.walls is None:
         return floor, None

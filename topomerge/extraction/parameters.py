@@ -37,7 +37,6 @@ class DefaultParameters(SharedParameters):
     """The default: rooms from the plans of the storeys (docs/adr/0004)."""
 
     door: float = 0.5  # narrowings of the floor that are doors with this probability part rooms
-    slice_door: float = 0.65  # … in slices of a 2D laser: there neither lintels nor tops of furniture are seen
     narrow: float = 0.2  # and with this one areas of a room
     walls: bool = True  # doors are looked for on walls, too: shut ones, and where open ones end (docs/adr/0018)
 

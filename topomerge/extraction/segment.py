@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 
 import numpy as np
-from scipy import ndimage
 
 from topomerge.extraction.completeness import measure_seen_outline
 from topomerge.extraction.plans.part_rooms import PartRooms, compute_door_log_odds, find_boundary_columns, rasterise_part_rooms
@@ -38,10 +37,8 @@ Scorer = Callable[[Array, Sequence[Passage]], Array]  # (n, 17) features and pas
 PLAN_CELL = 0.1  # m: finer grids are looked at with about this
 THINNEST_SLAB = 0.15  # m: a thinner one parts no storeys
 SAME_LEVEL = 1.0  # m between a place and the floor of the storey on which it is
-LINE_COLUMNS = 0.75  # columns to both sides of the line of a doorway: segments that touch at a corner are split, too
-PAST_JAMBS = 0.2  # m past both jambs of a doorway along which a segment is split
 SUREST_DOOR = 1e-6  # probabilities are that far from 0 and 1 at least where other maps are weighed
-LEAST_SPLIT = 0.3  # m2 on each side of a doorway that splits a segment
+LEAST_ROOM, LEAST_FLAT_ROOM = 0.3, 0.8  # m2 of floor; smaller ones are parts of a neighbour. Flat: in slices legs look like walls
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +75,6 @@ class SegmentedStorey:
         clearance: (nx, ny) m to the next wall.
         segment: (nx, ny) segment of each column, -1 none.
         passages: the widest of each two neighbouring segments.
-        split: pairs of them that a doorway in a wall parts, which the plan missed.
     """
 
     number: int
@@ -87,7 +83,6 @@ class SegmentedStorey:
     clearance: Array
     segment: Array
     passages: dict[Pair, Passage]
-    split: frozenset[Pair] = frozenset()
 
     @property
     def count(self) -> int:
@@ -165,40 +160,6 @@ def segment_storey(
     return SegmentedStorey(k, plan, classes, clearance, segment, passages)
 
 
-def split_segments(storey: SegmentedStorey, doorways: Array) -> SegmentedStorey:
-    """Split segments along doorways that lie within them: the plan misses the doors of rooms that are no wider.
-
-    Args:
-        doorways: DOORWAY_DTYPE of this storey, with one segment on both sides.
-    """
-    segment, split, pairs = storey.segment.copy(), set(), set()
-    for doorway in doorways:
-        line = _columns_along(storey.plan, doorway)
-        at = np.rint((doorway["centre"][:2] - storey.plan.origin) / storey.plan.edge - 0.5).astype(int)
-        near = segment[tuple(slice(max(k - 4, 0), k + 5) for k in at)]
-        for s in np.unique(near[near >= 0]).tolist():
-            own = segment == s
-            label, _ = ndimage.label(own & ~line)
-            sizes = np.bincount(label.ravel())[1:] * storey.plan.edge**2
-            large = np.flatnonzero(sizes >= LEAST_SPLIT) + 1
-            beside = np.unique(label[ndimage.binary_dilation(line, np.ones((3, 3))) & (label > 0)])
-            if len(np.intersect1d(large, beside)) < 2:
-                continue
-            nearest = ndimage.distance_transform_edt(~np.isin(label, large), return_distances=False, return_indices=True)
-            label = label[tuple(nearest)]
-            for part in large[np.argsort(-sizes[large - 1], kind="stable")][1:].tolist():
-                split |= {s, int(segment.max()) + 1}
-                segment[own & (label == part)] = int(segment.max()) + 1
-    if not split:
-        return storey
-    found = find_passages(storey.plan, storey.clearance, segment, storey.classes.probability)
-    passages = {pair: storey.passages.get(pair, passage) if not split & set(pair) else passage for pair, passage in found.items()}
-    for doorway in doorways:
-        near = ndimage.binary_dilation(_columns_along(storey.plan, doorway), np.ones((3, 3)))
-        pairs |= {pair for pair, passage in passages.items() if split & set(pair) and near[passage.place]}
-    return replace(storey, segment=segment, passages=passages, split=frozenset(pairs))
-
-
 def find_segments(storeys: Sequence[SegmentedStorey], places: Array) -> Array:
     """Find the (n,) int64 segment on whose floor each place (n, 3) m lies, numbered on from storey to storey, -1 none."""
     out, nearest = np.full(len(places), -1, np.int64), np.full(len(places), np.inf)
@@ -231,15 +192,6 @@ def log_odds(probability: Array) -> Array:
     """(n,) of probabilities, which are taken for no surer than `SUREST_DOOR`."""
     sure = np.clip(probability, SUREST_DOOR, 1 - SUREST_DOOR)
     return np.log(sure / (1 - sure))
-
-
-def _columns_along(plan: StoreyPlan, doorway: Array) -> Array:
-    """(nx, ny) bool: the columns along a doorway."""
-    x, y = (plan.origin[k] + (np.arange(n) + 0.5) * plan.edge - doorway["centre"][k] for k, n in enumerate(plan.wall.shape))
-    u, v = doorway["out"]
-    along, across = y[None] * u - x[:, None] * v, x[:, None] * u + y[None] * v
-    columns: Array = (np.abs(across) < LINE_COLUMNS * plan.edge) & (np.abs(along) < doorway["width"] / 2 + PAST_JAMBS)
-    return columns
 
 
 def _coarsen(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, factor: int) -> tuple[VoxelGrid, VoxelGrid, Array]:
@@ -310,33 +262,6 @@ class GrowingRooms:
         self._score(sorted(sort_pair(room, other) for other in self.neighbours[room]))
 
 
-SURE_PARTED = 0.8  # probability of a door from which on what is small, but not tiny, stays a room: toilets and stores
-SURE_SHOWN = 2.3  # log odds, on average along a doorway that walls show: likewise (as `walls.SURE_WITHIN`)
-NO_DOOR = -0.85  # log odds of a door below which there is probably none
-CRACK = 0.45  # m: nobody walks through less; a room behind a crack, of a door that is ajar, stays one
-
-
-@dataclass(frozen=True)
-class LeastSize:
-    """What is too small for a room of its own.
-
-    Args:
-        tiny: m2 of floor that was seen; smaller ones are parts of a neighbour, or of no room.
-        small: m2, smaller ones are parts of a neighbour where no door surely parts them from it.
-        open: m2, smaller ones likewise where there is probably no door.
-        half_width: m, what is nowhere farther from a wall is none.
-    """
-
-    tiny: float
-    small: float
-    open: float
-    half_width: float
-
-
-ROOM_LEAST = LeastSize(0.3, 0.8, 0.0, 0.2)  # narrower ones are the edge of a facade or of a slab
-FLAT_LEAST = LeastSize(0.8, 0.8, 6.0, 0.35)  # in slices, where legs look like walls
-
-
 @dataclass(frozen=True, eq=False)
 class PartitionedStorey:
     """A storey cut into rooms and areas, both numbered from 0 in the storey; an area is a segment.
@@ -361,13 +286,13 @@ class PartitionedStorey:
     door_probability: dict[Pair, float]
 
 
-def partition_rooms(storey: SegmentedStorey, score: Scorer, door: float, least: LeastSize = ROOM_LEAST) -> PartitionedStorey:
+def partition_rooms(storey: SegmentedStorey, score: Scorer, door: float, least: float = LEAST_ROOM) -> PartitionedStorey:
     """Merge the segments of a storey, the least likely door first, until only likely doors part them: this cuts the rooms, once.
 
     Args:
         score: tells doors from narrowings of a room, by all evidence.
         door: probability from which on two rooms stay apart.
-        least: what is smaller is given to a neighbour.
+        least: m2, what is smaller is given to a neighbour; without one it is of no room.
     """
     segment, edge = storey.segment, storey.plan.edge
     rooms = GrowingRooms(segment, storey.clearance, storey.passages, edge, score)
@@ -376,7 +301,7 @@ def partition_rooms(storey: SegmentedStorey, score: Scorer, door: float, least: 
     while (small := find_too_small(rooms, least)) is not None:
         rooms.merge(small)
     large = np.unique(rooms.of_region)
-    large = large[(rooms.area[large] >= least.tiny) & (rooms.peak[large] >= least.half_width)]
+    large = large[rooms.area[large] >= least]
     number = np.full(len(rooms.of_region) + 1, -1)
     number[large] = np.arange(len(large))
     room_of_segment = number[rooms.of_region]
@@ -399,18 +324,10 @@ def partition_rooms(storey: SegmentedStorey, score: Scorer, door: float, least: 
     )
 
 
-def find_too_small(rooms: GrowingRooms, least: LeastSize) -> Pair | None:
-    """Find the least surely parted two rooms of which one is too small; None: none is."""
-    found: list[tuple[int, float, Pair]] = []
-    for pair, probability in rooms.door_probability.items():
-        size = min(rooms.area[pair[0]], rooms.area[pair[1]])
-        shown, _, door = rooms.passages[pair].evidence or (0.0, 0.0, 0.0)
-        parted = probability >= SURE_PARTED or shown >= SURE_SHOWN
-        if size < least.tiny or (size < least.small and not parted):
-            found.append((0, probability, pair))
-        elif size < least.open and door < NO_DOOR and rooms.passages[pair].width >= CRACK:
-            found.append((1, door, pair))
-    return min(found)[2] if found else None
+def find_too_small(rooms: GrowingRooms, least: float) -> Pair | None:
+    """Find the least surely parted two rooms of which one is smaller than `least` m2; None: none is."""
+    found = [(p, pair) for pair, p in rooms.door_probability.items() if min(rooms.area[list(pair)]) < least]
+    return min(found)[1] if found else None
 
 
 def find_rooms_of_segments(storeys: Sequence[PartitionedStorey], numbers: Array) -> Array:

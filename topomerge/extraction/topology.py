@@ -11,14 +11,13 @@ from scipy import ndimage
 from topomerge.extraction.completeness import measure_completeness
 from topomerge.extraction.convolution import build_sphere
 from topomerge.extraction.morphology import label_components
-from topomerge.extraction.plans.storey_plan import Floor, is_through_wall
+from topomerge.extraction.plans.storey_plan import Floor
 from topomerge.extraction.storeys import estimate_ceiling_height, measure_floor_to_ceiling, select_lowest_of_column
 from topomerge.kernels.rasters import count_steps
 from topomerge.types import AREA_DTYPE, EDGE_DTYPE, ROOM_DTYPE, Array, TopometricMap, VoxelGrid
 
 # Where two rooms meet: doors, openings and stairs (seeds 2.7).
 
-PASSAGE_LEAST_WIDTH = 0.4  # m: narrower gaps in which no body fits are holes in a wall
 DOOR_MOST_WIDTH = 1.6  # m: what is wider is an opening
 SAME_DOOR_DISTANCE = 0.8  # m: passages between the same rooms that are this close are one
 LEVEL_HEIGHT = 0.6  # m: what is higher or lower is another level
@@ -65,9 +64,7 @@ def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceilin
         contact = label_components(meeting, build_sphere(2.5 * navigable.edge, navigable.edge))
         parts = [rows[contact == c] for c in range(int(contact.max()) + 1)]
         passages = [_edge(navigable, room, part, storey_of_room, floor_to_ceiling, body) for part in parts]
-        edges += _select_distinct_doors(
-            [edge for edge in passages if edge[2] >= PASSAGE_LEAST_WIDTH or (edge[6] and edge[5] != "stairs")]
-        )
+        edges += _select_distinct_doors(passages)
     table = np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
     _add_stairs(table, floor)
     return table
@@ -284,7 +281,6 @@ def build_topometric_map(grid: VoxelGrid, floor: Floor, body_height: float) -> T
     above = measure_floor_to_ceiling(grid, floor.cells, body_height)
     rooms = _measure_rooms(grid, room, floor, label, above, old_number)
     edges = find_edges(floor, label, rooms["storey"], above)
-    edges = edges[~_is_through_wall(floor, edges)]
     for edge in edges:
         a, b = old_number[edge["rooms"]].tolist()
         edge["confidence"] = floor.door_probability.get((min(a, b), max(a, b)), 1.0)
@@ -298,13 +294,6 @@ def select_rooms_with_floor(floor: Floor) -> Array:
     """Return (R,) numbers of those rooms of a floor that are rooms of its map, in its order."""
     lowest = floor.room[select_lowest_of_column(floor.cells)]
     return np.unique(lowest[lowest >= 0])
-
-
-def _is_through_wall(floor: Floor, edges: Array) -> Array:
-    """(E,) bool: is a door or an opening where there is probably a wall?"""
-    level = np.isin(edges["kind"], ("door", "opening"))
-    through = [is_through_wall(floor.classified_storeys, centre) for centre in edges["centre"]]
-    return np.asarray(level & np.array(through, bool))
 
 
 def _build_areas(floor: Floor, label: Array, area: Array) -> tuple[Array, Array]:

@@ -14,7 +14,6 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.extraction.elevations.doorways import (
-    DOORWAY_DTYPE,
     StoreyWalls,
     classify_places,
     compute_door_probabilities,
@@ -23,8 +22,7 @@ from topomerge.extraction.elevations.doorways import (
 from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, PLACES, Elevations, build_face_rows, unroll
 from topomerge.extraction.plans.storey_floor import WALL_REACH, find_cells_of_storey
 from topomerge.extraction.scan import Scan
-from topomerge.extraction.segment import RasterisedStoreys, SegmentedStorey, find_segments, split_segments
-from topomerge.extraction.topology import DOOR_MOST_WIDTH
+from topomerge.extraction.segment import RasterisedStoreys, SegmentedStorey, find_segments
 from topomerge.kernels.voxels import OFFSET_STEPS
 from topomerge.structure.floors import FACE_HEIGHTS, FULL_COLUMN, LEAST_CELLS
 from topomerge.structure.lines import detect_lines, estimate_main_direction
@@ -33,9 +31,6 @@ from topomerge.types import Array, VoxelGrid
 Locate = Callable[[Array], Array]  # (n, 3) m places on floors -> (n,) int64 segment or room there, -1 none
 SPOTS_BEFORE = (0.2, 0.35, 0.5)  # m before a face: there the floor lies that sees it
 BEYOND = (0.1, 1.0)  # m from a wall: there the other side begins
-SURE_WITHIN = 0.91  # probability of a door, the mean along a doorway, from which on it splits a segment
-SAME_SIDE = 0.5  # of the places behind it
-LARGEST_SPLIT = 30.0  # m2: the plan misses the doors of toilets and stores, and what is on their other side is small, too
 
 
 def unroll_walls(
@@ -74,30 +69,6 @@ def find_doorways(elevations: Elevations, doors: Array, locate: Locate) -> Array
         if len(other):
             found["rooms"][k, 1] = np.bincount(other).argmax()
     return found
-
-
-def find_doorways_within(walls: StoreyWalls, storeys: Sequence[SegmentedStorey]) -> list[Array]:
-    """Find the doorways of each storey that walls show surely, with one small segment on both sides."""
-    ways, area = walls.doorways, np.concatenate([storey.areas for storey in storeys])
-    sure = (ways["rooms"][:, 1] < 0) & (ways["rooms"][:, 0] >= 0) & (ways["mean"] >= SURE_WITHIN)
-    sure &= (ways["width"] <= DOOR_MOST_WIDTH) & (area[ways["rooms"][:, 0]] <= LARGEST_SPLIT)
-    within: list[list[Array]] = [[] for _ in storeys]
-    ends = np.cumsum([storey.count for storey in storeys])
-    for way in ways[sure]:
-        behind = find_segments(storeys, _sample_places_behind(way))
-        if np.mean(behind == way["rooms"][0]) >= SAME_SIDE:
-            within[int(np.searchsorted(ends, way["rooms"][0], side="right"))].append(way)
-    return [np.array(some, DOORWAY_DTYPE) for some in within]
-
-
-def split_at_doorways(storeys: Sequence[SegmentedStorey], walls: StoreyWalls) -> tuple[list[SegmentedStorey], StoreyWalls]:
-    """Split segments along doorways that walls surely show within them; doorways and faces then lie beside the new segments."""
-    within = find_doorways_within(walls, storeys)
-    if not any(len(some) for some in within):
-        return list(storeys), walls
-    split = [split_segments(storey, some) for storey, some in zip(storeys, within, strict=True)]
-    doorways = find_doorways(walls.elevations, walls.doors, lambda places: find_segments(split, places))
-    return split, replace(walls, doorways=doorways)
 
 
 def relabel_walls(walls: StoreyWalls, number: Array) -> StoreyWalls:

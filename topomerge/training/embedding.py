@@ -7,7 +7,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 
 from topomerge.checkpoint import load_state
 from topomerge.embedding.learned import STATE_FILE, STATE_SETTINGS
+from topomerge.embedding.network import Network, build_network
 from topomerge.errors import InputError
 from topomerge.matching.assignment import assign_certain, compute_certainty
 from topomerge.models.embedder import Embedder, match_scores
@@ -37,9 +38,10 @@ from topomerge.training.loop import (
     prefetch_by_threads,
 )
 from topomerge.training.packed_pairs import EXTRAS, GraphPair, hold_out, load_pairs
-from topomerge.training.provenance import describe_provenance
+from topomerge.training.provenance import compare_settings, describe_provenance
 from topomerge.training.run_folder import MetricsLog, begin_run, export_files
 from topomerge.training.settings import (
+    FREEZE,
     VALIDATION,
     Augment,
     Training,
@@ -114,13 +116,14 @@ def fit(settings: Training, log_line: LogFn = lambda text: print(text, file=sys.
     if settings.overfit:
         settings = replace(settings, watch="f1", patience=0)
     check(settings)
+    settings = adopt_network(settings)
     check_exporter()
     check_start(settings)  # before other processes, if any, have come so far
     fabric = start_fabric(settings)
     chief = fabric.is_global_zero
     log_line = log_line if chief else lambda text: None
     settings = with_own_pairs(settings, log_line, fabric)
-    train, watched = _load_data(settings, log_line, fabric)
+    train, watched, replayed = _load_data(settings, log_line, fabric)
     network = _build_network(settings, train)
     optimizer = build_optimizer(settings, network, fused=fabric.device.type == "cuda")  # one launch for all weights
     state = State()
@@ -131,7 +134,7 @@ def fit(settings: Training, log_line: LogFn = lambda text: print(text, file=sys.
         name = torch.cuda.get_device_name() if on_cuda else "cpu"
         begin_run(settings, f"{fabric.world_size} x {name}, {find_precision(settings)}", torch.get_num_threads())
     fabric.barrier()
-    job = EmbeddingJob(settings, fabric, network, optimizer, (train, watched))
+    job = EmbeddingJob(settings, fabric, network, optimizer, (train, watched, replayed))
     log = MetricsLog(settings.folder, settings.tensorboard, state.epoch) if chief else None
     perfect = 1.0 if settings.overfit else float("inf")
     schedule = Schedule(settings.folder, settings.epochs, job.steps, settings.watch, settings.patience, perfect)
@@ -145,7 +148,7 @@ class EmbeddingJob:
     """What the loop does for an embedder.
 
     Args:
-        pairs: to train on, and to watch.
+        pairs: to train on, to watch, and, where `replay` is set, to draw from besides.
     """
 
     def __init__(
@@ -154,8 +157,10 @@ class EmbeddingJob:
         self.settings, self.fabric, self.network = settings, fabric, network
         processes = FabricProcesses(fabric) if fabric.world_size > 1 else None
         self.objective, self.optimizer = fabric.setup(Objective(network, settings.loss, processes), optimizer)
-        self.train, self.watched = pairs
-        self.steps = max(len(self.train) // (settings.batch * fabric.world_size), 1)
+        own, self.watched = pairs[:2]
+        self.train = [*own, *(pair for of in pairs[2:] for pair in of)]
+        self.own, self.drawn = len(own), round(len(own) * settings.replay / (1 - settings.replay))
+        self.steps = max((self.own + self.drawn) // (settings.batch * fabric.world_size), 1)
         self.augment: Augment | None = None if settings.overfit else settings.augment
         self.pairs = self._load_pairs()
 
@@ -173,12 +178,20 @@ class EmbeddingJob:
                 raise InputError("batches=device: this network or augmentation needs batches=host")
         return AugmentedPairs(self.train, names, self.augment, lambda pair: pair)
 
+    def _draw_order(self, generator: torch.Generator) -> list[int]:
+        """The pairs of an epoch: all of one's own, and those that are drawn for replay, with replacement, among them."""
+        order = torch.randperm(self.own, generator=generator)
+        if self.drawn:
+            again = torch.randint(self.own, len(self.train), (self.drawn,), generator=generator)
+            order = torch.cat([order, again])[torch.randperm(self.own + self.drawn, generator=generator)]
+        return [int(number) for number in order]
+
     def iter_batches(self, state: State) -> Generator[MapPair, None, None]:
         """Yield the batches of the state's epoch from its step on, prefetched by threads."""
         self.objective.train()
         settings = self.settings
         shuffle = torch.Generator().manual_seed(derive_seed(settings.seed, state.epoch))
-        order = torch.randperm(len(self.train), generator=shuffle).tolist()
+        order = self._draw_order(shuffle)
         if settings.overfit:
             order = list(range(len(self.train)))
         rank, world, size = self.fabric.global_rank, self.fabric.world_size, settings.batch
@@ -329,27 +342,51 @@ def with_own_pairs(settings: Training, log_line: LogFn, fabric: Any) -> Training
     return replace(settings, data=str(manifests["train"]), validation=watched)
 
 
-def _load_data(settings: Training, log_line: LogFn, fabric: Any) -> tuple[list[GraphPair], list[GraphPair]]:
-    """Pairs to train on, and to watch; a set is packed by one process while the others wait."""
-    extras = [part for part in settings.network.geometry.parts if part in EXTRAS]
-    extras += ["near"] if settings.network.node.near else []
-    extras += ["sheet"] if settings.network.turns > 1 else []
+def adopt_network(settings: Training) -> Training:
+    """Take the settings of the network from where its weights come from; how much drops out may differ.
+
+    Raises:
+        InputError: there is no network, or settings are asked for that are neither its own nor the defaults.
+    """
+    if not settings.init_from:
+        return settings
+    try:
+        there, asked = asdict(read_embedder(settings.init_from)[0].network), asdict(settings.network)
+    except InputError as error:
+        raise InputError(f"init_from={settings.init_from}: {error}") from error
+    given = compare_settings(asdict(Network()), asked)
+    differing = {key: values for key, values in compare_settings(there, asked).items() if key in given and key != "dropout"}
+    if differing:
+        said = ", ".join(f"{key} ({was!r} there, {now!r} asked for)" for key, (was, now) in differing.items())
+        raise InputError(f"init_from={settings.init_from}: is another network: {said}; leave out what differs")
+    dropout = settings.network.dropout if "dropout" in given else there["dropout"]
+    return replace(settings, network=build_network({**there, "dropout": dropout}))
+
+
+def _load_data(settings: Training, log_line: LogFn, fabric: Any) -> tuple[list[GraphPair], list[GraphPair], list[GraphPair]]:
+    """Pairs to train on, to watch, and to replay; a set is packed by one process while the others wait."""
+    names = (settings.data, settings.validation, settings.replay_data if settings.replay else "")
     with fabric.rank_zero_first():
-        around = settings.network.node.around
-        train = load_pairs(_get_manifest_path(settings, settings.data), extras, log_line, settings.limit, around)
-        watched = (
-            load_pairs(_get_manifest_path(settings, settings.validation), extras, log_line, around=around)
-            if settings.validation
-            else []
+        train, watched, replayed = (
+            load_read_pairs(settings, _get_manifest_path(settings, name), log_line, 0 if k else settings.limit) if name else []
+            for k, name in enumerate(names)
         )
     if settings.overfit:
         matched = [pair for pair in train if len(pair.matches)][: settings.batch]
-        return matched, matched
+        return matched, matched, []
     if not watched:
         train, watched = hold_out(train)
     if not train:
         raise InputError(f"{settings.data}: no pairs to train on")
-    return train, watched
+    return train, watched, replayed
+
+
+def load_read_pairs(settings: Training, manifest: Path, log_line: LogFn, limit: int = 0) -> list[GraphPair]:
+    """Load the pairs of a manifest with what the network reads; `limit` as of `load_pairs`."""
+    extras = [part for part in settings.network.geometry.parts if part in EXTRAS]
+    extras += ["near"] if settings.network.node.near else []
+    extras += ["sheet"] if settings.network.turns > 1 else []
+    return load_pairs(manifest, extras, log_line, limit, settings.network.node.around)
 
 
 def _get_manifest_path(settings: Training, name: str) -> Path:
@@ -362,14 +399,16 @@ def _build_network(settings: Training, train: Sequence[GraphPair]) -> Embedder:
     requested = replace(settings.network, dropout=0.0) if settings.overfit else settings.network
     network = Embedder(requested)
     network.fit_scales([graph for pair in train for graph in (pair.a, pair.b)])
+    if settings.init_from:
+        network.load_state_dict(read_embedder(settings.init_from)[0].state_dict())
     if settings.geometry_from:
         other, _ = read_embedder(settings.geometry_from)
         try:
             network.geometry.load_state_dict(other.geometry.state_dict())
         except RuntimeError as error:
             raise InputError(f"geometry_from={settings.geometry_from}: has another geometry encoder") from error
-    if settings.freeze == "geometry":
-        network.geometry.requires_grad_(False)
+    for part in FREEZE[settings.freeze]:
+        network.get_submodule(part).requires_grad_(False)
     return network
 
 

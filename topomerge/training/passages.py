@@ -27,8 +27,7 @@ from topomerge.training.scan_settings import Passages
 from topomerge.training.tasks import Task
 from topomerge.types import Array
 
-# Weights are pulled to the plan alone, but for doorways that split a segment, of which scans show few (docs/adr/0018).
-PRIOR = np.array([{"plan": 1.0, "within": 6.0}.get(name, 0.0) for name in SCORE_INPUTS])
+PRIOR = np.array([float(name == "plan") for name in SCORE_INPUTS])  # weights are pulled to the plan alone
 STIFF = np.array([1.0 if name == "constant" else 4.0 for name in SCORE_INPUTS])  # of each pull
 
 
@@ -71,7 +70,7 @@ def fit_models(scans: Sequence[PassageExamples], pull: float) -> dict[str, list[
         own = [scan for scan in scans if scan.kind == kind]
         weights = PRIOR
         if own:
-            x = np.concatenate([compute_inputs(scan.plan, scan.evidence) for scan in own])
+            x = np.concatenate([compute_inputs(scan.plan, scan.shown) for scan in own])
             y = np.concatenate([scan.parted for scan in own])
             count = np.concatenate([np.full(len(scan.parted), 1 / np.sqrt(len(scan.parted))) for scan in own])
             weights = minimize(_loss, PRIOR, (x, y, count / count.mean(), pull), jac=True, method="BFGS").x
@@ -88,7 +87,7 @@ def _loss(weights: Array, x: Array, y: Array, count: Array, pull: float) -> tupl
 
 def score(scan: PassageExamples, weights: dict[str, list[float]]) -> tuple[Array, Array, Array]:
     """(n,) probability of a door in each passage, of the plan alone, and are they doors?"""
-    inputs = compute_inputs(scan.plan, scan.evidence)
+    inputs = compute_inputs(scan.plan, scan.shown)
     return sigmoid(inputs @ np.array(weights[scan.kind])), sigmoid(scan.plan), scan.parted
 
 

@@ -31,6 +31,8 @@ PACKAGES = ("torch", "torch-geometric", "numpy", "topomerge")
 # Keys that a run may go on with other values of: how long, where and by how many workers it trains, and what it tells.
 MAY_CHANGE = {"epochs", "patience", "accelerator", "precision", "batches", "threads", "jobs", "cluster", "cache"}
 MAY_CHANGE |= {"name", "runs", "tensorboard", "export", "resume", "overwrite"}
+# Keys that follow from the `path` of one's own captures; `record_start` compares what the sets hold.
+OWN_SETS = {"data", "data.name", "heldout.name", "validation"}
 UNTOLD = {"name", "runs", "resume", "overwrite"}  # of them
 MISSING = object()
 
@@ -79,7 +81,8 @@ def _changes(folder: Path, settings: Mapping[str, Any]) -> dict[str, list[Any]]:
         return {}  # `load_state` says that there is nothing
     except (OSError, ValueError) as error:
         raise InputError(f"{folder / CONFIG_FILE}: can't be read ({' '.join(str(error).split())[:80]}); start anew") from error
-    return compare_settings(before, settings)
+    differing = compare_settings(before, settings)
+    return {key: values for key, values in differing.items() if not (settings.get("path") and key in OWN_SETS)}
 
 
 def record_start(folder: Path, settings: Mapping[str, Any], data: Mapping[str, Any], device: str, threads: int) -> None:
@@ -147,8 +150,9 @@ def describe_data(settings: Any) -> dict[str, Any]:
     """Of each set that a task learns from or watches: its name, its recipe where that is known, and a digest of its manifest,
     which names every file by a hash of what it was made from."""
     out = {}
+    sets = ("data", "validation", *(["replay_data"] if getattr(settings, "replay", 0) else []))
     for key, value in vars(settings).items():
-        named = value.name if is_dataclass(value) and hasattr(value, "name") else value if key in ("data", "validation") else ""
+        named = value.name if is_dataclass(value) and hasattr(value, "name") else value if key in sets else ""
         if not named or "heldout" in key:
             continue
         path = Path(named) if Path(named).suffix in (".jsonl", ".npz") else Path(settings.cache) / f"{named}.jsonl"

@@ -146,9 +146,10 @@ class RasterTask(NetworkTask):
             raise InputError(f"accelerator must be cpu or cuda, not {self.accelerator!r}")
 
 
-FREEZE = ("", "geometry")
+FREEZE = {"": (), "geometry": ("geometry",), "encoders": ("geometry", "node")}  # parts of `Embedder` that stay as they are
 ACCELERATORS, PRECISIONS = ("cpu", "cuda", "gpu", "auto"), ("auto", "32-true", "bf16-mixed", "16-mixed")
 VALIDATION = "val_small"  # the set that is watched
+REPLAYED = "train_walks"  # what the embedder that ships learned from
 BATCHES = ("auto", "host", "device")
 
 
@@ -199,7 +200,10 @@ class Training:
     epochs: at most; rate: of learning, rises over `warmup` of all steps and falls to nothing.
     batch: pairs of maps a step, of each process.
     patience: epochs without a better validation after which it ends; 0: never.
-    geometry_from: run whose geometry encoder is the start; freeze: `geometry` keeps it as it is.
+    init_from: `pretrained`, a run or a file, whose weights the whole network starts from; its settings are the network's, too.
+    geometry_from: run whose geometry encoder is the start.
+    freeze: of `FREEZE`, what keeps the weights that it starts from: `geometry`, or `encoders`, all but the last layers.
+    replay: share of the pairs of an epoch that are drawn from the set `replay_data`, so that what it taught is not forgotten.
     overfit: train on one batch, without augmentation, and validate on it.
     resume: go on where the run of this name stopped, with the same settings; overwrite: replace that run.
     threads: that make batches, of each process; beside an accelerator as many as there are cores.
@@ -235,8 +239,11 @@ class Training:
     threads: int = 1
     precision: str = "auto"
     batches: str = "auto"
+    init_from: str = ""
     geometry_from: str = ""
     freeze: str = ""
+    replay: float = 0.0
+    replay_data: str = REPLAYED
     overfit: bool = False
     resume: bool = False
     overwrite: bool = False
@@ -272,7 +279,12 @@ def check(settings: Training) -> None:
     for key in ("rate", "clip"):
         if not getattr(settings, key) > 0:
             raise InputError(f"{key} must be above 0, not {getattr(settings, key)}")
-    shares = {"warmup": settings.warmup, "augment.rooms": settings.augment.rooms, "augment.edges": settings.augment.edges}
+    shares = {
+        "warmup": settings.warmup,
+        "replay": settings.replay,
+        "augment.rooms": settings.augment.rooms,
+        "augment.edges": settings.augment.edges,
+    }
     shares |= {f"augment.{name}": getattr(settings.augment, name) for name in ("walks", "slices", "rough")}
     for key, value in shares.items():
         if not 0 <= value < 1:
@@ -285,9 +297,12 @@ def check(settings: Training) -> None:
     if settings.precision == "16-mixed" and settings.accelerator == "cpu":
         raise InputError("precision=16-mixed needs accelerator=cuda; a processor takes bf16-mixed or 32-true")
     if settings.freeze not in FREEZE:
-        raise InputError(f"freeze: unknown {settings.freeze!r}; geometry or nothing are possible")
-    if settings.freeze and not settings.geometry_from:
-        raise InputError("freeze=geometry needs geometry_from=<run>, or random weights would be frozen")
+        raise InputError(f"freeze: unknown {settings.freeze!r}; {' or '.join(filter(None, FREEZE))}, or nothing, are possible")
+    if settings.init_from and settings.geometry_from:
+        raise InputError("init_from and geometry_from both say what to start from; give one of them")
+    if settings.freeze and not (settings.init_from or (settings.freeze == "geometry" and settings.geometry_from)):
+        of = "init_from=<run> or geometry_from=<run>" if settings.freeze == "geometry" else "init_from=<run>"
+        raise InputError(f"freeze={settings.freeze} needs {of}, or random weights would be frozen")
     check_descent(settings)
     _check_run_name(settings)
 

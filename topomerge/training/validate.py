@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -49,20 +50,35 @@ def _build_rows(rows: Array, graph: Mapping[str, Tensor]) -> Rows:
     return TurnedRows(rows, rotate_to_walls({name: graph[name].numpy() for name in ("pos", "turn")}))
 
 
-def validate(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu") -> dict[str, float]:
-    """Scores over all rooms with a partner, of both maps: recall@1, recall@5 and MRR, apart for those with and without a
-    near-identical twin; precision, recall and F1 of the assignment in which a room may stay alone, at the certainty
-    (`least`) that is best; and of the pairs with rooms in common (`mergeable`) the share whose matches give the true transform
-    within 0.5 m and 5 degrees (`merged`: `training.success`)."""
+@dataclass(frozen=True, eq=False)
+class PairScores:
+    """How well the rooms of a pair were found.
+
+    Args:
+        ranks: (n,) of the true partner of each room that has one, of both maps.
+        twins, clear: (n,) has the partner a near-identical twin, and did both maps see the room well?
+        counts: (L, 4) of `count_pairs`, for each of `LEAST_CERTAINTIES`.
+        right: is the transform that the matches give right? Empty where it cannot be told.
+    """
+
+    ranks: Array
+    twins: Array
+    clear: Array
+    counts: Array
+    right: list[bool]
+
+
+def score_pairs(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu") -> list[PairScores]:
+    """Score each pair by itself; of none, nothing."""
     embeddings, temperature = embed(network, pairs, device), float(network.temperature.detach())
-    ranks, twins, clear, counts = [], [], [], np.zeros((len(LEAST_CERTAINTIES), 4), int)
-    right: list[bool] = []
+    scores = []
     for pair, (a, bin_a), (b, bin_b) in zip(pairs, embeddings[::2], embeddings[1::2], strict=True):
         similarity, matches = (a @ b.T).numpy(), pair.matches.numpy()
         links = torch.zeros(similarity.shape, dtype=torch.bool)
         links[pair.matches[:, 0], pair.matches[:, 1]] = True
         good = [which.numpy() for which in find_well_seen_rooms(links, pair.a["x"], pair.b["x"])]
         sides = ((similarity, matches, pair.b), (similarity.T, matches[:, ::-1], pair.a))
+        ranks, twins, clear = [], [], []
         for (one, truth, other), well in zip(sides, good, strict=True):
             rooms, rank = rank_partners(one, truth)
             ranks.append(rank)
@@ -70,10 +86,22 @@ def validate(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu")
             twins.append(has_twin(other["x"][:, SIZE_COLUMNS].numpy(), truth, rooms))
         rows, columns = match_scores(a, b, bin_a, bin_b, temperature)
         certain = compute_certainty(rows.exp().numpy(), columns.exp().numpy())
-        right += _evaluate_merge(pair, certain)
-        counts += [count_pairs(assign_certain(certain, least), matches) for least in LEAST_CERTAINTIES]
+        counts = np.array([count_pairs(assign_certain(certain, least), matches) for least in LEAST_CERTAINTIES])
+        r, t, c = (np.concatenate(values) for values in (ranks, twins, clear))
+        scores.append(PairScores(r, t, c, counts, _evaluate_merge(pair, certain)))
+    return scores
+
+
+def validate(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu") -> dict[str, float]:
+    """Scores over all rooms with a partner, of both maps: recall@1, recall@5 and MRR, apart for those with and without a
+    near-identical twin; precision, recall and F1 of the assignment in which a room may stay alone, at the certainty
+    (`least`) that is best; and of the pairs with rooms in common (`mergeable`) the share whose matches give the true transform
+    within 0.5 m and 5 degrees (`merged`: `training.success`)."""
+    each = score_pairs(network, pairs, device)
+    right = [good for one in each for good in one.right]
     merged = {"merged": float(np.mean(right)) if right else 0.0, "mergeable": float(len(right))}
-    return score_matches(np.concatenate(ranks), np.concatenate(twins), np.concatenate(clear), counts) | merged
+    ranks, twins, clear = (np.concatenate([getattr(one, of) for one in each]) for of in ("ranks", "twins", "clear"))
+    return score_matches(ranks, twins, clear, np.sum([one.counts for one in each], axis=0)) | merged
 
 
 def _evaluate_merge(pair: GraphPair, certain: Array) -> list[bool]:

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from topomerge.errors import InputError
 from topomerge.kernels.bend import blend_moves, interpolate_nodes
@@ -217,6 +216,8 @@ class Deformation:
 def blended(points: Array, anchors: Array, moves: Array, reach: float) -> Array:
     """(n, 2) m: shifts of points (n, 2) by the moves (k, 4) of pieces about their anchors (k, 2), weighed by their nearness."""
     many = min(BLENDED_PIECES, len(anchors))
+    from scipy.spatial import cKDTree  # here: SciPy takes a quarter of a second, and only bent maps need it
+
     distance, nearest = cKDTree(anchors).query(points, many)
     distance, nearest = distance.reshape(len(points), many), nearest.reshape(len(points), many)
     out: Array = blend_moves(points, distance, nearest, anchors, moves, reach)

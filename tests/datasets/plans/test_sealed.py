@@ -29,7 +29,7 @@ from topomerge.errors import InputError
 from topomerge.training.tasks import compose_settings, train
 
 ROOT = Path(__file__).parents[3]
-GATE = "sealed_run"
+GATE = "open_sealed_set"
 SEED = 1_000_005  # a sealed one; nothing is made of it here
 CODE = ("topomerge", "models", "datasets", "configs", "benchmarks", "train.py", "evaluate.py")
 
@@ -85,7 +85,7 @@ def test_an_item_of_a_cache_that_names_a_sealed_seed_is_refused() -> None:
         ("merge_belief", "grids"),
         ("plan_segmentation", "plan_scans"),
         ("door_classification", "door_scans"),
-        ("room_odds", "build_room_scans"),
+        ("room_odds", "room_scans"),
         ("match_odds", "matching_train"),
         ("match_belief", "matching_validation"),
         ("feature_scale", "matching_train"),

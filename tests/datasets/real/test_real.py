@@ -57,7 +57,7 @@ def test_walls_agree_in_halmstad_pairs(data_dir):
 
 @pytest.mark.longer
 @pytest.mark.data
-@pytest.mark.parametrize("wanted", QUICK)
+@pytest.mark.parametrize("requested", QUICK)
 def test_walls_agree_in_single_pairs(data_dir, requested):
     source, name = requested.split("/")
     if source == "ifc":

@@ -13,7 +13,7 @@ from topomerge.extraction.plans.plan_network import (
     compute_evidence,
     remove_furniture,
 )
-from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES, ClassifiedStorey, StoreyPlan, is_through_wall
+from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES, StoreyPlan
 from topomerge.kernels.rasters import PROFILE_BELOW
 from topomerge.types import Array
 
@@ -54,15 +54,6 @@ def test_furniture_is_no_wall(two_rooms: StoreyPlan) -> None:
     plan = remove_furniture(two_rooms, compute_column_probabilities(two_rooms))
     assert not plan.wall[65:90, 10:30].any() and plan.inside[65:90, 10:30].all()
     assert plan.wall[52:54, 5:15].any(axis=0).all() and not (plan.wall & plan.inside).any()
-
-
-def test_through_a_wall(two_rooms: StoreyPlan) -> None:
-    drawn_storey = ClassifiedStorey(compute_column_probabilities(two_rooms), np.zeros(2), 0.1, 0.0)
-    storeys = [drawn_storey, ClassifiedStorey(np.zeros((106, 46, 5)), np.zeros(2), 0.1, 3.0)]
-    assert not is_through_wall(storeys, np.array([5.3, 2.25, 0.1]))
-    assert not is_through_wall(storeys, np.array([2.5, 2.0, 0.0]))
-    assert is_through_wall(storeys, np.array([5.3, 0.8, 0.1])) and not is_through_wall(storeys, np.array([5.3, 0.8, 2.9]))
-    assert not is_through_wall(storeys, np.array([50.0, -20.0, 0.0])) and not is_through_wall([], np.zeros(3))
 
 
 @pytest.mark.parametrize("turn", [1, 2, 3])

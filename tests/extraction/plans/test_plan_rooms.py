@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -25,7 +23,7 @@ from topomerge.extraction.plans.plan import _find_box_around, build_storey_plan
 from topomerge.extraction.plans.plan_network import COARSEST_STRIDE, compute_column_probabilities
 from topomerge.extraction.plans.storey_floor import FLOOR_PROPERTIES, join_floor
 from topomerge.extraction.scan import Scan
-from topomerge.extraction.segment import FLAT_LEAST, ROOM_LEAST, LeastSize, _is_upper_side, score_by_plan
+from topomerge.extraction.segment import LEAST_FLAT_ROOM, LEAST_ROOM, _is_upper_side, score_by_plan
 from topomerge.extraction.slices import is_slice
 from topomerge.extraction.storeys import find_storeys, measure_floor_to_ceiling
 from topomerge.extraction.voxels import voxelise
@@ -247,38 +245,24 @@ def test_passages_measure_the_door() -> None:
     assert predict_door(compute_door_features(at_the_door[0], (2.0, 1.5), (20.0, 15.0))[None])[0] > 0.9
     parted = find_rooms_of_segments(region, clearance, passages, score_by_plan)
     never = find_rooms_of_segments(region, clearance, passages, lambda x, _: np.zeros(len(x)))
-    always = find_rooms_of_segments(region, clearance, passages, lambda x, _: np.ones(len(x)), LeastSize(0.0, 0.0, 0.0, 0.0))
+    always = find_rooms_of_segments(region, clearance, passages, lambda x, _: np.ones(len(x)), 0.0)
     sizes = np.bincount(region[region >= 0])
     assert len(np.unique(parted[sizes * 0.01 > 1])) == 2
     assert len(np.unique(never)) == 1 and len(np.unique(always)) == len(sizes)
 
 
 @pytest.mark.parametrize(
-    ("side", "chance", "evidence", "least", "rooms"),
-    [
-        (9, 0.9, (), ROOM_LEAST, 3),
-        (7, 0.9, (), ROOM_LEAST, 3),
-        (7, 0.7, (), ROOM_LEAST, 2),
-        (7, 0.7, (3.0, 0.0, 0.0), ROOM_LEAST, 3),
-        (5, 0.9, (3.0, 0.0, 0.0), ROOM_LEAST, 2),
-        (7, 0.9, (), FLAT_LEAST, 2),
-        (12, 0.9, (0.0, 0.0, 1.0), FLAT_LEAST, 3),
-        (12, 0.9, (0.0, 0.0, -2.0), FLAT_LEAST, 2),
-        (12, 0.9, (0.0, 0.0, -2.0), ROOM_LEAST, 3),
-    ],
-    ids=["a room", "small, surely parted", "small, less surely", "small, walls show a door", "tiny", "small, of a slice"]
-    + ["a room of a slice", "a room of a slice without a door", "a room without a door that walls show"],
+    ("side", "least", "rooms"),
+    [(7, LEAST_ROOM, 3), (5, LEAST_ROOM, 2), (7, LEAST_FLAT_ROOM, 2), (9, LEAST_FLAT_ROOM, 3)],
+    ids=["a room", "tiny", "tiny, of a slice", "a room of a slice"],
 )
-def test_what_is_small_is_a_room_where_a_door_surely_parts_it(
-    side: int, chance: float, evidence: tuple[float, ...], least: LeastSize, rooms: int
-) -> None:
+def test_what_is_tiny_is_part_of_its_neighbour(side: int, least: float, rooms: int) -> None:
     region = np.zeros((20, 60), np.int64)
     region[:, 30:] = 1
-    region[:side, 60 - side :] = 2  # squares of 1.44, 0.81, 0.49 and 0.25 m2
+    region[:side, 60 - side :] = 2  # squares of 0.81, 0.49 and 0.25 m2
     passage = Passage((0, 0), 0.8, (1.0, 0.0), (0.0,) * 12)
-    passages = {(0, 1): passage, (1, 2): replace(passage, evidence=evidence)}
-    whole = replace(least, half_width=0.0)
-    of_segment = find_rooms_of_segments(region, np.ones(region.shape), passages, lambda x, _: np.full(len(x), chance), whole)
+    passages = {(0, 1): passage, (1, 2): passage}
+    of_segment = find_rooms_of_segments(region, np.ones(region.shape), passages, lambda x, _: np.full(len(x), 0.9), least)
     assert len(np.unique(of_segment)) == rooms
 
 

@@ -38,14 +38,6 @@ def test_a_column_may_lack_bands_beside_a_full_one(rule, walls):
     assert detect_wall_columns(filled(3, 6), rule)[0, 0]
 
 
-def test_corners_help_only_as_eight_neighbours():
-    bands = np.zeros((6, 2, 2), bool)
-    bands[:, 1, 1], bands[:3, 0, 0] = True, True
-    assert (
-        not detect_wall_columns(bands, WallRule(neighbours=4))[0, 0] and detect_wall_columns(bands, WallRule(neighbours=8))[0, 0]
-    )
-
-
 def test_bands_that_nobody_looked_at_do_not_count():
     bands = filled(2, 2, 2)
     seen = bands[is_observed_band(bands)]

@@ -30,7 +30,7 @@ class Says:
         log_odds = float(self.said[i, j, int(true)])
         return Check(pose, log_odds, log_odds != 0.0, {"walls": 5.0})
 
-    def place(self, i: int, j: int, pose: Sim3) -> np.ndarray:
+    def locate_place(self, i: int, j: int, pose: Sim3) -> np.ndarray:
         return PLACE
 
 

@@ -42,7 +42,7 @@ def in_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
         map = result.maps[result.components[n][0]]
         return replace(map, provenance=np.ones(len(map.grid), np.uint64))
 
-    monkeypatch.setattr("topomerge.fusion.atlas.solve.hypotheses", hypotheses)
+    monkeypatch.setattr("topomerge.fusion.atlas.solve.find_hypotheses", hypotheses)
     monkeypatch.setattr(AtlasResult, "join_component", joined)
     monkeypatch.setattr(store, "JOINED_ON_ONE_PAGE", 1)
 

@@ -97,7 +97,7 @@ def test_hypotheses_share_the_probability_that_one_of_them_is_right(monkeypatch)
         return Registration(Sim3(0.0, (0.01, 0.0, 0.0)), 0.6, False, {"walls": 9.0}, tuple(places))
 
     monkeypatch.setattr(pairs, "register", registered)
-    maps: Any = SimpleNamespace(matched=False, prepared=lambda k: k)
+    maps: Any = SimpleNamespace(matched=False, get_prepared=lambda k: k)
     ranked = find_hypotheses(maps, 0, 1, "free", "storey")
     assert [h.transform.translation[0] for h in ranked] == [0.01, 1.0, 2.0, 3.0] and ranked[0].features == {"walls": 9.0}
     assert [h.probability for h in ranked] == pytest.approx([0.6, 0.6 * np.exp(-1), 0.4, 0.6 * np.exp(-4)])
@@ -114,8 +114,8 @@ def test_fine_poses_are_made_once_and_never_of_slices(monkeypatch):
     sides = [
         SimpleNamespace(storeys=[plan_fields(np.ones((2, 2), bool), sliced=s)], middle=np.zeros(3)) for s in (False, False, True)
     ]
-    facts = {"sliced": [False, False, True].__getitem__, "middle": lambda k: np.zeros(3)}
-    maps = SimpleNamespace(prepared=sides.__getitem__, answer=lambda question, pair, make: make(), **facts)
+    facts = {"is_sliced": [False, False, True].__getitem__, "get_middle": lambda k: np.zeros(3)}
+    maps = SimpleNamespace(get_prepared=sides.__getitem__, answer=lambda question, pair, make: make(), **facts)
     checks = Checks(maps, scaled=True)  # type: ignore[arg-type]
     near = Sim3(0.0, (0.05, 0.0, 0.0))
     assert checks.refine_pose(0, 1, Sim3()) == checks.refine_pose(0, 1, near) == Sim3(0.0, (1.0, 0.0, 0.0))

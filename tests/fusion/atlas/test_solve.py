@@ -162,10 +162,10 @@ class Looks:
     def __len__(self) -> int:
         return len(self.all)
 
-    def rows(self, k: int) -> np.ndarray:
+    def get_rows(self, k: int) -> np.ndarray:
         return self.all[k]
 
-    def area(self, k: int) -> float:
+    def get_area(self, k: int) -> float:
         return 100.0 + 1e-6 * k
 
     def coarse_log_odds(self, i: int, j: int, scale: str) -> float:

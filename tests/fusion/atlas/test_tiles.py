@@ -41,7 +41,7 @@ def small_tiles(monkeypatch: pytest.MonkeyPatch, large: TopometricMap) -> None:
     def hypotheses(maps: Maps, i: int, j: int, *_: object) -> tuple[PoseHypothesis, ...]:
         return (PoseHypothesis(Sim3(0.0, (20.0 * (j - i), 0.0, 0.0)), probability=0.995),)
 
-    monkeypatch.setattr("topomerge.fusion.atlas.solve.hypotheses", hypotheses)
+    monkeypatch.setattr("topomerge.fusion.atlas.solve.find_hypotheses", hypotheses)
 
 
 def test_each_room_and_each_cell_is_in_one_tile(monkeypatch: pytest.MonkeyPatch, large: TopometricMap) -> None:

@@ -40,7 +40,7 @@ def room(width: int) -> tm.TopometricMap:
 @pytest.fixture
 def apart(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is registered: the atlas keeps its maps apart, at once."""
-    monkeypatch.setattr("topomerge.fusion.atlas.solve.hypotheses", lambda *_: ())
+    monkeypatch.setattr("topomerge.fusion.atlas.solve.find_hypotheses", lambda *_: ())
 
 
 @pytest.fixture
@@ -252,7 +252,7 @@ def test_a_wrong_link_is_given_up_when_a_third_map_contradicts_it(tmp_path, monk
         wrong = Sim3(0.0, (99.0, 0.0, 0.0)) if {one, two} == {0, 2} else Sim3()
         return (PoseHypothesis(wrong @ truth(one, two), probability=0.9 if {one, two} == {0, 2} else 0.995),)
 
-    monkeypatch.setattr("topomerge.fusion.atlas.solve.hypotheses", claimed)
+    monkeypatch.setattr("topomerge.fusion.atlas.solve.find_hypotheses", claimed)
     for k in (0, 2):
         tm.save_map(office_map(k), scans / f"{NAMES[k]}.tmap")
     lines = seen(scans, tmp_path / "site")
@@ -275,7 +275,7 @@ def test_what_is_left_to_be_registered_follows_when_nothing_new_is_there(scans, 
         made.append((i, j))
         return ()
 
-    monkeypatch.setattr("topomerge.fusion.atlas.solve.hypotheses", claimed)
+    monkeypatch.setattr("topomerge.fusion.atlas.solve.find_hypotheses", claimed)
     monkeypatch.setattr("topomerge.fusion.atlas.watch.SECONDS_TO_ANSWER", -1.0)
     lines = Lines()
     one = watch(scans, tmp_path / "site", lines)

@@ -41,7 +41,7 @@ class Votes:
         at = [Conflict(tuple(self.conflicts[i, j].tolist()), 1.0)] if (i, j) in self.conflicts else []
         return Check(self.measured.get((i, j), pose), said or 0.0, said is not None, walls, tuple(at))
 
-    def place(self, i: int, j: int, pose: Sim3) -> np.ndarray:
+    def locate_place(self, i: int, j: int, pose: Sim3) -> np.ndarray:
         return PLACE
 
     def fine(self, i: int, j: int, pose: Sim3) -> Sim3:

@@ -61,7 +61,7 @@ def test_a_bent_corridor_is_straightened(points, straightened):
 
 def test_what_speaks_against_a_bent_map_is_drift(straight, bent_map, straightened):
     rigid = Judge(straight.storeys, bent_map.storeys)(straightened.transform)
-    judged = Judge(straight.storeys, straightened.storeys(bent_map.storeys))(straightened.transform)
+    judged = Judge(straight.storeys, straightened.bend_storeys(bent_map.storeys))(straightened.transform)
     assert judged["walls"] > 1.05 * rigid["walls"] and judged["ratio"] > 0.99 > rigid["ratio"]
     assert judged["conflict_share"] <= rigid["conflict_share"]
 

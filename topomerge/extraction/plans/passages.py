@@ -63,13 +63,13 @@ class Passage:
     across: tuple[float, float]  # unit vector from jamb to jamb
     measured: tuple[float, ...]  # the features 3 to 14
     log_odds: float = 0.0  # of a door, by the maps that were joined (`part_rooms`): added to what the classifier says
-    evidence: tuple[float, ...] = ()  # `extraction.passages.EVIDENCE`, once it was gathered
+    shown: float = 0.0  # log odds of a door by the walls, once they were read (`extract.find_passages`)
 
 
 def joined(one: Passage, other: Passage) -> Passage:
-    """The wider of two passages between the same rooms, with the evidence of both: each its highest."""
+    """The wider of two passages between the same rooms, with what walls show of either."""
     wider = one if one.width > other.width else other
-    return replace(wider, evidence=tuple(np.maximum(one.evidence, other.evidence).tolist()))
+    return replace(wider, shown=max(one.shown, other.shown))
 
 
 def compute_clearance(plan: StoreyPlan) -> Array:

@@ -26,9 +26,8 @@ from topomerge.extraction.storeys import CARRIED, HIGHEST_CEILING, NOWHERE, STOR
 from topomerge.kernels.rasters import PROFILE_BELOW, PROFILE_LEVELS, fill_profiles, find_first_occupied, is_hollow_below
 from topomerge.types import Array, VoxelGrid
 
-ROOM_WALLS = WallRule(lacking=2, neighbours=8, least_bands=3)  # fewer bands show the upper side of a ceiling, beside higher ones
+ROOM_WALLS = WallRule(least_bands=3)  # fewer bands show the upper side of a ceiling, beside higher ones
 THIN = 0.4  # share of the usual wall's levels: what has fewer is no wall
-UPRIGHT_BANDS = 3  # of the bands in which walls are looked for: a table's top fills one, or two where noise spreads it
 ROOFLESS_SHARE = 0.1  # of the floor that was seen, over which something is: less, and the scan has no ceiling
 FURNITURE_HEIGHTS = 0.25, 1.9  # m above the floor
 OVER_FURNITURE = 2.05  # m: cupboards end below
@@ -176,11 +175,9 @@ def build_profile_bands(edge: float) -> HeightBands:
 
 
 def _is_filled_like_wall(profile: Array, bands: HeightBands) -> Array:
-    """Is the column filled like a wall, at the heights at which the sensor looked? Worktops and tables fill whole areas at their
-    height: beside what stands upright they would make the heights above them seem unseen, and themselves walls."""
+    """Is the column filled like a wall, at the heights at which the sensor looked?"""
     filled = build_band_stack(profile, bands)
-    upright = filled.sum(axis=0) >= UPRIGHT_BANDS
-    filled = filled[is_observed_band(filled) | is_observed_band(filled & upright)]
+    filled = filled[is_observed_band(filled)]
     like = detect_wall_columns(filled, ROOM_WALLS)
     if len(filled) < ROOM_WALLS.least_bands:
         return like

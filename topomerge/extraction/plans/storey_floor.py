@@ -8,7 +8,6 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.extraction.completeness import measure_seen_outline
-from topomerge.extraction.morphology import spread_labels
 from topomerge.extraction.plans.passages import Pair
 from topomerge.extraction.plans.plan import locate_columns
 from topomerge.extraction.plans.storey_plan import Floor, StoreyPlan
@@ -19,7 +18,6 @@ from topomerge.types import Array, VoxelGrid
 WALL_REACH = 0.5  # m: so far into walls and what stands before them the cells of a room go
 OVER_CEILING = 0.4  # m
 UNDER_FLOOR = 0.25  # m
-DOORWAY_REACH = 0.5  # m: so far the navigable volume goes on into what looks like wall: the openings of noisy scans
 FLOOR_PROPERTIES = ("standing", "storey", "room", "area")
 
 
@@ -123,7 +121,7 @@ def _select_floor_cells(
 def join_floor(
     grid: VoxelGrid, storeys: Array, cells: Array, tables: dict[str, Array]
 ) -> tuple[VoxelGrid, Array, dict[str, Array]]:
-    """Return the floor cells of all storeys as one grid; rooms go on into doorways that look like wall.
+    """Return the floor cells of all rooms as one grid.
 
     Args:
         storeys: (S,) STOREY_DTYPE; the areas are written.
@@ -136,14 +134,10 @@ def join_floor(
     in_grid = ((cells >= 0) & (cells < grid.shape)).all(axis=1)
     floor = grid.replace_cells(cells[in_grid], {name: values[in_grid] for name, values in tables.items()})
     of_cell = {name: values.astype(np.int32) for name, values in floor.properties.items()}
-    in_a_room = of_cell["room"] >= 0
-    for name in ("room", "area"):
-        of_cell[name] = spread_labels(floor, of_cell[name], round(DOORWAY_REACH / grid.edge)).astype(np.int32)
-    of_rooms = (of_cell["room"] >= 0) & (in_a_room | of_cell["standing"].astype(bool))
+    of_rooms = of_cell["room"] >= 0
     of_cell = {name: values[of_rooms] for name, values in of_cell.items()}
     floor = grid.replace_cells(floor.cells[of_rooms], {"standing": of_cell["standing"].astype(bool)})
     storeys["area"] = np.bincount(of_cell["storey"][select_lowest_of_column(floor)], minlength=len(storeys)) * floor.edge**2
-    # What has no room of its own is no storey: the upper side of a ceiling, or stray cells that a room below reaches.
-    used = np.bincount(of_cell["storey"][in_a_room[of_rooms]], minlength=len(storeys)) > 0
+    used = np.bincount(of_cell["storey"], minlength=len(storeys)) > 0  # what has no room is no storey: a ceiling's upper side
     of_cell["storey"] = np.maximum(np.cumsum(used) - 1, 0)[of_cell["storey"]].astype(np.int32)
     return floor, storeys[used], of_cell

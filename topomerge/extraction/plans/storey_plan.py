@@ -133,13 +133,11 @@ class WallRule:
     Args:
         share: of the observed bands that it fills.
         lacking: bands that it may have fewer, though not less than half, where it fills more than enough with its neighbours.
-        neighbours: 4 or 8 columns around it that help.
         least_bands: observed ones; with fewer, nothing is known of walls.
     """
 
     share: float = 4 / 6
     lacking: int = 1
-    neighbours: int = 4
     least_bands: int = 1
 
     def count_least_bands(self, observed: int) -> int:
@@ -175,26 +173,24 @@ def detect_wall_columns(filled: Array, rule: WallRule) -> Array:
     need = rule.count_least_bands(len(filled))
     nearly = max(need - rule.lacking, -(-need // 2))
     own = filled.sum(axis=0)
-    around = _spread_bands(filled, rule.neighbours).sum(axis=0)
+    around = _spread_bands(filled).sum(axis=0)
     return np.asarray((own >= need) | ((own >= nearly) & (around > need)))
 
 
-def _spread_bands(filled: Array, neighbours: int) -> Array:
-    """Bands that each column or any neighbour fills: a noisy wall is spread over columns."""
+def _spread_bands(filled: Array) -> Array:
+    """Bands that each column or one of the four beside it fills: a noisy wall is spread over columns."""
     out = filled.copy()
     out[:, 1:] |= filled[:, :-1]
     out[:, :-1] |= filled[:, 1:]
-    rows = out.copy() if neighbours == 8 else filled
-    out[:, :, 1:] |= rows[:, :, :-1]
-    out[:, :, :-1] |= rows[:, :, 1:]
+    out[:, :, 1:] |= filled[:, :, :-1]
+    out[:, :, :-1] |= filled[:, :, 1:]
     return out
 
 
-# What probably stands in the columns of a storey, and which passages that rules out (beyond the thesis: docs/adr/0005).
+# What probably stands in the columns of a storey (beyond the thesis: docs/adr/0005).
 
 COLUMN_CLASSES = ("inside", "wall", "doorway", "shut", "outside")  # furniture is inside
 INSIDE_CLASS, WALL_CLASS, DOORWAY_CLASS, SHUT_CLASS = range(4)  # of them
-DOOR_CHANCE, WALL_CHANCE = 0.3, 0.02  # less of a door and more of a wall around it, and a passage leads through a wall
 PASSAGE_REACH = 0.3  # m around a passage
 SIGNS_REACH = 0.5  # m around it, in which walls and leaves are looked for
 PLAN_SIGNS = (
@@ -220,18 +216,6 @@ class ClassifiedStorey:
     origin: Array
     edge: float
     height: float
-
-
-def is_through_wall(storeys: Sequence[ClassifiedStorey], centre: Array) -> bool:
-    """Does a passage at `centre` (3,) m lead through a wall: none of its columns is of a door, and some are of a wall?"""
-    if not storeys:
-        return False
-    near = _crop_around(_find_nearest_storey(storeys, centre), centre, PASSAGE_REACH)
-    if not near.size:
-        return False
-    return bool(
-        near[..., DOORWAY_CLASS : SHUT_CLASS + 1].sum(axis=-1).max() < DOOR_CHANCE and near[..., WALL_CLASS].mean() > WALL_CHANCE
-    )
 
 
 def compute_plan_features(storeys: Sequence[ClassifiedStorey], centres: Array) -> Array:

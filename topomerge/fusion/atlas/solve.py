@@ -100,7 +100,7 @@ def build_atlas(
         InputError: no list, fewer than two maps, one map twice, a map without cells, maps in different units, a wrong threshold,
             risk or scale, or another word for what is known.
     """
-    check_list(maps, "atlas")
+    check_list(maps, "build_atlas")
     return solve(maps, AtlasSettings(scale, threshold, embedder, rigid, same), registrations)
 
 

@@ -1,0 +1,333 @@
+"""The maps that the inputs of a command stand for: read from a .tmap, or extracted from anything else, large ones side by side.
+
+Extraction holds the interpreter's lock for most of its time, so that threads gain nothing: each core has a process of its own.
+They are spawned, as GNU OpenMP refuses forked ones. A started process imports for about a second before it works: small clouds
+are extracted here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from topomerge.cli.console import ProgressBars, Report, exit_on_signals, format_failure, show_log, warn
+from topomerge.cli.options import collect_given
+from topomerge.errors import InputError
+
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
+    from multiprocessing.context import SpawnProcess
+
+    from topomerge.types import TopometricMap
+
+# Advice of the readers that only `extract` can take: --scale and --poses of `merge` are others.
+EXTRACT_ADVICE = ("--resolution", "--poses", "--topic", "--scale", "--spacing")
+LEAST_SIZE = 8_000_000  # bytes of a cloud, from which a process for it is worth its start (docs/benchmarks.md)
+COMPRESSION = {".laz": 6, ".e57": 2}  # of the bytes of a point, against PLY and LAS
+MEMORY_START, MEMORY_GROWTH = 600_000_000, 8  # bytes that extraction takes at most: to start with, and for each byte of the cloud
+WORKER_OPTIONS = ("voxel_size", "up", "unit", "one_frame", "sensor", "verbose")
+GRACE = 2.0  # s that a process has to end by itself
+Starter = Callable[[str], Report | None]  # title of a task -> what moves its bar
+
+
+@dataclass(frozen=True)
+class LoadedMap:
+    """A map, and the seconds that reading (or loading) and extracting it took."""
+
+    map: TopometricMap
+    read_seconds: float
+    extract_seconds: float = 0.0
+
+
+def check_cloud_options(paths: Sequence[str], args: argparse.Namespace) -> None:
+    """Refuse `CLOUD_OPTIONS` where no input is a cloud.
+
+    Raises:
+        InputError: names the first of them; or the files of one frame, where no input is a folder.
+    """
+    useless = collect_given(args, "voxel_size", "up", "unit", "sensor")
+    if useless and all(is_map(path) for path in paths):
+        name = next(iter(useless)).replace("_", "-")
+        raise InputError(f"--{name}: is for clouds, of no use to a .tmap; give the scan that it was made of, or leave it out")
+    if collect_given(args, "one_frame") and not any(Path(path).is_dir() for path in paths):
+        raise InputError("--one-frame: is for folders of files; give such a folder, or leave it out")
+
+
+def collect_reading_options(path: str, args: argparse.Namespace) -> dict[str, Any]:
+    """Collect the `CLOUD_OPTIONS` of reading one input, of which some are for folders only."""
+    return collect_given(args, "up", "unit", *(["one_frame"] if Path(path).is_dir() else []))
+
+
+def is_map(path: str) -> bool:
+    """Return whether an input is a .tmap."""
+    return Path(path).suffix.lower() == ".tmap"
+
+
+def load_input_map(path: str, args: argparse.Namespace) -> TopometricMap:
+    """Load the map of one input (`iter_input_maps`)."""
+    return next(iter_input_maps([path], args)).map
+
+
+def iter_input_maps(paths: Sequence[str], args: argparse.Namespace) -> Generator[LoadedMap, None, None]:
+    """Yield the maps of the inputs in their order: of a .tmap, or extracted with the `CLOUD_OPTIONS` that were given. They do not
+    depend on the number of processes.
+
+    Raises:
+        InputError: one can't be read or extracted; the line names the file.
+    """
+    large = {path: size for path in paths if not is_map(path) and (size := measure_input(path)) >= LEAST_SIZE}
+    processes = count_processes(list(large.values()), getattr(args, "jobs", None)) if len(large) > 1 else 1
+    if processes == 1:
+        for path in paths:
+            with ProgressBars(enabled=not getattr(args, "quiet", False)) as bars:
+                loaded = _load_map(path, args, bars.start_task)
+            warn(loaded.map.warnings)
+            yield loaded
+        return
+    with ProgressBars(enabled=not getattr(args, "quiet", False)) as bars, _Processes(processes - 1, args, bars) as others:
+        begun: dict[int, Future[LoadedMap]] = {}
+        first = 0
+        for k in range(len(paths)):
+            for n in range(first, last := min(k + processes + 1, len(paths))):  # more maps are never in memory
+                begun[n] = others.submit(paths[n]) if paths[n] in large else Future()
+            first = last
+            while not begun[k].done():
+                here = next((n for n in sorted(begun) if begun[n].cancel()), None)  # the first that no process has taken
+                if here is None:
+                    break
+                begun[here] = _load_future(paths[here], args, others.name_bars(paths[here]))
+            loaded = begun.pop(k).result()
+            warn(loaded.map.warnings)
+            yield loaded
+
+
+def _load_future(path: str, args: argparse.Namespace, start_task: Starter) -> Future[LoadedMap]:
+    """Load a map here and now; an error is kept until its turn, so that the first input that is wrong is named."""
+    done: Future[LoadedMap] = Future()
+    try:
+        done.set_result(_load_map(path, args, start_task))
+    except Exception as error:
+        done.set_exception(error)
+    return done
+
+
+def _load_map(path: str, args: argparse.Namespace, start_task: Starter) -> LoadedMap:
+    """The map of one input.
+
+    Raises:
+        InputError: as `iter_input_maps`.
+    """
+    from topomerge.io.maps import load_map
+
+    began = time.perf_counter()
+    try:
+        if is_map(path):
+            topomap = load_map(path)
+        else:
+            from topomerge.extraction.extract import extract
+            from topomerge.io.points import read_chunks
+
+            chunks = read_chunks(path, **collect_reading_options(path, args), progress=start_task("read"))
+            topomap = extract(chunks, **collect_given(args, "voxel_size"), name=path, progress=start_task("extract"))
+        topomap = replace(topomap, parameters={**topomap.parameters, **collect_given(args, "sensor")})
+    except InputError as error:
+        text = str(error) if path in str(error) else f"{path}: {error}"
+        if advised := [name for name in EXTRACT_ADVICE if name in text]:
+            text += f" ({', '.join(advised)}: of `topomerge extract`, whose .tmap can be given here)"
+        raise InputError(text) from error
+    seconds, extracting = time.perf_counter() - began, 0.0
+    if not is_map(path):
+        extracting = min(sum(s for step, s in topomap.seconds.items() if not step.startswith("read")), seconds)
+    return LoadedMap(topomap, seconds - extracting, extracting)
+
+
+def measure_input(path: str) -> int:
+    """Return the bytes of a cloud, of a folder those of its files, as if they were not compressed."""
+    place = Path(path)
+    files = [file for file in place.rglob("*") if file.is_file()] if place.is_dir() else [place]
+    size = 0
+    for file in files:
+        with suppress(OSError):  # the reader says what is wrong with it
+            size += file.stat().st_size * COMPRESSION.get(file.suffix.lower(), 1)
+    return size
+
+
+def count_processes(sizes: Sequence[int], limit: int | None = None) -> int:
+    """Return how many clouds are extracted at once, of those of the given bytes: no more than cores, nor than memory is free for.
+
+    Args:
+        limit: of the number; as many as this process may use cores, if None.
+    """
+    if limit is None:
+        limit = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    free, taken = estimate_free_memory(), 0
+    for count, size in enumerate(sorted(sizes, reverse=True)[:limit]):
+        taken += MEMORY_START + MEMORY_GROWTH * size
+        if taken > free:
+            return max(count, 1)
+    return max(min(limit, len(sizes)), 1)
+
+
+def estimate_free_memory(root: Path = Path("/")) -> int:
+    """Return the bytes that are free on this machine and, within a container, in it; half of all where neither says so.
+
+    Args:
+        root: folder of the machine's files, for tests.
+    """
+    free = []
+    with suppress(OSError, ValueError, StopIteration):
+        lines = (root / "proc/meminfo").read_text(encoding="ascii").splitlines()
+        free.append(int(next(line.split()[1] for line in lines if line.startswith("MemAvailable:"))) * 1024)
+    with suppress(OSError, ValueError, StopIteration):
+        most = int((root / "sys/fs/cgroup/memory.max").read_text(encoding="ascii"))
+        lines = (root / "sys/fs/cgroup/memory.stat").read_text(encoding="ascii").splitlines()
+        free.append(most - int(next(line.split()[1] for line in lines if line.startswith("anon "))))
+    if free:
+        return max(min(free), 0)
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+    except (AttributeError, ValueError, OSError):  # Windows does not say
+        return 2 * MEMORY_START
+
+
+class _Processes:
+    """Processes that extract clouds, each with a thread here that gives it work and passes on what it tells. All end with the
+    context, however it is left.
+
+    Args:
+        count: of processes; those that get no work are not started.
+    """
+
+    def __init__(self, count: int, args: argparse.Namespace, bars: ProgressBars) -> None:
+        self._options = argparse.Namespace(**{"verbose": 0, **collect_given(args, *WORKER_OPTIONS)}, cores=count + 1)
+        self._bars = bars
+        self._local = threading.local()
+        self._started: list[SpawnProcess] = []
+        self._lock = threading.Lock()
+        self._leaving = False
+        self._threads = ThreadPoolExecutor(count, "extract", _keep_interrupts_away)
+
+    def __enter__(self) -> _Processes:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._leaving = True
+        for process in self._started:
+            process.terminate()
+        for process in self._started:
+            process.join(GRACE)
+            process.kill()  # of one that has ended, nothing is left to kill
+        self._threads.shutdown(cancel_futures=True)
+
+    def submit(self, path: str) -> Future[LoadedMap]:
+        """Return the map of an input to come; cancelled is what this process takes before another one does."""
+        return self._threads.submit(self._load, path)
+
+    def name_bars(self, path: str) -> Starter:
+        """Return what starts the bars of an input, whose texts name it."""
+
+        def start_task(title: str) -> Report | None:
+            move = self._bars.start_task(f"{path} {title}")
+
+            def report(fraction: float, text: str = "") -> None:
+                if move is not None:
+                    move(fraction, f"{Path(path).name}: {text or title}")
+
+            return move and report
+
+        return start_task
+
+    def _load(self, path: str) -> LoadedMap:
+        """Let the process of this thread load a map.
+
+        Raises:
+            InputError: as `iter_input_maps`.
+        """
+        process, connection = self._get_process()
+        reports: dict[str, Report | None] = {}
+        try:
+            connection.send(path)
+            while isinstance(told := connection.recv(), tuple):
+                title, done, text = told
+                if title not in reports:
+                    reports[title] = self.name_bars(path)(title)
+                if (report := reports[title]) is not None:
+                    report(done, text)
+        except (EOFError, OSError):
+            process.join(GRACE)
+            status = process.exitcode or 0
+            code = f"signal {-status}" if status < 0 else f"status {status}"
+            raise InputError(f"{path}: the process that extracted it ended ({code}); if memory is short, give --jobs 1") from None
+        if isinstance(told, str):
+            raise InputError(told)
+        return told  # type: ignore[no-any-return]
+
+    def _get_process(self) -> tuple[SpawnProcess, Connection[Any, Any]]:
+        if not hasattr(self._local, "process"):
+            from multiprocessing import get_context
+
+            ours, theirs = get_context("spawn").Pipe()
+            process = get_context("spawn").Process(target=_work, args=(theirs, self._options, self._bars.enabled), daemon=True)
+            with self._lock:
+                if self._leaving:
+                    raise InterruptedError("the command ends")
+                process.start()
+                self._started.append(process)
+            theirs.close()  # so that its end is seen
+            self._local.process = process, ours
+        return self._local.process  # type: ignore[no-any-return]
+
+
+def _keep_interrupts_away() -> None:
+    """A terminal sends Ctrl-C to all processes. Those that this thread starts do not hear it: the first one answers, and ends
+    them."""
+    if hasattr(signal, "pthread_sigmask"):  # Windows has none
+        from multiprocessing import resource_tracker
+
+        resource_tracker.ensure_running()  # its start would let them in again
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+
+
+def _work(connection: Connection[Any, Any], options: argparse.Namespace, shows_progress: bool) -> None:
+    """Load the maps of the paths that come, until none comes. Back go tuples of progress, then the map or a line of error."""
+    exit_on_signals()
+    debug = options.verbose > 1 or os.environ.get("TOPOMERGE_DEBUG", "") not in ("", "0")
+    show_log(options.verbose, debug)
+    _share_cores(options.cores)
+
+    def start_task(title: str) -> Report | None:
+        def report(fraction: float, text: str = "") -> None:
+            connection.send((title, fraction, text))
+
+        return report if shows_progress else None
+
+    with suppress(EOFError, BrokenPipeError):  # the first process has ended
+        while True:
+            path = connection.recv()
+            try:
+                told: LoadedMap | str = _load_map(path, options, start_task)
+            except BrokenPipeError:
+                raise
+            except Exception as error:
+                if debug:
+                    traceback.print_exc()
+                told = format_failure(error, [path])
+            connection.send(told)
+
+
+def _share_cores(processes: int) -> None:
+    """Leave the compiled loops of each process its share of the cores: threads that wait for a core wait busily."""
+    import numba
+
+    numba.set_num_threads(max(numba.get_num_threads() // processes, 1))
