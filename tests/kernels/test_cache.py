@@ -13,8 +13,8 @@ NOWHERE = """
 import numba.core.caching as caching
 caching.CacheImpl._locator_classes = [caching.UserProvidedCacheLocator]  # neither beside the source nor in a home
 import numpy as np
-from topomerge.kernels import morton
-print(morton.encode(np.array([[1, 1, 1]])))
+from topomerge.kernels import voxels
+print(voxels.encode(np.array([[1, 1, 1]])))
 """
 
 

@@ -114,7 +114,7 @@ def test_a_poisoned_map_is_not_let_in(maps, registrations):
 
 @pytest.mark.longer
 def test_the_joined_map_is_that_of_the_whole(atlas, maps):
-    joined = atlas.joined(0)
+    joined = atlas.join_component(0)
     assert 9 <= len(joined.rooms) <= 11 and joined.rooms["area"].sum() == pytest.approx(24 * 14, rel=0.15)
     assert joined.source == " + ".join(NAMES) and joined.free is not None
     bits = joined.provenance

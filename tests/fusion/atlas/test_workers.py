@@ -58,7 +58,7 @@ def backwards(work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tupl
 
 @pytest.mark.longer
 def test_who_is_killed_goes_on_and_the_order_in_which_pairs_end_changes_nothing(alone, tmp_path):
-    asked: dict[str, list[int]] = {"lay_coarsely": [], "register_pair": []}
+    asked: dict[str, list[int]] = {"score_coarsely": [], "register_pair": []}
 
     def failing(work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
         asked[work.__name__].append(len(tasks))
@@ -80,7 +80,7 @@ def test_who_is_killed_goes_on_and_the_order_in_which_pairs_end_changes_nothing(
     add(folder, parts(), tm.render_atlas_html, going_on)
     first, second = asked["register_pair"][:2]
     assert second == first - 1 and same_atlas(alone, folder)
-    assert asked["lay_coarsely"] == [2]  # the first map on two, the second on one; then it is written down
+    assert asked["score_coarsely"] == [2]  # the first map on two, the second on one; then it is written down
     assert not journal.exists()
 
 

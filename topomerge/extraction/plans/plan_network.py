@@ -27,7 +27,7 @@ UP_LEVELS = ("e", "f", "g", "h")  # and back, each beside what went down
 SIZE_CHANNEL = EVIDENCE_CHANNELS - 1  # the last one, which is the same everywhere
 NETWORK_REACH = 4  # strides: the network sees 60 columns to each side
 WORTH_PARTING = 0.8  # of a plan's area: its parts are looked at one by one where their boxes have less
-FURNITURE_CHANCE = 0.6  # of the inside of a room, from which on what looked like wall is none
+FURNITURE_CHANCE = 0.6, 0.95  # of the inside of a room, from which on what looked like wall is none: without and with a ceiling
 
 
 PLAN_SIGNATURE = Signature(
@@ -126,7 +126,7 @@ def remove_furniture(plan: StoreyPlan, probability: Array) -> StoreyPlan:
     Args:
         probability: (nx, ny, 5) of each of `COLUMN_CLASSES`.
     """
-    furniture = plan.wall & (probability[..., INSIDE_CLASS] > FURNITURE_CHANCE)
+    furniture = plan.wall & (probability[..., INSIDE_CLASS] > np.where(np.isnan(plan.ceiling), *FURNITURE_CHANCE))
     furniture &= ~ndimage.binary_dilation(plan.wall & ~furniture, np.ones((3, 3)))
     return replace(plan, wall=plan.wall & ~furniture, inside=plan.inside | furniture)
 
