@@ -170,7 +170,7 @@ def test_resumed_equals_uninterrupted(task, words, tmp_path, monkeypatch) -> Non
     jobs |= {"wall_segmentation": wall_segmentation.WallJob}
     kind = {**jobs, "place_evidence": place_evidence.PlaceJob, "room_matcher": room_matcher.MatcherJob}[task]
     train(compose_settings(words(task, "name=whole")), quiet)
-    step, seen = kind.step, []
+    step, seen = kind.train_step, []
 
     def cut(self, batch: Any, state: State) -> dict[str, float]:
         seen.append(1)
@@ -178,10 +178,10 @@ def test_resumed_equals_uninterrupted(task, words, tmp_path, monkeypatch) -> Non
             os.kill(os.getpid(), 2)
         return step(self, batch, state)
 
-    monkeypatch.setattr(kind, "run_mcl_step", cut)
+    monkeypatch.setattr(kind, "train_step", cut)
     with pytest.raises(KeyboardInterrupt):
         train(compose_settings(words(task, "name=cut")), quiet)
-    monkeypatch.setattr(kind, "run_mcl_step", step)
+    monkeypatch.setattr(kind, "train_step", step)
     train(compose_settings(words(task, "name=cut", "resume=true")), quiet)
     files = [tmp_path / "runs" / name / "last" / "network.safetensors" for name in ("cut", "whole")]
     assert files[0].read_bytes() == files[1].read_bytes()
