@@ -24,10 +24,12 @@ from pathlib import Path
 from topomerge.datasets.core.builder import run_script
 
 from topomerge.code_digest import find_other_clone
-from topomerge.config import compose
+from topomerge.config import compose, find_plugins
 from topomerge.evaluation.evaluate import evaluate
 from topomerge.evaluation.settings import Evaluation
 from topomerge.evaluation.tasks import MODULES, run_task
+from topomerge.registry import TASKS
+from topomerge.training.tasks import DEFAULT_TASK, evaluate_task, get_word
 
 
 def print_progress(text: str) -> None:
@@ -45,10 +47,11 @@ def main(words: list[str]) -> int:
     command = shlex.join(
         ["python", "evaluate.py", *words]
     )  # brackets and spaces in quotes, so that a shell takes it as it stands
-    task = next((word[len("task=") :] for word in words if word.startswith("task=")), "embedding")
+    task = get_word(words, "task", DEFAULT_TASK)
 
     def work() -> None:
-        if task == "embedding":
+        find_plugins(words)
+        if task not in MODULES and TASKS[task].is_descriptor:
             keys = [word for word in words if not word.startswith("task=")]
             keys = [f"run=[{w[4:]}]" if w.startswith("run=") and not w.startswith("run=[") else w for w in keys]
             scores = evaluate(compose("evaluate", Evaluation, keys), print_progress, command)
@@ -57,8 +60,6 @@ def main(words: list[str]) -> int:
             outcome = run_task(task, words, print_progress)
             print(f"{outcome.summary}\n\nWritten to {outcome.folder}")
         else:
-            from topomerge.training.tasks import evaluate_task
-
             judgement = evaluate_task(task, words, print_progress)
             print(f"{judgement.summary}\n\nWritten to {judgement.folder}")
 

@@ -19,9 +19,8 @@ from omegaconf import DictConfig
 from topomerge.code_digest import find_other_clone
 from topomerge.config import name_by_sweep
 from topomerge.errors import InputError
-from topomerge.training.tasks import compose_settings, convert_settings, register_tasks, train
+from topomerge.training.tasks import compose_settings, convert_settings, prepare_words, train
 
-register_tasks()
 FLAGS = {f"--{word}": f"{word}=true" for word in ("overfit", "resume", "overwrite")}
 
 
@@ -53,9 +52,10 @@ if __name__ == "__main__":
         print_progress(f"train: {other}")
     words = [FLAGS.get(word, word) for word in sys.argv[1:]]
     try:
+        ready = prepare_words(words)
         if not any(word.startswith("-") or word.startswith("hydra") for word in words):
             compose_settings(words)  # a wrong key is one line, where Hydra says ten
-        sys.argv[1:] = name_by_sweep(words)
+        sys.argv[1:] = name_by_sweep(ready)
     except InputError as error:
         sys.exit(f"train: {error}")
     main()

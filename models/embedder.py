@@ -6,16 +6,16 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
-from topomerge.models.geometry import DoorsEncoder, LocalPointNet, PointNet, SurroundingsEncoder, VoxelCNN, YawAverage
+from topomerge.models.geometry import DoorsEncoder, SurroundingsEncoder, YawAverage
 from topomerge.models.nodes import NodeEncoder, Standardizer, build_mlp
 from torch import Tensor, nn
 
 from topomerge.embedding.graph import count_columns
 from topomerge.embedding.network import GRAPH, TABLE_PARTS, Network, check, find_tensor, list_pair_tensors, list_tensors
 from topomerge.embedding.surroundings import CROP_SHAPES, DOOR_PART
+from topomerge.registry import POINTS
 
 QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # cosine and sine of 0 to 3 quarter turns
-POINT_ENCODERS = {"pointnet": PointNet, "pointnet_local": LocalPointNet, "voxelcnn": VoxelCNN}
 
 
 class Table(nn.Module):
@@ -39,8 +39,8 @@ class GeometryEncoder(nn.Module):
         geometry, self.width = network.geometry, network.geometry.width
         self.parts = nn.ModuleDict()
         for part in geometry.parts:
-            if part in POINT_ENCODERS:
-                self.parts[part] = YawAverage(POINT_ENCODERS[part](self.width), geometry.yaws, geometry.canonical)
+            if part in POINTS:
+                self.parts[part] = YawAverage(POINTS[part](self.width), geometry.yaws, geometry.canonical)
             elif part == DOOR_PART:
                 self.parts[part] = DoorsEncoder(self.width, network.dropout)
             elif part in CROP_SHAPES:

@@ -8,28 +8,30 @@ pairs that show one building: they may be one room.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
 
 import torch
 from topomerge.models.embedder import Embedder
 from torch import Tensor, nn
 
 from topomerge.errors import InputError
+from topomerge.registry import LOSSES
 
-LOSS_KINDS = ("infonce", "ntxent", "triplet")
 NEVER_LOGIT = -1e4  # a logit that is never chosen; minus infinity would make gradients of rows without a partner nan
 
 
 @dataclass
 class LossSettings:
     """Args:
-    kind: of `LOSS_KINDS`.
+    kind: of `topomerge.registry.LOSSES`.
     easy: weight of the other buildings' rooms among the negatives.
     dustbin: weight of the choice between the other map's rooms and no partner at all.
     margin: of the triplets, in distances between unit vectors.
     temperature: of NT-Xent; that of InfoNCE is learned.
     faint: weight of rooms of which one of the maps has a part only (not `Truth.clear`).
+    options: numbers that a loss of one's own takes, by name.
     """
 
     kind: str = "infonce"
@@ -38,6 +40,7 @@ class LossSettings:
     margin: float = 0.3
     temperature: float = 0.1
     faint: float = 0.5
+    options: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(eq=False)  # not frozen: fabric fills a copy of it in half precision
@@ -73,6 +76,37 @@ class Others:
     building: Tensor
 
 
+class RoomLosses(NamedTuple):
+    """What a loss gives.
+
+    Args:
+        values: (N,) of each room.
+        counts: (N,) bool, which rooms have one.
+        joint: the choice between the other map's rooms and no partner shapes the embedding, too; else only the dustbins and the
+            temperature are fitted to it.
+    """
+
+    values: Tensor
+    counts: Tensor
+    joint: bool = False
+
+
+@dataclass(eq=False)
+class RoomBatch:
+    """What a loss is computed from.
+
+    Args:
+        embedding: (N, D) of length 1.
+        temperature: the learned one.
+        gather: returns the rooms of other processes; None where there are none.
+    """
+
+    embedding: Tensor
+    temperature: Tensor
+    truth: Truth
+    gather: Callable[[], Others | None]
+
+
 class Processes(Protocol):
     """What a loss asks of the processes that train together."""
 
@@ -89,8 +123,7 @@ def check(settings: LossSettings) -> None:
     Raises:
         InputError: names the key.
     """
-    if settings.kind not in LOSS_KINDS:
-        raise InputError(f"loss.kind: unknown {settings.kind!r}; {', '.join(LOSS_KINDS)} are possible")
+    LOSSES.check(settings.kind)
     for key in ("easy", "dustbin", "margin", "faint"):
         if getattr(settings, key) < 0:
             raise InputError(f"loss.{key} must be 0 or more, not {getattr(settings, key)}")
@@ -116,19 +149,16 @@ def compute_matching_loss(
         temperature: learned one.
         processes: that train together; None: this one alone.
     """
-    others = None
-    if processes is not None and settings.kind != "triplet":  # the negatives of triplets are of the same pair
-        others = Others(processes.gather_others(embedding), processes.gather_others(truth.building))
-    if settings.kind == "infonce":
-        main, counts = compute_info_nce(embedding, temperature, truth, settings.easy, others)
-    elif settings.kind == "ntxent":
-        main, counts = compute_info_nce(embedding, embedding.new_tensor(settings.temperature), truth, 1.0, others)
-    else:
-        main, counts = compute_triplet_loss(embedding, truth, settings.margin)
-    # Where another loss than InfoNCE shapes the embedding, only the dustbins and the temperature are fitted to it.
-    fixed = embedding if settings.kind == "infonce" else embedding.detach()
+
+    def gather() -> Others | None:
+        if processes is None:
+            return None
+        return Others(processes.gather_others(embedding), processes.gather_others(truth.building))
+
+    main = RoomLosses(*LOSSES[settings.kind](settings, RoomBatch(embedding, temperature, truth, gather)))
+    fixed = embedding if main.joint else embedding.detach()
     weight = torch.where(truth.clear, 1.0, settings.faint)
-    first = _compute_weighted_mean(main, weight * counts, processes)
+    first = _compute_weighted_mean(main.values, weight * main.counts, processes)
     second = _compute_weighted_mean(compute_dustbin_loss(fixed, dustbin, temperature, truth), weight, processes)
     return {"loss": first + settings.dustbin * second, settings.kind: first.detach(), "dustbin": second.detach()}
 
@@ -136,6 +166,22 @@ def compute_matching_loss(
 def _compute_weighted_mean(values: Tensor, weight: Tensor, processes: Processes | None) -> Tensor:
     total = weight.sum() if processes is None else processes.average(weight.sum())
     return (values * weight).sum() / total.clamp(min=1e-6)
+
+
+def score_info_nce(settings: LossSettings, batch: RoomBatch) -> RoomLosses:
+    """InfoNCE at the learned temperature."""
+    return RoomLosses(*compute_info_nce(batch.embedding, batch.temperature, batch.truth, settings.easy, batch.gather()), True)
+
+
+def score_nt_xent(settings: LossSettings, batch: RoomBatch) -> RoomLosses:
+    """NT-Xent: at a temperature that stays, and all negatives count alike."""
+    temperature = batch.embedding.new_tensor(settings.temperature)
+    return RoomLosses(*compute_info_nce(batch.embedding, temperature, batch.truth, 1.0, batch.gather()))
+
+
+def score_triplets(settings: LossSettings, batch: RoomBatch) -> RoomLosses:
+    """Triplets, whose negatives are of the same pair."""
+    return RoomLosses(*compute_triplet_loss(batch.embedding, batch.truth, settings.margin))
 
 
 def compute_info_nce(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from collections.abc import Callable
 from itertools import pairwise
 
 import torch
@@ -15,6 +14,7 @@ from torch_geometric.utils import softmax
 
 from topomerge.embedding.graph import count_columns, find_column
 from topomerge.embedding.network import Node, list_pair_tensors
+from topomerge.registry import NODES
 
 
 def build_mlp(*widths: int, dropout: float = 0.0) -> nn.Sequential:
@@ -218,13 +218,11 @@ def build_gat(settings: Node, channels: int) -> nn.Module:
     return GATv2Conv(channels, channels // settings.heads, settings.heads, edge_dim=edge_dim, add_self_loops=False)
 
 
-# Kind of node encoder (`Node.kind`, `embedding.network.NODES`) -> what builds one of its layers over the rooms:
-# (R, channels), edge_index, edges (E, settings.width) if there are features -> (R, channels).
-ROOM_LAYERS: dict[str, Callable[[Node, int], nn.Module]] = {"sage": build_sage, "gat": build_gat}
-
-
 class NodeEncoder(nn.Module):
     """(R, width) -> (R, out): each room with what it learns from its neighbours.
+
+    Layers are of `topomerge.registry.NODES`, whose entries take the settings and a number of channels. A layer takes rooms
+    (R, channels), edge_index (2, E) and, where edges have features, these (E, settings.width); it gives (R, channels).
 
     Args:
         settings: kind of layer and how they are stacked; kind `none` gives the rooms back.
@@ -247,7 +245,7 @@ class NodeEncoder(nn.Module):
             self.pairs = Standardizer(pair_dim)
             self.doors = nn.ModuleList(DoorConv(settings.width, pair_dim) for _ in range(settings.doors))
         count = 0 if settings.kind == "none" else settings.layers
-        self.layers = nn.ModuleList(ROOM_LAYERS[settings.kind](settings, channels) for _ in range(count))
+        self.layers = nn.ModuleList(NODES[settings.kind](settings, channels) for _ in range(count))
         self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(count))
         self.drop = nn.Dropout(dropout)
         self.out = channels * (count + 1) if settings.jump == "cat" else channels

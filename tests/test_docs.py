@@ -81,7 +81,7 @@ def run_page(page: Path, folder: Path) -> None:
             if example.kind == "console":
                 run_commands(example, where)
             else:
-                exec(compile(example.text, where, "exec"), names)
+                exec(compile(example.text, where, "exec", dont_inherit=True), names)  # as in a file of its own
 
 
 @pytest.mark.parametrize("page", [pytest.param(p, id=p.name, marks=mark_of(p)) for p in pages()])
@@ -189,21 +189,34 @@ def source_name(path: str) -> str:
     return name if name.startswith("topomerge") else f"topomerge.{name}"
 
 
-def test_yaml_of_extend_is_taken(tmp_path: Path) -> None:
-    """A geometry that the page adds can be named in a training."""
-    hydra = pytest.importorskip("hydra")
+def test_yaml_of_extend_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the page adds can be named in a training, from a folder of one's own."""
+    pytest.importorskip("hydra")
     text = (ROOT / "docs" / "extend.md").read_text()
     added = re.findall(r"\*\*One YAML\*\*, `configs/(\w+)/(\w+)\.yaml`.*?```yaml\n(.*?)```", text, re.DOTALL)
-    assert len(added) == text.count("```yaml") > 0
-    from topomerge.training.tasks import compose_settings
-
-    compose_settings([])  # schemas
-    shutil.copytree(ROOT / "configs", tmp_path / "configs")
+    assert len(added) == text.count("```yaml") == 6
+    code = [
+        re.findall(r"```python\n(.*?)```", text[text.index(head) :], re.DOTALL)[0] for head in ("### A task", "### A dataset")
+    ]
+    classes = code[0].partition("TASKS.register")[0].partition("class AreaJob")[0]
+    (tmp_path / "page.py").write_text(
+        "from torch import nn\nimport torch\nfrom topomerge.registry import *\n"
+        "NODES.register('transformer')(nn.Linear)\nLOSSES.register('alignment')(print)\nPOINTS.register('extent')(nn.Linear)\n"
+        "OPTIMIZERS.register('nadam')(torch.optim.NAdam)\nSCHEDULES.register('halved')(max)\n"
+        f"{classes}\nTASKS.register('area')(Task(Area, print, ('error',)))\n{code[1]}"
+    )
     for group, name, block in added:
+        (tmp_path / "configs" / group).mkdir(parents=True, exist_ok=True)
         (tmp_path / "configs" / group / f"{name}.yaml").write_text(block)
-        with hydra.initialize_config_dir(str(tmp_path / "configs"), version_base="1.3"):
-            settings = hydra.compose("train", overrides=[f"{group}={name}"])
-        assert list(settings.network[group].parts) == [name]
+    script = (
+        "import sys; from topomerge.training.tasks import compose_settings as c; from topomerge.training.settings import check\n"
+        "s = c(['plugins=[page]', 'geometry=extent', 'node=transformer', 'loss=alignment',"
+        " 'experiment=descent', 'data=twins', 'path=.']); check(s)\n"
+        "print(s.network.geometry.parts, s.network.node.kind, s.loss.options, s.optimizer, s.schedule, s.data)\n"
+        "print(c(['plugins=[page]', 'task=area']).watch)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300)
+    assert done.stdout == "['extent'] transformer {'spread': 0.5} nadam halved twins\nerror\n", done.stderr
 
 
 def test_every_formula_has_its_function() -> None:

@@ -15,6 +15,7 @@ RANKS = {
     "blas": 0,
     "errors": 0,
     "code_digest": 0,
+    "registry": 0.5,
     "writers": 0,
     "kernels": 0,
     "types": 1,

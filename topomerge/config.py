@@ -8,8 +8,10 @@ from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from topomerge.errors import InputError
+from topomerge.registry import load_plugins
 
 Schema = TypeVar("Schema")
+SEARCH_PATH = "hydra.searchpath="
 
 
 def compose(name: str, schema: type[Schema], words: Sequence[str] = ()) -> Schema:
@@ -28,12 +30,28 @@ def compose(name: str, schema: type[Schema], words: Sequence[str] = ()) -> Schem
     except ImportError as error:
         raise InputError("settings need Hydra: pip install topomerge[learn]") from error
     register(name, schema)
+    words = find_plugins(words)
     try:
         with initialize_config_module("topomerge.configs", version_base="1.3"):
-            given = hydra_compose(name, overrides=list(words))
+            given = hydra_compose(name, overrides=words)
     except (HydraException, OmegaConfBaseException) as error:
         raise InputError(_shorten_error(error)) from error
     return convert_to_dataclass(given, schema)
+
+
+def find_plugins(words: Sequence[str]) -> list[str]:
+    """Import the modules that words like ``plugins=[my_package.my_module]`` name.
+
+    Returns:
+        The words, with one more by which Hydra finds the YAML files in folders `configs` beside these modules.
+
+    Raises:
+        InputError: one of them cannot be imported.
+    """
+    named = next((word.partition("=")[2] for word in reversed(words) if word.lstrip("+").startswith("plugins=")), "")
+    folders = load_plugins([name.strip(" '\"") for name in named.strip("[]").split(",") if name])
+    paths = ",".join(f"'file://{folder}'" for folder in folders)
+    return [*(w for w in words if not w.startswith(SEARCH_PATH)), f"{SEARCH_PATH}[{paths}]"] if folders else list(words)
 
 
 def register(name: str, schema: type[Any], group: str | None = None) -> None:

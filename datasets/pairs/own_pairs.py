@@ -25,6 +25,7 @@ from topomerge.datasets.core.builder import BuildRow, build_set, make_item, read
 from topomerge.datasets.pairs.evaluation_pair import compute_anchor
 from topomerge.datasets.pairs.own_truth import NO_OVERLAP, RoomOverlap, find_overlap
 from topomerge.datasets.pairs.pairs_file import (
+    OWN_DATA,
     PARTS,
     Capture,
     PairsFile,
@@ -43,9 +44,9 @@ from topomerge.io.listing import convert_to_plain
 from topomerge.io.maps import load_map, save_map
 from topomerge.io.points import OCTREES, read_chunks
 from topomerge.matching.assignment import has_twin
+from topomerge.registry import DATASETS
 from topomerge.types import Array, LogFn, TopometricMap
 
-OWN_DATA = "folder"  # name of the set on the command line: configs/data/folder.yaml
 OWN_SOURCE, OWN_FOLDER = "own", "own"  # source of the pairs; folder of the cache
 LONGEST_CAPTURE, LONGEST_OWN_PAIR = 7200.0, 600.0  # s
 TWIN_COLUMNS = (0, 3, 4)  # area, length, width of a room in its graph's `x`
@@ -115,7 +116,7 @@ class OwnSets:
 
 
 def check_own_path(data: str, path: str) -> None:
-    """Refuse ``data=folder`` without a path, and a path without it.
+    """Refuse ``data=folder``, or another of `topomerge.registry.DATASETS`, without a path, and a path without it.
 
     Args:
         data: name of the set that is asked for.
@@ -123,19 +124,21 @@ def check_own_path(data: str, path: str) -> None:
     Raises:
         InputError: names the key.
     """
-    if data == OWN_DATA and not path:
-        raise InputError(f"path: data={OWN_DATA} needs path=<a folder with a pairs.yaml>")
-    if path and data != OWN_DATA:
+    if data in DATASETS and not path:
+        raise InputError(f"path: data={data} needs path=<its folder{', with a pairs.yaml' if data == OWN_DATA else ''}>")
+    if path and data not in DATASETS:
         raise InputError(f"path={path}: is of data={OWN_DATA}, not of data={data}; name this, or leave the path out")
 
 
-def build_own_sets(path: str | Path, cache: str | Path, jobs: int = 1, log_line: LogFn = lambda text: None) -> OwnSets:
+def build_own_sets(
+    path: str | Path, cache: str | Path, jobs: int = 1, log_line: LogFn = lambda text: None, data: str = OWN_DATA
+) -> OwnSets:
     """Extract the captures of a folder, find the true matches of its pairs, and list the pairs of each part.
 
     Raises:
         InputError: the first thing that is wrong with the folder, in one line.
     """
-    listing = read_pairs_file(path)
+    listing = read_pairs_file(path, data)
     items, faults = extract_captures(listing, cache, jobs, log_line)
     if faults:
         raise InputError(f"{listing.path}: {next(iter(faults.values()))}")

@@ -29,9 +29,11 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.piece import OPTION_NAMES
+from topomerge.registry import DATASETS
 from topomerge.types import Array
 
 PAIRS_FILE = "pairs.yaml"
+OWN_DATA = "folder"  # name of the set on the command line: configs/data/folder.yaml
 LARGEST_FILE = 20 << 20  # bytes
 PARTS = ("train", "val", "test")
 KEYS = ("captures", "pairs", "split", "negatives", "voxel_size")
@@ -98,10 +100,21 @@ class PairsFile:
     voxel_size: float = 0.1
 
 
-def read_pairs_file(path: str | Path, paired: bool = True) -> PairsFile:
-    """Read the `pairs.yaml` of a folder, or one of another name.
+def read_pairs_table(folder: Path) -> Any:
+    """Read what a `pairs.yaml` in a folder, or a file of another name, holds, as it is."""
+    return _parsed(_find_file(folder))
+
+
+def _find_file(path: Path) -> Path:
+    return path / PAIRS_FILE if path.is_dir() else path
+
+
+def read_pairs_file(path: str | Path, data: str = OWN_DATA, paired: bool = True) -> PairsFile:
+    """Read the pairs of a folder and check them.
 
     Args:
+        data: of `topomerge.registry.DATASETS`: function of the folder that returns the table of a `pairs.yaml`, with files
+            relative to it; `OWN_DATA` reads that file itself, or one of another name.
         paired: two of its captures must share a place.
 
     Raises:
@@ -110,9 +123,10 @@ def read_pairs_file(path: str | Path, paired: bool = True) -> PairsFile:
     file = Path(path)
     if not file.exists():
         raise InputError(f"{file}: no such folder; give one with a {PAIRS_FILE}")
-    file = file / PAIRS_FILE if file.is_dir() else file
-    where = str(file)
-    given = _table(_parsed(file), where, KEYS)
+    given = DATASETS[data](file)
+    file = _find_file(file)
+    where = str(file) if data == OWN_DATA else f"{file.parent} (data={data})"
+    given = _table(given, where, KEYS)
     entries = _list(given.get("captures"), f"{where}: captures")
     if not entries:
         raise InputError(f"{where}: lists no captures; enter each file under captures")

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from tests.scenes_map import building
-from topomerge.embedding import network as parts
 from topomerge.embedding.graph import build_graph_arrays
 from topomerge.embedding.learned import load_embedder
 from topomerge.embedding.network import Geometry, Network, Node
@@ -24,6 +23,7 @@ from topomerge.embedding.surroundings import CROP_SHAPES
 from topomerge.embedding.weights import EMBEDDER_FILE, find_embedder, read_embedder_card
 from topomerge.errors import InputError
 from topomerge.networks.network import card_of
+from topomerge.registry import NODES
 
 ROOT = Path(__file__).parent.parent.parent
 EARLIER = Path(__file__).parent / "earlier"
@@ -127,8 +127,7 @@ def test_every_encoder_is_as_with_torch(torch, name, tmp_path):
 
 
 def test_a_node_encoder_of_somebody_else_trains_is_exported_and_loads(torch, tmp_path, monkeypatch):
-    """Registered by two lines. Those who load it need not know it."""
-    from topomerge.models.nodes import ROOM_LAYERS
+    """Registered by one line. Those who load it need not know it."""
     from topomerge.models.weights import read_embedder
     from torch_geometric.nn import TransformerConv
 
@@ -141,8 +140,7 @@ def test_a_node_encoder_of_somebody_else_trains_is_exported_and_loads(torch, tmp
 
     write_set(tmp_path, "some", 6)
     with monkeypatch.context() as registered:
-        registered.setitem(ROOM_LAYERS, "transformer", build)
-        registered.setattr(parts, "NODES", (*parts.NODES, "transformer"))
+        registered.setitem(NODES._registered, "transformer", build)
         network = Network(Geometry(["scalars"], width=16), Node("transformer", 2, width=8), size=8)
         common = {"runs": str(tmp_path), "cache": str(tmp_path), "data": "some", "validation": "", "tensorboard": False}
         settings = Training(**common, epochs=2, batch=2, network=network)

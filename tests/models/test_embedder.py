@@ -18,7 +18,7 @@ from tests.graphs import graph, shuffled, turned
 from tests.scenes_map import building
 from topomerge.embedding.engineered import LAYOUT_REACH, compute_door_layout
 from topomerge.embedding.graph import add_proximity_edges, build_graph_arrays, is_door_edge
-from topomerge.embedding.network import GEOMETRY_PARTS, TABLE_PARTS, Geometry, Network, Node, build_network, check
+from topomerge.embedding.network import TABLE_PARTS, Geometry, Network, Node, build_network, check, list_geometry_parts
 from topomerge.embedding.quarter_turns import rotate_graph as numpy_quarter_turned
 from topomerge.embedding.surroundings import CROP_SHAPES
 from topomerge.errors import InputError
@@ -78,7 +78,7 @@ def test_four_quarter_turns_are_none_and_numpy_turns_alike():
     assert all(torch.equal(rotate_quarter_turns(one, 4)[name], one[name]) for name in one)
 
 
-@pytest.mark.parametrize("part", [part for part in GEOMETRY_PARTS if part not in CROP_SHAPES])
+@pytest.mark.parametrize("part", [part for part in list_geometry_parts() if part not in CROP_SHAPES])
 def test_yaw(part):
     """Numbers: exactly; points about their longest axis: to 1e-3; points as they are: at the turns that are averaged."""
     one = graph(points=200)

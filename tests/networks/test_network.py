@@ -19,7 +19,7 @@ from topomerge.extraction.plans.plan_network import GRID_NETWORK_FILE, PLAN_NETW
 from topomerge.io.archive import find_weights_file
 from topomerge.networks.network import WEIGHTS_PACKAGE, Signature, Tensor, load_network, load_shipped_network, read_card
 from topomerge.registration.evidence.places import PLACE_SIGNATURE
-from topomerge.training.tasks import TASKS
+from topomerge.registry import TASKS
 from topomerge.types import Array
 
 SHIPPED = {

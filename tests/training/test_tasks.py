@@ -38,6 +38,7 @@ from topomerge.matching.room_matcher import load_matcher_weights
 from topomerge.networks.network import Network
 from topomerge.registration.evidence.places import load_weights as place_weights
 from topomerge.registration.verify import load_model
+from topomerge.registry import TASKS
 from topomerge.training import (
     door_classification,
     passages,
@@ -50,7 +51,7 @@ from topomerge.training import (
 from topomerge.training.door_classification import score_doors
 from topomerge.training.loop import State, prefetch_batches, select_device
 from topomerge.training.plan_segmentation import score_classes
-from topomerge.training.tasks import SCORES, TASKS, compose_settings, evaluate_task, find_weights, train
+from topomerge.training.tasks import compose_settings, evaluate_task, find_weights, train
 from topomerge.types import EDGE_DTYPE, Array
 
 ROOT = Path(__file__).parent.parent.parent
@@ -142,7 +143,7 @@ def test_a_task_is_trained_exported_read_and_judged(task, words, tmp_path, monke
     run = tmp_path / "runs" / task
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert len(rows) == (2 if task in NETWORKS else 1) and all(np.isfinite(value) for value in scores.values())
-    assert {f"val/{name}" for name in SCORES[task]} <= set(rows[0])
+    assert {f"val/{name}" for name in TASKS[task].scores} <= set(rows[0])
     assert json.loads((run / "config.json").read_text())["task"] == task
     card = json.loads((run / "best" / f"{Path(TASKS[task].file).stem}.card.json").read_text())
     assert card["task"] == task and f"task={task}" in card["command"] and card["metrics"]
@@ -211,7 +212,7 @@ def test_fits_learn_what_is_so(words) -> None:
 @pytest.mark.parametrize(
     ("given", "key"),
     [
-        (["task=door"], "task=door"),
+        (["task=door"], "task: unknown .door."),
         (["task=plan_segmentation", "data.scan=3"], "data.scan"),
         (["task=plan_segmentation", "epochs=many"], "epochs"),
         (["task=plan_segmentation", "crop=30"], "crop"),

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from topomerge.registry import TASKS
 from topomerge.training import weights
-from topomerge.training.tasks import TASKS
 
 
 def test_steps_run_in_order_and_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,14 +10,12 @@ from topomerge.embedding.graph import POINTS_PER_ROOM, TABLES
 from topomerge.embedding.surroundings import CROP_SHAPES
 from topomerge.errors import InputError
 from topomerge.networks.network import Signature, Tensor
+from topomerge.registry import NODES, POINTS
 
 TABLE_PARTS = {"scalars": "x", "engineered": "engineered", "shapedna": "shapedna"}  # part -> table of the graph that it reads
-POINT_PARTS = ("pointnet", "pointnet_local", "voxelcnn")  # these read the points
-GEOMETRY_PARTS = (*TABLE_PARTS, *POINT_PARTS, *CROP_SHAPES)
 GRAPH = ("edge_index", "edge_attr")
 LARGEST_WIDTH = 4096  # more is a mistake, or a file that was made to take all memory
 FARTHEST_AROUND = 100.0  # m
-NODES = ("none", "sage", "gat")  # those that `models.nodes` has layers of
 JUMPS = ("last", "cat", "max")
 
 
@@ -26,7 +24,7 @@ class Geometry:
     """Room -> vector.
 
     Args:
-        parts: of `GEOMETRY_PARTS`; several are concatenated.
+        parts: of `list_geometry_parts`; several are concatenated.
         width: of the vector.
         yaws: turns over which an encoder of points takes the mean.
         canonical: turn the longest axis into x first.
@@ -43,7 +41,7 @@ class Node:
     """Rooms and the edges between them -> vector.
 
     Args:
-        kind: of `NODES`.
+        kind: of `topomerge.registry.NODES`, or none.
         layers: 1 to 4.
         heads: of the attention.
         edges: use the features of edges.
@@ -85,6 +83,11 @@ class Network:
     def turns(self) -> int:
         """1, or 4 where what a room gets depends on how the map is turned: it gets a row for each quarter turn then."""
         return 4 if CROP_SHAPES.keys() & set(self.geometry.parts) or (self.node.ways and self.node.kind != "none") else 1
+
+
+def list_geometry_parts() -> tuple[str, ...]:
+    """Return what a geometry can be made of: tables, encoders of points (`topomerge.registry.POINTS`) and of surroundings."""
+    return (*TABLE_PARTS, *POINTS, *CROP_SHAPES)
 
 
 def find_tensor(part: str) -> str:
@@ -135,10 +138,10 @@ def check(network: Network) -> None:
         InputError: names the key.
     """
     for part in network.geometry.parts:
-        if not isinstance(part, str) or part not in GEOMETRY_PARTS:
-            raise InputError(f"geometry.parts: unknown {part!r}; {', '.join(GEOMETRY_PARTS)} are possible")
-    if network.node.kind not in NODES:
-        raise InputError(f"node.kind: unknown {network.node.kind!r}; {', '.join(NODES)} are possible")
+        if not isinstance(part, str) or part not in (possible := list_geometry_parts()):
+            raise InputError(f"geometry.parts: unknown {part!r}; {', '.join(possible)} are possible")
+    if network.node.kind not in ("none", *NODES):
+        raise InputError(f"node.kind: unknown {network.node.kind!r}; none, {', '.join(NODES)} are possible")
     _check_sizes(network)
 
 

@@ -148,7 +148,7 @@ def with_own_pairs(settings: Evaluation, log_line: LogFn) -> Evaluation:
     if not settings.path:
         return settings
     cache = Path(settings.cache)
-    manifests = build_own_sets(settings.path, own_cache(cache), settings.jobs, log_line).manifests
+    manifests = build_own_sets(settings.path, own_cache(cache), settings.jobs, log_line, settings.data.name).manifests
     part = {"validation": "val"}.get(settings.data.split, settings.data.split)
     if part not in manifests:
         raise InputError(f"data.split={settings.data.split}: {', '.join(manifests)} are possible of data=folder")

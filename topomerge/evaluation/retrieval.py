@@ -178,7 +178,7 @@ def find_manifest(settings: Settings, log_line: LogFn) -> Path:
     """
     check_own_path(settings.data.set, settings.path)
     if settings.path:
-        return build_own_sets(settings.path, settings.cache, settings.jobs, log_line).manifests["test"]
+        return build_own_sets(settings.path, settings.cache, settings.jobs, log_line, settings.data.set).manifests["test"]
     return Path(settings.cache) / settings.manifest
 
 

@@ -68,6 +68,7 @@ class Evaluation:
         write: a Markdown file, to the marked section of which a short table goes; empty: none.
         section: the name of that mark.
         remake: make predictions again that are there.
+        plugins: modules that are imported first, as they register something (`topomerge.registry`).
     """
 
     data: Pairs = field(default_factory=Pairs)
@@ -95,6 +96,7 @@ class Evaluation:
     write: str = ""
     section: str = "evaluation"
     remake: bool = False
+    plugins: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from topomerge.io.archive import replace_on_success
+from topomerge.registry import TASKS
 from topomerge.training.run_folder import MetricsLog, begin_run, export_files, write_card
 from topomerge.training.settings import TaskSettings
-from topomerge.training.tasks import TASKS
 from topomerge.types import Array, LogFn
 
 PROBABILITY_BANDS = (0, 0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.97, 1.0)  # over which calibration is measured

@@ -42,6 +42,7 @@ from topomerge.numpy_nn import apply_mlp, sigmoid
 from topomerge.training.loop import NetworkJob, State, derive_seed, descend_gradient, run_network
 from topomerge.training.packed_pairs import number_buildings, read_scan_building
 from topomerge.training.scan_settings import DoorClassification
+from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
 
 PURE = 0.7  # share of a region in its true room; regions between rooms are no example
@@ -262,3 +263,14 @@ def judge(settings: DoorClassification, file: Path, log_line: LogFn) -> dict[str
         "examples": len(y),
         "buildings": len(np.unique(building)),
     }
+
+
+TASK = Task(
+    DoorClassification,
+    fit,
+    ("auc", "precision", "recall", "accuracy"),
+    judge,
+    "topomerge.extraction.plans",
+    "door_classifier.json",
+    hours=0.7,
+)

@@ -25,6 +25,7 @@ from topomerge.models.export import check_exporter, export_embedder
 from topomerge.models.losses import Objective
 from topomerge.models.weights import read_embedder, read_state, save_state
 from topomerge.networks.network import WEIGHTS_PACKAGE
+from topomerge.registry import SCHEDULES
 from topomerge.training.batches import AugmentedPairs, MapPair
 from topomerge.training.device_batches import DevicePairs, supports_device_batches
 from topomerge.training.loop import (
@@ -32,16 +33,24 @@ from topomerge.training.loop import (
     Schedule,
     State,
     build_diverged,
+    build_optimizer,
     derive_seed,
-    group_parameters,
     prefetch_by_threads,
-    warmup_cosine,
 )
 from topomerge.training.packed_pairs import EXTRAS, GraphPair, hold_out, load_pairs
 from topomerge.training.provenance import compare_settings, describe_provenance
 from topomerge.training.run_folder import MetricsLog, begin_run, export_files
-from topomerge.training.settings import FREEZE, VALIDATION, Augment, Training, check, convert_to_dict
-from topomerge.training.tasks import check_start
+from topomerge.training.settings import (
+    FREEZE,
+    VALIDATION,
+    Augment,
+    Training,
+    build_recipe_schema,
+    check,
+    convert_composed,
+    convert_to_dict,
+)
+from topomerge.training.tasks import RANKINGS, Task, check_start
 from topomerge.training.validate import embed, validate
 from topomerge.types import LogFn
 
@@ -114,8 +123,7 @@ def fit(settings: Training, log_line: LogFn = lambda text: print(text, file=sys.
     settings = with_own_pairs(settings, log_line, fabric)
     train, watched, replayed = _load_data(settings, log_line, fabric)
     network = _build_network(settings, train)
-    fused = fabric.device.type == "cuda"  # one launch for all weights
-    optimizer = torch.optim.AdamW(group_parameters(network, settings.decay), settings.rate, fused=fused)
+    optimizer = build_optimizer(settings, network, fused=fabric.device.type == "cuda")  # one launch for all weights
     state = State()
     if settings.resume:
         state = State(**load_state(settings.folder / "last", network, optimizer))
@@ -208,7 +216,8 @@ class EmbeddingJob:
         """
         settings, done = self.settings, state.epoch * self.steps + state.step
         for group in self.optimizer.param_groups:
-            group["lr"] = settings.rate * warmup_cosine(done / (settings.epochs * self.steps), settings.warmup)
+            factor = SCHEDULES[settings.schedule](done / (settings.epochs * self.steps), settings.warmup)
+            group["lr"] = settings.rate * factor
         torch.manual_seed(derive_seed(settings.seed, state.epoch, state.step, self.fabric.global_rank, 1))  # of the dropout
         batch = batch.to(self.fabric.device)
         losses = self.objective(batch.tensors, batch.truth)
@@ -219,7 +228,7 @@ class EmbeddingJob:
         out = {name: value.detach() for name, value in losses.items()}
         if getattr(self.fabric.strategy.precision, "scaler", None) is not None:
             out |= {"norm": norm.masked_fill(lost, 0.0), "skipped": lost.float()}
-        elif self.get_optimizer().defaults["fused"]:
+        elif self.get_optimizer().defaults.get("fused"):
             self.get_optimizer().found_inf, out["norm"] = lost.float(), norm  # type: ignore[attr-defined]
         elif lost:
             raise build_diverged(state)
@@ -326,7 +335,7 @@ def with_own_pairs(settings: Training, log_line: LogFn, fabric: Any) -> Training
     from topomerge.datasets.pairs.own_pairs import build_own_sets
 
     with fabric.rank_zero_first():
-        manifests = build_own_sets(settings.path, settings.cache, log_line=log_line).manifests
+        manifests = build_own_sets(settings.path, settings.cache, log_line=log_line, data=settings.data).manifests
     watched = str(manifests["val"]) if settings.validation == VALIDATION else settings.validation
     return replace(settings, data=str(manifests["train"]), validation=watched)
 
@@ -399,3 +408,33 @@ def _build_network(settings: Training, train: Sequence[GraphPair]) -> Embedder:
     for part in FREEZE[settings.freeze]:
         network.get_submodule(part).requires_grad_(False)
     return network
+
+
+def describe_network(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what tells runs apart in a table, out of the settings of one: its encoders and its loss."""
+    geometry, node = config["network"]["geometry"], config["network"]["node"]
+    edges = "yes"
+    if node["kind"] == "none" or not node["edges"]:
+        edges = "–"
+    elif node["doors"]:
+        edges = "near doors" if node["near"] else "doors"
+    elif node.get("around"):
+        edges = f"rooms within {node['around']:g} m"
+    kind = node["kind"] if node["kind"] == "none" else f"{node['kind']} {node['layers']}"
+    return {"geometry": "+".join(geometry["parts"]), "node": kind, "edges": edges, "loss": config["loss"]["kind"]}
+
+
+TASK = Task(
+    Training,
+    fit,
+    (*RANKINGS, "recall@1_clear", "recall@5_clear", "mrr", "precision", "recall", "f1", "merged"),
+    package=WEIGHTS_PACKAGE,
+    file="embedder.onnx",
+    hours=0.6,
+    words=("experiment=surroundings",),
+    sets=("train_walks", "val_small"),
+    schema=build_recipe_schema,
+    convert=convert_composed,
+    is_descriptor=True,
+    describe=describe_network,
+)

@@ -23,6 +23,7 @@ from topomerge.training.closed_form import FitResult, run_fit
 from topomerge.training.match_odds import build_map_pairs
 from topomerge.training.packed_pairs import name_building
 from topomerge.training.task_settings import FeatureScale
+from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn, is_mostly_unseen
 
 CLIPPED = 4.0  # standard deviations that a difference counts for at most
@@ -135,3 +136,6 @@ def judge(settings: FeatureScale, file: Path, log_line: LogFn) -> dict[str, Any]
     """Return recall@1 of engineered features with these weights on pairs of buildings that trained nothing."""
     weights = json.loads(file.read_text(encoding="utf-8"))
     return rank_scores(rank_scaled(build_pair_features(settings.heldout, settings, log_line), weights))
+
+
+TASK = Task(FeatureScale, fit, ("recall@1", "recall@5", "mrr"), judge, "topomerge.embedding", "engineered.json", hours=0.3)

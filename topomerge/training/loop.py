@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import math
 import shutil
@@ -24,9 +25,10 @@ from topomerge.checkpoint import NETWORK_FILE, load_state, read_network, save_st
 from topomerge.errors import InputError
 from topomerge.models.export import check_exporter, export_network, run_with_torch
 from topomerge.networks.network import Run, Signature
+from topomerge.registry import OPTIMIZERS, SCHEDULES, TASKS
 from topomerge.training.run_folder import EtaClock, MetricsLog, begin_run, export_files, write_card
 from topomerge.training.settings import NetworkTask
-from topomerge.training.tasks import TASKS, check_accelerator
+from topomerge.training.tasks import check_accelerator
 from topomerge.types import LogFn
 
 STEPS_BETWEEN_CHECKS = 20  # of whether the losses are finite: each waits for the device
@@ -51,7 +53,7 @@ class Schedule:
     """Args:
     folder: of the run.
     epochs: at most; steps: of each.
-    watch: score of validation whose highest value is best.
+    watch: score of validation by which an epoch is best; lower: less of it is better.
     patience: epochs without a better one after which it ends; 0: never.
     perfect: value of the score at which nothing is left to learn.
     """
@@ -62,6 +64,7 @@ class Schedule:
     watch: str
     patience: int = 0
     perfect: float = math.inf
+    lower: bool = False
 
 
 class Job(Protocol):
@@ -131,8 +134,8 @@ class Loop:
             row = self._run_epoch()
             scores = self.job.compute_scores()
             row |= {f"val/{name}": value for name, value in scores.items()}
-            state, score = self.state, scores[schedule.watch]
-            better = score > state.best
+            state, score = self.state, -scores[schedule.watch] if schedule.lower else scores[schedule.watch]
+            better = score > state.best or (state.best_epoch < 0 and math.isfinite(score))
             self.state = State(state.epoch + 1, 0, state.best, state.best_epoch, state.stale + 1)
             if better:
                 best = row
@@ -244,6 +247,29 @@ def group_parameters(network: torch.nn.Module, decay: float) -> list[dict[str, A
     return [{"params": of, "weight_decay": by} for of, by in ((layers, decay), (others, 0.0)) if of]
 
 
+def build_optimizer(settings: Any, network: torch.nn.Module, **options: Any) -> torch.optim.Optimizer:
+    """Build the optimizer that settings name.
+
+    Args:
+        options: that it gets if it takes them.
+
+    Raises:
+        InputError: it does not take the settings' `optimizer_options`.
+    """
+    kind = OPTIMIZERS[settings.optimizer]
+    taken = inspect.signature(kind).parameters
+    options = {name: value for name, value in options.items() if name in taken}
+    try:
+        optimizer: torch.optim.Optimizer = kind(
+            group_parameters(network, settings.decay), lr=settings.rate, **options, **settings.optimizer_options
+        )
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"optimizer={settings.optimizer}: {' '.join(str(error).split())[:160]}; see optimizer_options"
+        ) from error
+    return optimizer
+
+
 def descend_gradient(optimizer: torch.optim.Optimizer, loss: torch.Tensor, state: State) -> dict[str, float]:
     """Take one step of an optimizer down the gradient of a loss; return the loss and the gradient's length.
 
@@ -288,6 +314,11 @@ def warmup_cosine(done: float, warmup: float) -> float:
     return 0.5 * (1 + math.cos(math.pi * (done - warmup) / (1 - warmup)))
 
 
+def warmup_constant(done: float, warmup: float) -> float:
+    """Compute the factor of the learning rate after this share of all steps: a rise, then 1."""
+    return min((done + 1e-3) / (warmup + 1e-3), 1.0)
+
+
 def derive_seed(*numbers: int) -> int:
     """Derive a seed from several numbers."""
     return int.from_bytes(hashlib.sha256(json.dumps(numbers).encode()).digest()[:7])
@@ -314,7 +345,7 @@ class NetworkJob(ABC):
     def __init__(self, settings: NetworkTask, network: torch.nn.Module, origin: Mapping[str, Any]) -> None:
         self.device = select_device(settings)
         self.settings, self.network, self.origin = settings, network.to(self.device), origin
-        self.optimizer = torch.optim.AdamW(group_parameters(network, settings.decay), lr=settings.rate)
+        self.optimizer = build_optimizer(settings, network)
 
     def sum_over_processes(self, sizes: int) -> float:
         """Return the size of the one process."""
@@ -336,7 +367,8 @@ class NetworkJob(ABC):
         """One step of the optimizer at the rate of its place in the run: it rises over `options.warmup` steps, then falls."""
         total, done = options.epochs * options.steps, state.epoch * options.steps + state.step
         for group in self.optimizer.param_groups:
-            group["lr"] = options.rate * max(warmup_cosine(done / total, min(options.warmup / total, 0.5)), 0.01)
+            factor = SCHEDULES[self.settings.schedule](done / total, min(options.warmup / total, 0.5))
+            group["lr"] = options.rate * max(factor, 0.01)
         return descend_gradient(self.optimizer, loss, state)
 
     @abstractmethod
@@ -417,8 +449,10 @@ def run_network(job: Job, settings: NetworkTask, steps: int, log_line: LogFn) ->
     device = str(next(job.network.parameters()).device)
     begin_run(settings, torch.cuda.get_device_name() if device.startswith("cuda") else device, torch.get_num_threads())
     log = MetricsLog(settings.folder, settings.tensorboard, state.epoch)
-    schedule = Schedule(settings.folder, settings.epochs, steps, settings.watch, settings.patience)
+    task = TASKS[settings.task]
+    lower = settings.watch in task.lower
+    schedule = Schedule(settings.folder, settings.epochs, steps, settings.watch, settings.patience, lower=lower)
     best = Loop(job, schedule, state, log, log_line).run()
     if settings.export:
-        export_files(settings.folder / "best", settings.export, TASKS[settings.task].package)
+        export_files(settings.folder / "best", settings.export, task.package)
     return best

@@ -27,6 +27,7 @@ from topomerge.training.closed_form import FitResult, run_fit
 from topomerge.training.match_odds import STRANGER, build_map_pairs
 from topomerge.training.packed_pairs import name_building
 from topomerge.training.task_settings import MatchBelief
+from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
 
 SURE = (0.5, 0.8)  # probabilities from which precision is told
@@ -174,3 +175,6 @@ def judge(settings: MatchBelief, file: Path, log_line: LogFn) -> dict[str, Any]:
     rows = build_match_rows(settings.heldout, settings, log_line)
     guesses = {m: [_predict_probability(r.features[m], np.array(weights[m])) for r in rows] for m in BELIEVED_METHODS}
     return score_beliefs(rows, guesses)
+
+
+TASK = Task(MatchBelief, fit, ("attention_all_after_accuracy",), judge, "topomerge.fusion", "match_belief.json", hours=0.3)

@@ -26,6 +26,7 @@ from topomerge.training.closed_form import FitResult, compute_calibration_error,
 from topomerge.training.packed_pairs import name_building
 from topomerge.training.settings import TaskSettings
 from topomerge.training.task_settings import MatchOdds
+from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn, Sim3
 
 RIGHT_POSE = (0.5, np.radians(5))  # m in the middle of what both maps saw, rad
@@ -193,3 +194,6 @@ def judge(settings: MatchOdds, file: Path, log_line: LogFn) -> dict[str, Any]:
     weights = json.loads(file.read_text(encoding="utf-8"))
     evidence = build_pair_evidence(settings.heldout, settings, log_line)
     return score_odds(*predict_probabilities(evidence, np.array(weights[HYPOTHESIS]), np.array(weights[MATCH])))
+
+
+TASK = Task(MatchOdds, fit, ("match_accuracy", "hypothesis_accuracy"), judge, "topomerge.matching", "odds.json", hours=0.3)

@@ -42,6 +42,7 @@ from topomerge.training.belief_hypotheses import (
 from topomerge.training.closed_form import FitResult, compute_calibration_error, run_fit
 from topomerge.training.packed_pairs import name_building
 from topomerge.training.task_settings import MergeBelief
+from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
 
 LEAST_SPREAD = 1e-4  # the file of weights holds five decimals: less would be 0 there
@@ -464,3 +465,6 @@ def _round_values(value: Any) -> Any:
     if isinstance(value, list):
         return [_round_values(v) for v in value]
     return {k: _round_values(v) for k, v in value.items()} if isinstance(value, dict) else value
+
+
+TASK = Task(MergeBelief, fit, ("right_believed", "right_first"), judge, "topomerge.registration", "calibration.json", hours=4.0)

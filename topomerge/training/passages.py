@@ -23,6 +23,7 @@ from topomerge.numpy_nn import sigmoid
 from topomerge.training.closed_form import FitResult, compute_calibration_error, run_fit
 from topomerge.training.packed_pairs import number_buildings, read_scan_building
 from topomerge.training.scan_settings import Passages
+from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
 
 PRIOR = np.array([float(name == "plan") for name in SCORE_INPUTS])  # weights are pulled to the plan alone
@@ -107,3 +108,8 @@ def judge(settings: Passages, file: Path, log_line: LogFn) -> dict[str, Any]:
     """Scores of weights on scans of buildings that trained nothing."""
     weights = json.loads(file.read_text(encoding="utf-8"))
     return compute_figures([score(scan, weights) for scan in read_scans(settings.heldout, settings, log_line)])
+
+
+TASK = Task(
+    Passages, fit, ("log_loss", "accuracy"), judge, "topomerge.extraction", "passages.json", hours=0.2, lower=("log_loss",)
+)

@@ -33,6 +33,7 @@ from topomerge.training.belief_hypotheses import assign_half, build_hypothesis_f
 from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, run_network
 from topomerge.training.packed_pairs import name_building
 from topomerge.training.task_settings import PlaceAugment, PlaceEvidence
+from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
 
 
@@ -207,3 +208,6 @@ def judge(settings: PlaceEvidence, file: Path, log_line: LogFn) -> dict[str, Any
     places = collect_places(build_hypothesis_files(settings.heldout, settings, log_line))
     scores = score_places(compute_network_log_odds(places.planes, read_weights(file)), places.right, places.weight)
     return {**scores, "places": len(places.right)}
+
+
+TASK = Task(PlaceEvidence, fit, ("auc",), judge, "topomerge.networks", "place_network.onnx", hours=4.0)

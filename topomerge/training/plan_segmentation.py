@@ -28,6 +28,7 @@ from topomerge.networks.network import Run
 from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, prefetch_batches, run_network
 from topomerge.training.packed_pairs import mark_watched, read_scan_building
 from topomerge.training.scan_settings import GridSegmentation, PlanAugment, PlanLoss, PlanSegmentation
+from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
 
 SQUARE = np.ones((3, 3))
@@ -273,3 +274,8 @@ def judge(settings: PlanSegmentation, file: Path, log_line: LogFn) -> dict[str, 
     paths, _ = build_plans(recipe, settings, log_line)
     examples = [e for path in paths for e in load_examples(path)]
     return {**score_classes(count_confusion(examples, read_weights(file))), "scans": len(paths), "plans": len(examples)}
+
+
+PLAN_SCORES = ("mean_iou", "mean_f1", "accuracy", *(f"{of}_{name}" for of in ("iou", "f1") for name in COLUMN_CLASSES))
+PLAN_TASK = Task(PlanSegmentation, fit, PLAN_SCORES, judge, "topomerge.networks", "plan_network.onnx", hours=5.0)
+GRID_TASK = Task(GridSegmentation, fit, PLAN_SCORES, judge, "topomerge.networks", "grid_network.onnx", hours=1.2)

@@ -33,6 +33,7 @@ from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, r
 from topomerge.training.packed_pairs import Graph, GraphPair, load_pairs
 from topomerge.training.settings import Augment
 from topomerge.training.task_settings import RoomMatching
+from topomerge.training.tasks import RANKINGS, Task
 from topomerge.training.validate import LEAST_CERTAINTIES, SIZE_COLUMNS, score_matches
 from topomerge.types import Array, LogFn
 
@@ -256,7 +257,7 @@ def with_own_sets(settings: RoomMatching, log_line: LogFn) -> RoomMatching:
     from topomerge.datasets.pairs.own_pairs import build_own_sets
     from topomerge.datasets.pairs.pairs_file import PARTS
 
-    manifests = build_own_sets(settings.path, settings.cache, settings.jobs, log_line).manifests
+    manifests = build_own_sets(settings.path, settings.cache, settings.jobs, log_line, settings.data.name).manifests
     train, val, test = (str(manifests[part]) for part in PARTS)
     data, heldout = replace(settings.data, name=train), replace(settings.heldout, name=test)
     return replace(settings, data=data, heldout=heldout, validation=val)
@@ -284,3 +285,14 @@ def read_examples(settings: RoomMatching, name: str, network: Embedder, number: 
     return build_examples(
         load_pairs(manifest, ["sheet"], log_line, around=network.network.node.around), network, number, log_line
     )
+
+
+TASK = Task(
+    RoomMatching,
+    fit,
+    (*RANKINGS, "mrr", "precision", "recall", "f1", "turn"),
+    judge,
+    "topomerge.networks",
+    "room_matcher.onnx",
+    hours=0.3,
+)

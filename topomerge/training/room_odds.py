@@ -30,6 +30,7 @@ from topomerge.numpy_nn import sigmoid
 from topomerge.training.closed_form import FitResult, compute_calibration_error, run_fit
 from topomerge.training.packed_pairs import number_buildings, read_scan_building
 from topomerge.training.scan_settings import RoomOdds
+from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
 
 CLIPPED = (0.005, 0.995)  # quantiles that features are clipped to
@@ -192,3 +193,8 @@ def judge(settings: RoomOdds, file: Path, log_line: LogFn) -> dict[str, Any]:
         _append_predictions(weights[family.key] if family.key else weights, family, scans, guesses)
         scores |= _score_family(family, guesses)
     return scores
+
+
+TASK = Task(
+    RoomOdds, fit, ("entered_auc", "whole_auc", "confidence_auc"), judge, "topomerge.extraction", "room_odds.json", hours=0.5
+)

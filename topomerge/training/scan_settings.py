@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from topomerge.datasets.pairs.plan_examples import PlanRecipe
+from topomerge.errors import InputError
+from topomerge.extraction.elevations.elevation import WALL_CLASSES
 from topomerge.training.settings import NetworkTask, RasterTask, TaskSettings
 
 
@@ -58,6 +60,16 @@ class PlanSegmentation(RasterTask):
     loss: PlanLoss = field(default_factory=PlanLoss)
     augment: PlanAugment = field(default_factory=PlanAugment)
     watch: str = "mean_f1"
+
+    def check(self) -> None:
+        """Refuse what makes no sense."""
+        super().check()
+        if self.crop < 16 or self.crop % 16:
+            raise InputError(f"crop must be a multiple of 16, not {self.crop}")
+        if len(self.widths) != 8 or min(self.widths) < 1:
+            raise InputError(f"widths must be 8 numbers of channels, not {self.widths}")
+        if len(self.loss.classes) != 5 or min(self.loss.classes) <= 0:
+            raise InputError(f"loss.classes must be 5 weights above 0, not {self.loss.classes}")
 
 
 @dataclass
@@ -116,6 +128,16 @@ class WallSegmentation(RasterTask):
     unseen: float = 0.05
     augment: WallAugment = field(default_factory=WallAugment)
     watch: str = "f1_doors"
+
+    def check(self) -> None:
+        """Refuse what makes no sense."""
+        super().check()
+        if len(self.widths) != 4 or min(self.widths) < 1:
+            raise InputError(f"widths must be 4 numbers of channels, not {self.widths}")
+        if self.length < 8 or self.length % 2:
+            raise InputError(f"length must be an even number of places, 8 or more, not {self.length}")
+        if len(self.classes) != len(WALL_CLASSES) or min(self.classes) <= 0:
+            raise InputError(f"classes must be {len(WALL_CLASSES)} weights above 0, not {self.classes}")
 
 
 @dataclass

@@ -14,6 +14,7 @@ from topomerge.embedding.network import check as check_network
 from topomerge.errors import InputError
 from topomerge.models.losses import LossSettings
 from topomerge.models.losses import check as check_loss
+from topomerge.registry import DATASETS, OPTIMIZERS, SCHEDULES, load_plugins
 
 
 def check_numbers(settings: Mapping[str, Any], above: str = "") -> None:
@@ -29,6 +30,21 @@ def check_numbers(settings: Mapping[str, Any], above: str = "") -> None:
             raise InputError(f"{above}{key} must be a finite number, not {value}")
 
 
+def check_descent(settings: Any) -> None:
+    """Refuse optimizers and schedules that are not registered.
+
+    Raises:
+        InputError: lists the names.
+    """
+    OPTIMIZERS.check(settings.optimizer)
+    SCHEDULES.check(settings.schedule)
+
+
+def _check_run_name(settings: Any) -> None:
+    if not settings.name or Path(settings.name).is_absolute() or ".." in Path(settings.name).parts:
+        raise InputError(f"name must name a folder inside {settings.runs}, not {settings.name!r}")
+
+
 @dataclass
 class TaskSettings:
     """What every task has.
@@ -38,6 +54,7 @@ class TaskSettings:
         name: of the run; its folder is `runs`/`name`.
         cache: folder of the data, which is made where it is missing, by so many processes (`jobs`), or those of a Dask cluster.
         part: [k, n]: make every n-th item of the data from the k-th on, for machines that share nothing.
+        plugins: modules that are imported first, as they register something (`topomerge.registry`).
         resume: go on where the run of this name stopped, with the same settings; overwrite: replace that run.
         export: where the best weights go at the end: `package`, or a folder; empty: they stay in the run's.
     """
@@ -50,6 +67,7 @@ class TaskSettings:
     jobs: int = 1
     cluster: str | None = None
     part: list[int] = field(default_factory=lambda: [1, 1])
+    plugins: list[str] = field(default_factory=list)
     resume: bool = False
     overwrite: bool = False
     tensorboard: bool = True
@@ -60,6 +78,23 @@ class TaskSettings:
         """Where the run is written."""
         return Path(self.runs) / self.name
 
+    def check(self) -> None:
+        """Refuse what makes no sense; a task with keys of its own checks these, too.
+
+        Raises:
+            InputError: names the key.
+        """
+        check_numbers(asdict(self))
+        keys = ("epochs", "batch", "steps", "hidden", "networks", "hypotheses", "inspected")
+        at_least = {**dict.fromkeys(keys, 1), "jobs": 1, "patience": 0, "seed": 0, "warmup": 0, "folds": 2, "hold_out": 2}
+        for key, least in at_least.items():
+            if getattr(self, key, least) < least:
+                raise InputError(f"{key} must be {least} or more, not {getattr(self, key)}")
+        data = getattr(getattr(self, "data", None), "name", "")
+        if data in DATASETS and not hasattr(self, "path"):
+            raise InputError(f"data={data}: is for tasks that learn from pairs of maps, not for {self.task}")
+        _check_run_name(self)
+
 
 @dataclass
 class NetworkTask(TaskSettings):
@@ -67,6 +102,7 @@ class NetworkTask(TaskSettings):
 
     Args:
         epochs: at most; rate: of learning; decay: of weights; batch: examples a step.
+        optimizer, schedule: of `topomerge.registry`; optimizer_options: of the optimizer, by name.
         patience: epochs without a better validation after which it ends; 0: never.
         hold_out: the scans of every n-th physical building are watched and train nothing.
         watch: what is best: a score of validation.
@@ -76,9 +112,21 @@ class NetworkTask(TaskSettings):
     batch: int = 8
     rate: float = 2e-3
     decay: float = 1e-3
+    optimizer: str = "adamw"
+    optimizer_options: dict[str, float] = field(default_factory=dict)
+    schedule: str = "cosine"
     patience: int = 0
     hold_out: int = 8
     watch: str = ""
+
+    def check(self) -> None:
+        """Refuse what makes no sense."""
+        super().check()
+        check_descent(self)
+        if not self.rate > 0:
+            raise InputError(f"rate must be above 0, not {self.rate}")
+        if self.decay < 0:
+            raise InputError(f"decay must be 0 or more, not {self.decay}")
 
 
 @dataclass
@@ -90,6 +138,12 @@ class RasterTask(NetworkTask):
     """
 
     accelerator: str = "cpu"
+
+    def check(self) -> None:
+        """Refuse what makes no sense."""
+        super().check()
+        if self.accelerator not in ("cpu", "cuda"):
+            raise InputError(f"accelerator must be cpu or cuda, not {self.accelerator!r}")
 
 
 FREEZE = {"": (), "geometry": ("geometry",), "encoders": ("geometry", "node")}  # parts of `Embedder` that stay as they are
@@ -139,6 +193,8 @@ class Training:
     name: of the run; its folder is `runs`/`name`.
     data: name of the set of pairs to train on: `cache`/`data`.jsonl, or the path of a manifest or packed file.
     validation: likewise of the set to watch; empty: a tenth of the training buildings is held out.
+    plugins: modules that are imported first, as they register something (`topomerge.registry`).
+    optimizer, schedule: of `topomerge.registry`; optimizer_options: of the optimizer, by name.
     path: of ``data=folder``: a folder of captures with a `pairs.yaml`; its own pairs are watched, where `validation` is not set.
     limit: of the first pairs only; 0: all.
     epochs: at most; rate: of learning, rises over `warmup` of all steps and falls to nothing.
@@ -173,6 +229,9 @@ class Training:
     decay: float = 1e-4
     warmup: float = 0.05
     clip: float = 1.0
+    optimizer: str = "adamw"
+    optimizer_options: dict[str, float] = field(default_factory=dict)
+    schedule: str = "cosine"
     patience: int = 8
     watch: str = "recall@1"
     accelerator: str = "cpu"
@@ -190,6 +249,7 @@ class Training:
     overwrite: bool = False
     tensorboard: bool = True
     export: str = ""
+    plugins: list[str] = field(default_factory=list)
     network: Network = field(default_factory=Network)
     loss: LossSettings = field(default_factory=LossSettings)
     augment: Augment = field(default_factory=Augment)
@@ -206,8 +266,10 @@ def check(settings: Training) -> None:
     Raises:
         InputError: names the key.
     """
-    if settings.task != "embedding":
-        raise InputError(f"task must be embedding, not {settings.task!r}: the other tasks need Hydra, python train.py task=...")
+    if settings.task != Training.task:
+        raise InputError(
+            f"task must be {Training.task}, not {settings.task!r}: the other tasks need Hydra, python train.py task=..."
+        )
     check_numbers(asdict(settings))
     check_network(settings.network)
     check_loss(settings.loss)
@@ -241,8 +303,8 @@ def check(settings: Training) -> None:
     if settings.freeze and not (settings.init_from or (settings.freeze == "geometry" and settings.geometry_from)):
         of = "init_from=<run> or geometry_from=<run>" if settings.freeze == "geometry" else "init_from=<run>"
         raise InputError(f"freeze={settings.freeze} needs {of}, or random weights would be frozen")
-    if not settings.name or Path(settings.name).is_absolute() or ".." in Path(settings.name).parts:
-        raise InputError(f"name must name a folder inside {settings.runs}, not {settings.name!r}")
+    check_descent(settings)
+    _check_run_name(settings)
 
 
 def build_recipe_schema() -> type[Training]:
@@ -296,6 +358,7 @@ def parse_settings(values: Any) -> Training:
     if not isinstance(values, Mapping):
         raise InputError(f"settings must be a table of keys, not {type(values).__name__}")
     values = dict(values)
+    load_plugins(values["plugins"] if isinstance(values.get("plugins"), list) else [])
     parts: dict[str, Any] = {"network": build_network(values.pop("network", {}))}
     for key, kind in (("loss", LossSettings), ("augment", Augment)):
         parts[key] = _parse_dataclass(kind, values.pop(key, {}), f"{key}.")

@@ -16,10 +16,10 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.archive import replace_on_success
+from topomerge.registry import TASKS, load_plugins
 from topomerge.statistics import estimate_mean
 from topomerge.training.provenance import MAY_CHANGE
-
-SHOWN = ("recall@1", "recall@1_single", "recall@1_twin", "recall@5", "mrr", "precision", "recall", "f1", "merged")
+from topomerge.training.tasks import DEFAULT_TASK
 
 
 class SweepTable:
@@ -48,9 +48,7 @@ def write_table(folder: str | Path) -> Path:
     if not rows:
         raise InputError(f"{folder}: no runs in it")
     rows.sort(key=lambda row: -row["best"])
-    columns = ["run", "geometry", "node", "edges", "loss", "seed", *SHOWN, "epoch", "s an epoch"]
-    if any("geometry" not in row for row in rows):  # of other tasks: all their scores
-        columns = list(dict.fromkeys(name for row in rows for name in row if name not in ("best", "geometry", "same")))
+    columns = list(dict.fromkeys(name for row in rows for name in row if name not in ("best", "same")))
     lines = _table(rows, columns)
     if gathered := gather_seeds(rows):
         lines += [
@@ -99,35 +97,20 @@ def _read_best_epoch(run: Path) -> dict[str, Any] | None:
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
     if not rows:
         return None
-    best = max(rows, key=lambda row: float(row[f"val/{config['watch']}"]))
-    score = float(best[f"val/{config['watch']}"])
-    seconds = sum(float(row["seconds"]) for row in rows) / len(rows)
+    load_plugins(config.get("plugins", []))
+    task = TASKS[config.get("task", DEFAULT_TASK)]
+    sign = -1 if config["watch"] in task.lower else 1
+    best = max(rows, key=lambda row: sign * float(row[f"val/{config['watch']}"]))
     same = json.dumps({key: value for key, value in config.items() if key not in MAY_CHANGE - {"epochs", "patience"} | {"seed"}})
-    if config.get("task", "embedding") != "embedding":
-        scores = {name.removeprefix("val/"): value for name, value in best.items() if name.startswith("val/")}
-        row = {"run": run.name, "best": score, "same": same, "seed": config["seed"], **scores}
-        return {**row, "epoch": best["epoch"] + 1, "s an epoch": seconds}
-    geometry, node = config["network"]["geometry"], config["network"]["node"]
     return {
         "run": run.name,
-        "best": score,
+        "best": sign * float(best[f"val/{config['watch']}"]),
         "same": same,
-        "geometry": "+".join(geometry["parts"]),
-        "node": node["kind"] if node["kind"] == "none" else f"{node['kind']} {node['layers']}",
-        "edges": "–"
-        if node["kind"] == "none" or not node["edges"]
-        else "near doors"
-        if node["doors"] and node["near"]
-        else "doors"
-        if node["doors"]
-        else f"rooms within {node['around']:g} m"
-        if node.get("around")
-        else "yes",
-        "loss": config["loss"]["kind"],
+        **task.describe(config),
         "seed": config["seed"],
-        **{name: best.get(f"val/{name}", "–") for name in SHOWN},
+        **{name: best.get(f"val/{name}", "–") for name in task.scores},
         "epoch": best["epoch"] + 1,
-        "s an epoch": seconds,
+        "s an epoch": sum(float(row["seconds"]) for row in rows) / len(rows),
     }
 
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from topomerge.datasets.pairs.grid_pairs import GridRecipe
 from topomerge.datasets.pairs.items import Recipe
 from topomerge.datasets.pairs.lookalikes import LookalikeRecipe
+from topomerge.datasets.pairs.own_pairs import check_own_path
+from topomerge.errors import InputError
 from topomerge.training.settings import NetworkTask, RasterTask, TaskSettings
 
 LOOKALIKES_TAKEN = ("none", "judged", "fitted")
@@ -54,6 +56,12 @@ class PlaceEvidence(RasterTask):
     augment: PlaceAugment = field(default_factory=PlaceAugment)
     watch: str = "auc"
 
+    def check(self) -> None:
+        """Refuse what makes no sense."""
+        super().check()
+        if self.half not in (0, 1, 2):
+            raise InputError(f"half must be 0, 1 or 2, not {self.half}")
+
 
 @dataclass
 class MergeBelief(TaskSettings):
@@ -98,6 +106,23 @@ class MergeBelief(TaskSettings):
     alike_heldout: LookalikeRecipe = field(default_factory=LookalikeRecipe)
     watch: str = "right_believed"
 
+    def check(self) -> None:
+        """Refuse what makes no sense."""
+        super().check()
+        for key in ("pose_strength", "winner_strength", "kinds_strength"):
+            if not getattr(self, key) > 0:
+                raise InputError(f"{key} must be above 0, not {getattr(self, key)}")
+        if not 0 < self.risk <= 1000:
+            raise InputError(f"risk must be above 0 and at most 1000, not {self.risk}")
+        if not 0 <= self.floor <= 10:
+            raise InputError(f"floor must be 0 to 10, not {self.floor}")
+        if self.lookalikes not in LOOKALIKES_TAKEN:
+            raise InputError(f"lookalikes must be {', '.join(LOOKALIKES_TAKEN)}, not {self.lookalikes!r}")
+        if self.refit not in ("all", "closely", "plan"):
+            raise InputError(f"refit must be all, closely or plan, not {self.refit!r}")
+        if len(self.halves) not in (0, 2):
+            raise InputError(f"halves must name two runs, not {self.halves}")
+
 
 @dataclass
 class RoomMatching(NetworkTask):
@@ -130,6 +155,11 @@ class RoomMatching(NetworkTask):
     rate: float = 1e-3
     steps: int = 50
     watch: str = "f1"
+
+    def check(self) -> None:
+        """Refuse what makes no sense."""
+        super().check()
+        check_own_path(self.data.name, self.path)
 
 
 @dataclass

@@ -1,118 +1,94 @@
-"""The tasks of `train.py` and `evaluate.py`: every learned part that ships."""
+"""What a task of `train.py` and `evaluate.py` is; every learned part that ships is one (`topomerge.registry.TASKS`)."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from topomerge.errors import InputError
 from topomerge.io.archive import find_weights_file, replace_on_success
+from topomerge.registry import TASKS, load_plugins
 from topomerge.types import LogFn
+
+DEFAULT_TASK = "embedding"  # of `train.py`
+
+
+def check_settings(settings: Any) -> Any:
+    """Check composed settings, and return them."""
+    settings.check()
+    return settings
+
+
+def refuse_judgement(settings: Any, file: Path, log_line: LogFn) -> dict[str, Any]:
+    """Tell that a task cannot be judged on its own.
+
+    Raises:
+        InputError: always.
+    """
+    raise InputError(f"task={settings.task}: has no judge; its scores stand in {settings.folder / 'metrics.jsonl'}")
 
 
 @dataclass(frozen=True)
 class Task:
-    """A learned part.
+    """A part that is learned: its module, which registers it in `topomerge.registry.TASKS`, has its data, network and loss.
 
     Args:
-        module: of `topomerge.training`: its function `fit(settings, say)` trains, `judge(settings, file, say)` gives the scores
-            of a file of weights on buildings that trained nothing.
-        schema: its settings, in the module `settings` of `topomerge.training`.
-        package, file: where its weights ship.
-        hours: that `make weights` takes for it on two cores, about; once it ran, what it took stands instead.
+        settings: dataclass of its settings, beside `TaskSettings`; what `fit` and `judge` take.
+        fit: trains, leaves a run's folder and exports (`training.loop.run_network`, `training.closed_form.run_fit`).
+        scores: of validation, that may be watched; the more, the better, but of those in `lower`.
+        judge: scores of a file of weights on buildings that trained nothing.
+        package, file: where its weights ship, and their name in `best/` of a run.
+        hours: that `make weights` takes for it on two cores, about; 0: it does not ship.
+        words: beside the defaults, by which what ships is trained; sets: of pairs, that are built before.
+        schema: what Hydra composes, where that is not `settings`; convert: that into checked settings.
+        is_descriptor: what it trains is a descriptor of rooms (`tm.load_embedder`), which `evaluate.py run=` compares.
+        describe: columns of a table of runs, out of the settings of one.
     """
 
-    module: str
-    schema: str
-    package: str
-    file: str
-    hours: float
-    settings: str = "task_settings"
+    settings: type[Any]
+    fit: Callable[[Any, LogFn], Mapping[str, float]]
+    scores: Sequence[str]
+    judge: Callable[[Any, Path, LogFn], Mapping[str, Any]] = refuse_judgement
+    package: str = ""
+    file: str = ""
+    hours: float = 0.0
+    lower: Sequence[str] = ()
+    words: Sequence[str] = ()
+    sets: Sequence[str] = ()
+    schema: Callable[[], type[Any]] | None = None
+    convert: Callable[[Any], Any] = check_settings
+    is_descriptor: bool = False
+    describe: Callable[[Mapping[str, Any]], dict[str, Any]] = lambda config: {}
+
+    def get_schema(self) -> type[Any]:
+        """Return the dataclass that Hydra composes."""
+        return self.settings if self.schema is None else self.schema()
 
 
-TASKS = {
-    "plan_segmentation": Task(
-        "plan_segmentation", "PlanSegmentation", "topomerge.networks", "plan_network.onnx", 5.0, "scan_settings"
-    ),
-    "grid_segmentation": Task(
-        "plan_segmentation", "GridSegmentation", "topomerge.networks", "grid_network.onnx", 1.2, "scan_settings"
-    ),
-    "door_classification": Task(
-        "door_classification", "DoorClassification", "topomerge.extraction.plans", "door_classifier.json", 0.7, "scan_settings"
-    ),
-    "wall_segmentation": Task(
-        "wall_segmentation", "WallSegmentation", "topomerge.networks", "wall_network.onnx", 1.2, "scan_settings"
-    ),
-    "passages": Task("passages", "Passages", "topomerge.extraction", "passages.json", 0.2, "scan_settings"),
-    "wall_doors": Task("wall_doors", "WallDoors", "topomerge.extraction.elevations", "wall_doors.json", 0.2, "scan_settings"),
-    "room_odds": Task("room_odds", "RoomOdds", "topomerge.extraction", "room_odds.json", 0.5, "scan_settings"),
-    "feature_scale": Task("feature_scale", "FeatureScale", "topomerge.embedding", "engineered.json", 0.3),
-    "match_odds": Task("match_odds", "MatchOdds", "topomerge.matching", "odds.json", 0.3),
-    "place_evidence": Task("place_evidence", "PlaceEvidence", "topomerge.networks", "place_network.onnx", 4.0),
-    "match_belief": Task("match_belief", "MatchBelief", "topomerge.fusion", "match_belief.json", 0.3),
-    "merge_belief": Task("merge_belief", "MergeBelief", "topomerge.registration", "calibration.json", 4.0),
-    "embedding": Task("embedding", "", "topomerge.networks", "embedder.onnx", 0.6),
-    "room_matcher": Task("room_matcher", "RoomMatching", "topomerge.networks", "room_matcher.onnx", 0.3),
-}
 RANKINGS = tuple(f"recall@{k}{of}" for k in (1, 5) for of in ("", "_single", "_twin"))
-PLAN_CLASSES = ("inside", "wall", "doorway", "shut", "outside")
-PLAN_SCORES = ("mean_iou", "mean_f1", "accuracy", *(f"{of}_{name}" for of in ("iou", "f1") for name in PLAN_CLASSES))
-SCORES = {  # of each task: what may be watched; the higher, the better
-    "plan_segmentation": PLAN_SCORES,
-    "grid_segmentation": PLAN_SCORES,
-    "door_classification": ("auc", "precision", "recall", "accuracy"),
-    "wall_segmentation": ("f1_doors", "f1_wall", "f1_open", "f1_shut", "f1_window", "f1_half", "f1_niche", "f1_cupboard"),
-    "passages": ("log_loss", "accuracy"),
-    "wall_doors": ("precision", "recall"),
-    "room_odds": ("entered_auc", "whole_auc", "confidence_auc"),
-    "feature_scale": ("recall@1", "recall@5", "mrr"),
-    "match_odds": ("match_accuracy", "hypothesis_accuracy"),
-    "place_evidence": ("auc",),
-    "match_belief": ("attention_all_after_accuracy",),
-    "merge_belief": ("right_believed", "right_first"),
-    "embedding": (*RANKINGS, "recall@1_clear", "recall@5_clear", "mrr", "precision", "recall", "f1", "merged"),
-    "room_matcher": (*RANKINGS, "mrr", "precision", "recall", "f1", "turn"),
-}
 
 
-def register_tasks() -> None:
-    """Let Hydra know the keys of every task."""
-    from topomerge.config import register
-
-    for name in TASKS:
-        register(name, get_schema(name), group="task")
+def get_word(words: Sequence[str], key: str, default: str = "") -> str:
+    """Return the value of the last word ``key=value``."""
+    return next((word[len(key) + 1 :] for word in reversed(words) if word.startswith(f"{key}=")), default)
 
 
-def get_schema(task: str) -> type[Any]:
-    """Return the dataclass of a task's settings.
+def prepare_words(words: Sequence[str]) -> list[str]:
+    """Import the plugins that words of a command line name, let Hydra know the keys of the tasks, and find YAML of plugins.
 
     Raises:
-        InputError: there is no such task.
+        InputError: a plugin cannot be imported, or there is no such task.
     """
-    if task not in TASKS:
-        raise InputError(f"task={task}: {', '.join(TASKS)} are possible")
-    if task == "embedding":
-        from topomerge.training.settings import build_recipe_schema
+    from topomerge.config import find_plugins, register
 
-        return build_recipe_schema()
-    schema: type[Any] = getattr(import_module(f"topomerge.training.{TASKS[task].settings}"), TASKS[task].schema)
-    return schema
-
-
-def parse_task(words: Sequence[str]) -> str:
-    """Parse the task that the words of a command line name; `embedding` where they name none.
-
-    Raises:
-        InputError: there is no such task.
-    """
-    task = next((word[len("task=") :] for word in reversed(words) if word.startswith("task=")), "embedding")
-    get_schema(task)
-    return task
+    ready = find_plugins(words)
+    for task in get_word(words, "task", DEFAULT_TASK).split(","):
+        register(task, TASKS[task].get_schema(), group="task")
+    return ready
 
 
 def compose_settings(words: Sequence[str] = ()) -> Any:
@@ -123,8 +99,9 @@ def compose_settings(words: Sequence[str] = ()) -> Any:
     """
     from topomerge.config import compose
 
-    register_tasks()
-    return _check_settings(compose("train", get_schema(parse_task(words)), words))
+    ready = prepare_words(words)
+    task = TASKS[get_word(words, "task", DEFAULT_TASK)]
+    return task.convert(compose("train", task.get_schema(), ready))
 
 
 def convert_settings(config: Any) -> Any:
@@ -135,18 +112,9 @@ def convert_settings(config: Any) -> Any:
     """
     from topomerge.config import convert_to_dataclass
 
-    return _check_settings(convert_to_dataclass(config, get_schema(str(config.task))))
-
-
-def _check_settings(settings: Any) -> Any:
-    if settings.task == "embedding":
-        from topomerge.training.settings import convert_composed
-
-        return convert_composed(settings)
-    from topomerge.training.task_check import check_task
-
-    check_task(settings)
-    return settings
+    load_plugins(list(config.get("plugins", [])))
+    task = TASKS[str(config.task)]
+    return task.convert(convert_to_dataclass(config, task.get_schema()))
 
 
 def train(settings: Any, log_line: LogFn) -> Mapping[str, float]:
@@ -159,11 +127,8 @@ def train(settings: Any, log_line: LogFn) -> Mapping[str, float]:
         InputError: settings that make no sense, data or a state that can't be read.
         KeyboardInterrupt: after Ctrl-C or SIGTERM.
     """
-    if settings.task != "embedding":  # which does so itself, with and without Hydra
-        check_start(settings)
-    module = import_module(f"topomerge.training.{TASKS[settings.task].module}")
-    scores: Mapping[str, float] = module.fit(settings, log_line)
-    return scores
+    check_start(settings)
+    return TASKS[settings.task].fit(settings, log_line)
 
 
 def check_start(settings: Any) -> None:
@@ -174,7 +139,7 @@ def check_start(settings: Any) -> None:
     """
     from topomerge.training.provenance import check_folder
 
-    possible = SCORES[settings.task]
+    possible = TASKS[settings.task].scores
     if settings.watch not in possible:
         raise InputError(f"watch: unknown {settings.watch!r}; {', '.join(possible)} are possible for task={settings.task}")
     check_accelerator(settings)
@@ -233,16 +198,13 @@ def evaluate_task(task: str, words: Sequence[str], log_line: LogFn) -> Evaluatio
     Raises:
         InputError: a wrong word, no such weights, or no data.
     """
-    if task not in TASKS or task == "embedding":
-        raise InputError(f"task={task}: {', '.join(TASKS)} are possible")
     named = {key: word[len(key) + 1 :] for key in ("run", "folder") for word in words if word.startswith(f"{key}=")}
     rest = [word for word in words if not word.startswith(("run=", "folder="))]
-    settings = compose_settings(rest)
+    settings = compose_settings(rest)  # which imports plugins
     file = find_weights(task, named.get("run", ""))
-    module = import_module(f"topomerge.training.{TASKS[task].module}")
-    scores = dict(module.judge(settings, file, log_line))
+    scores = dict(TASKS[task].judge(settings, file, log_line))
     own = getattr(settings, "path", "")
-    heldout = Path(own).resolve().name if own else settings.heldout.name
+    heldout = Path(own).resolve().name if own else getattr(getattr(settings, "heldout", None), "name", "own")
     folder = Path(named.get("folder", "runs/eval")) / f"{task}-{heldout}"
     digest = hashlib.sha256(file.read_bytes()).hexdigest()
     record = {"task": task, "weights": str(file), "sha256": digest, "heldout": heldout, "scores": scores}

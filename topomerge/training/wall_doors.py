@@ -36,6 +36,7 @@ from topomerge.metrics import match_places
 from topomerge.training.closed_form import FitResult, compute_calibration_error, run_fit
 from topomerge.training.packed_pairs import number_buildings, read_scan_building
 from topomerge.training.scan_settings import WallDoors
+from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn, TopometricMap
 
 FEWEST_DOORS = 5  # among the candidates of a source
@@ -137,3 +138,6 @@ def judge(settings: WallDoors, file: Path, log_line: LogFn) -> dict[str, Any]:
     recipes = (settings.heldout, settings.heldout_frameless, settings.heldout_flat)
     scans = [scan for recipe in recipes for _, scan in build_candidates(recipe, settings, log_line)]
     return score_doors([(compute_door_probability(c, weights), y) for c, y in scans])
+
+
+TASK = Task(WallDoors, fit, ("precision", "recall"), judge, "topomerge.extraction.elevations", "wall_doors.json", hours=0.2)

@@ -31,6 +31,7 @@ from topomerge.networks.network import Run
 from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, run_network
 from topomerge.training.packed_pairs import mark_watched, read_scan_building
 from topomerge.training.scan_settings import WallAugment, WallSegmentation
+from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
 
 COARSE_CLASSES = ("wall", "open", "shut", "window")
@@ -196,3 +197,14 @@ def judge(settings: WallSegmentation, file: Path, log_line: LogFn) -> dict[str, 
     """Return scores of weights on scans of buildings that trained nothing."""
     paths, _ = build_walls(settings.heldout, settings, log_line)
     return {**score_walls([load_walls(path) for path in paths], read_network(file)), "scans": len(paths)}
+
+
+TASK = Task(
+    WallSegmentation,
+    fit,
+    ("f1_doors", "f1_wall", "f1_open", "f1_shut", "f1_window", "f1_half", "f1_niche", "f1_cupboard"),
+    judge,
+    "topomerge.networks",
+    "wall_network.onnx",
+    hours=1.2,
+)

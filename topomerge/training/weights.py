@@ -16,11 +16,10 @@ from pathlib import Path
 from topomerge.datasets.core.builder import run_script
 from topomerge.errors import InputError
 from topomerge.io.archive import replace_on_success
-from topomerge.training.tasks import TASKS, compose_settings, train
+from topomerge.registry import TASKS
+from topomerge.training.tasks import compose_settings, train
 
 RUNS = Path("runs/weights")
-SHIPPED = {"embedding": ["experiment=surroundings"]}  # words beside the defaults
-SETS = {"embedding": ("train_walks", "val_small")}  # that are built before
 
 
 def main(words: Sequence[str]) -> int:
@@ -28,16 +27,17 @@ def main(words: Sequence[str]) -> int:
     if {"-h", "--help"} & set(words):
         print(__doc__)
         return 0
-    only = next((word[5:].split(",") for word in words if word.startswith("only=")), list(TASKS))
+    shipped = [task for task in TASKS if TASKS[task].hours]
+    only = next((word[5:].split(",") for word in words if word.startswith("only=")), shipped)
     runs = Path(next((word[5:] for word in words if word.startswith("runs=")), str(RUNS)))
     shared = [word for word in words if not word.startswith(("only=", "runs="))]
 
     def work() -> None:
-        if unknown := next((task for task in only if task not in TASKS), ""):
-            raise InputError(f"only={unknown}: {', '.join(TASKS)} are possible")
-        for task in [task for task in TASKS if task in only]:
+        if unknown := next((task for task in only if task not in shipped), ""):
+            raise InputError(f"only={unknown}: {', '.join(shipped)} are possible")
+        for task in [task for task in shipped if task in only]:
             seconds = _read_seconds(runs)
-            left = [t for t in TASKS if t in only and not _is_finished(runs, t)]
+            left = [t for t in shipped if t in only and not _is_finished(runs, t)]
             if task not in left:
                 _print_progress(f"{task}: is there ({runs / task})")
                 continue
@@ -54,18 +54,17 @@ def main(words: Sequence[str]) -> int:
 def make_task(task: str, runs: Path, shared: Sequence[str]) -> None:
     """Build the sets of a task where it does not do so itself, and train it, or go on training it."""
     training_words = list(shared)
-    if task == "embedding":
+    if TASKS[task].sets:
         from topomerge.config import compose
         from topomerge.datasets.pairs.build import Build, build
 
         build_words = [word for word in shared if word.partition("=")[0] in ("cache", "jobs", "cluster")]
-        for text in SETS[task]:
-            words = [f"data={text.split()[0]}", *text.split()[1:], *build_words]
-            build(compose("build", Build, words), _print_progress)
+        for name in TASKS[task].sets:
+            build(compose("build", Build, [f"data={name}", *build_words]), _print_progress)
         training_words = [word for word in shared if not word.startswith(("jobs=", "cluster=", "part="))]
     resume = "resume=true" if (runs / task / "last").exists() else "overwrite=true"
     exported = [] if any(word.startswith("export=") for word in shared) else ["export=package"]
-    words = [f"task={task}", *SHIPPED.get(task, []), f"runs={runs}", f"name={task}", resume, *exported, *training_words]
+    words = [f"task={task}", *TASKS[task].words, f"runs={runs}", f"name={task}", resume, *exported, *training_words]
     train(compose_settings(words), _print_progress)
 
 

@@ -414,7 +414,7 @@ def test_a_path_needs_its_data_and_data_its_path(houses: Path) -> None:
             compose_settings([f"task={task}", "data=folder"])
         with pytest.raises(InputError, match="is of data=folder, not of data=train_small"):
             compose_settings([f"task={task}", "data=train_small", f"path={houses}"])
-    with pytest.raises(InputError, match="data=folder: is for the tasks embedding and room_matcher"):
+    with pytest.raises(InputError, match="data=folder: is for tasks that learn from pairs of maps, not for match_odds"):
         compose_settings(["task=match_odds", "data=folder"])
     settings = Evaluation(descriptors={"engineered": {"name": "engineered"}}, only=["engineered"])
     settings.data.name = "folder"
