@@ -26,6 +26,7 @@ RANKS = {
     "extraction": 3,
     "embedding": 4,
     "matching": 5,
+    "landmarks": 5.2,  # testimony beyond walls
     "registration": 5.5,
     "fusion": 6,
     "viz": 7,

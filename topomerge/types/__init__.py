@@ -5,6 +5,7 @@ points of map b into the frame of map a. A room label of -1 means "no room".
 """
 
 from topomerge.types.grid import Array, LogFn, PointCloud, Sim3, TrueRoom, VoxelGrid, select_lowest_of_column
+from topomerge.types.landmarks import LANDMARK_DTYPE, LANDMARK_KINDS, Landmarks, build_landmarks, join_landmarks, move_landmarks
 from topomerge.types.placement import Deformation, Placement
 from topomerge.types.topometric_map import (
     AREA_DTYPE,
@@ -34,6 +35,8 @@ __all__ = [
     "AREA_DTYPE",
     "EDGE_DTYPE",
     "JOINED",
+    "LANDMARK_DTYPE",
+    "LANDMARK_KINDS",
     "LEVELLED",
     "OLDER_EDGE_DTYPE",
     "ROOM_DTYPE",
@@ -42,6 +45,7 @@ __all__ = [
     "WINDOW_DTYPE",
     "Array",
     "Deformation",
+    "Landmarks",
     "LogFn",
     "Placement",
     "PointCloud",
@@ -50,12 +54,15 @@ __all__ = [
     "TrueRoom",
     "VoxelGrid",
     "add_outline_odds",
+    "build_landmarks",
     "classify_door_state",
     "convert_pose_to_files",
     "convert_pose_to_maps",
     "filter_confident",
     "is_level",
     "is_mostly_unseen",
+    "join_landmarks",
+    "move_landmarks",
     "parse_levelling",
     "read_levelling",
     "select_lowest_of_column",

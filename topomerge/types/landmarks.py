@@ -117,7 +117,7 @@ def join_landmarks(parts: Iterable[Landmarks]) -> Landmarks:
 def move_landmarks(landmarks: Landmarks, pose: Sim3) -> Landmarks:
     """Carry landmarks into another frame: positions, their uncertainty, and headings of tags and signs."""
     table = landmarks.table.copy()
-    table["position"] = pose.transform_points(table["position"])
+    table["position"] = pose.apply(table["position"])
     table["sigma"] *= pose.scale
     turned = landmarks.is_kind("tag", "text")
     table["number"][turned] = (table["number"][turned] + pose.yaw + np.pi) % (2 * np.pi) - np.pi

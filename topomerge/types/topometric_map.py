@@ -11,6 +11,7 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.types.grid import Array, Sim3, VoxelGrid, require
+from topomerge.types.landmarks import Landmarks
 
 LEVELLED = "levelled"  # parameter of a map whose cloud was tilted: the matrix, row by row
 ROUNDING = 1e-9  # by which a rotation in a file may miss one
@@ -187,6 +188,7 @@ class TopometricMap:
         parameters: what it was extracted with.
         seconds: step -> s.
         warnings: what the user should know.
+        landmarks: signs, tags, radio, pressure, objects and names, in the frame of the map.
     """
 
     grid: VoxelGrid
@@ -206,6 +208,7 @@ class TopometricMap:
     parameters: Mapping[str, Any] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    landmarks: Landmarks = field(default_factory=Landmarks)
 
     def __post_init__(self) -> None:
         require(self.room.shape == (len(self.grid),), "room must have one label an occupied cell")
@@ -236,6 +239,9 @@ class TopometricMap:
         require(bool((first != second).all()), "a window must not lead from a room into itself")
         storey = self.rooms["storey"]
         require(not len(storey) or (storey.min() >= 0 and storey.max() < len(self.storeys)), "a room's storey is missing")
+        for column, most in (("room", len(self.rooms)), ("storey", len(self.storeys))):
+            number = self.landmarks.table[column]
+            require(not len(number) or (number.min() >= -1 and number.max() < most), f"a landmark's {column} does not exist")
         require(self.provenance is None or len(self.provenance) == len(self.grid), "provenance: one value a cell")
 
     @property
@@ -271,7 +277,7 @@ def select_rooms(map: TopometricMap, stays: Array) -> TopometricMap:
     """Return the map of some of its rooms, numbered anew in their order.
 
     Cells of the others are of no room, and their areas, doors and stairs are left out. A window of theirs stays
-    where the room on its other side does; it then leads to where nothing was seen. Storeys stay.
+    where the room on its other side does; it then leads to where nothing was seen. Storeys and landmarks stay.
 
     Args:
         map: any map.
@@ -289,6 +295,8 @@ def select_rooms(map: TopometricMap, stays: Array) -> TopometricMap:
     ends = number[windows["rooms"]]
     both = (ends >= 0).all(axis=1, keepdims=True)
     windows["rooms"] = np.where(both, np.sort(ends, axis=1), -np.sort(-ends, axis=1))
+    landmarks = map.landmarks.table.copy()
+    landmarks["room"] = number[landmarks["room"]]
     assert map.navigable_area is not None
     return replace(
         map,
@@ -300,6 +308,7 @@ def select_rooms(map: TopometricMap, stays: Array) -> TopometricMap:
         navigable_area=area_number[map.navigable_area],
         narrows=narrows,
         windows=windows[windows["rooms"][:, 0] >= 0],
+        landmarks=replace(map.landmarks, table=landmarks),
     )
 
 
