@@ -22,7 +22,7 @@ RANKS = {
     "structure": 1.5,  # what exports draw
     "io": 2,
     "numpy_nn": 2,
-    "networks": 2.5,
+    "networks": 1.9,  # pictures of plans are read by one
     "extraction": 3,
     "embedding": 4,
     "matching": 5,
@@ -42,6 +42,7 @@ RANKS = {
     "cli": 13,
     "__main__": 15,
 }
+FILES = ("topomerge.io.archive", "topomerge.io.listing", "topomerge.io.piece")  # below all formats
 HEAVY = ("torch", "torch_geometric", "lightning_fabric", "hydra", "omegaconf", "open3d", "laspy", "pye57", "ifcopenshell")
 HEAVY += ("onnxruntime", "onnx")
 HEAVY += ("trimesh", "rosbags")
@@ -104,6 +105,8 @@ def test_imports_go_one_way(package, module, path):
         if first == "topomerge" and rest:
             other = rest[0]
             if other == package or other not in RANKS:
+                continue
+            if name.startswith(FILES) and package == "networks":
                 continue
             assert RANKS[other] < RANKS[package], f"{where}: {package} must not import {other}"
 

@@ -40,6 +40,7 @@ MODULES = {
     "doors": "doors",
     "windows": "windows",
     "walls": "walls",
+    "drawings": "drawings",
     "merges": "merges",
     "joined": "joined",
     "bending": "bending",

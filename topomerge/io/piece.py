@@ -126,7 +126,8 @@ class ReadOptions:
             glTF and z for all others.
         unit: of the file's coordinates: "m", "cm", "mm", "ft" or "in"; None: metres.
         scale: factor on the coordinates, beside the unit.
-        resolution: m per pixel; needed for an image without a map_server file.
+        resolution: m per pixel of an image without a map_server file; of a drawing None: by what is written on it.
+        drawing: read an image of a page as a drawn plan; False: its dark pixels are walls.
         extrude: height of the walls made from a floor plan, m.
         ceiling: also close a floor plan from above.
         spacing: distance between points sampled on meshes, building models and floor plans, m; None: 0.05 m for surfaces
@@ -142,6 +143,7 @@ class ReadOptions:
     unit: str | None = None
     scale: float = 1.0
     resolution: float | None = None
+    drawing: bool = True
     extrude: float = 2.5
     ceiling: bool = False
     spacing: float | None = None

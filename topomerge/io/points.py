@@ -275,7 +275,7 @@ class Format:
 
 
 PICTURES = (".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-DRAWN = ("resolution", "extrude", "ceiling")  # options of drawings, whose walls are raised
+DRAWN = ("resolution", "drawing", "extrude", "ceiling")  # options of drawings, whose walls are raised
 FORMATS = (
     Format("a PLY file", "ply", (".ply",)),
     Format("a PCD file", "pcd", (".pcd",)),
