@@ -35,18 +35,6 @@ WALL_NEAR, DOOR_NEAR, SCALE_NEAR = 0.1, 0.5, 0.03  # m, m, share
 EVERY = {"r2v": 3, "campus": 1, "procedural": 1}  # of a source's plans, every n-th
 COLUMNS = ("pages", "of", "rooms' IoU", "precision", "recall", "walls' F1", "doors found", "doors right", "names", "scale")
 COLUMNS += ("outside",)
-    "pages",
-    "of",
-    "rooms' IoU",
-    "precision",
-    "recall",
-    "walls' F1",
-    "doors found",
-    "doors right",
-    "names",
-    "scale",
-    "outside",
-)
 
 
 @dataclass
