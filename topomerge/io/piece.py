@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from numbers import Real
 from pathlib import Path
 from typing import IO, Any
@@ -19,7 +19,7 @@ import numpy as np
 
 from topomerge.errors import InputError, is_memory_short
 from topomerge.io.frame import TURNS, UNITS
-from topomerge.types import Array, TrueRoom, VoxelGrid
+from topomerge.types import LANDMARK_DTYPE, Array, Landmarks, TrueRoom, VoxelGrid
 
 LFS_POINTER = b"version https://git-lfs.github.com/spec/v1"
 BLOCK_POINTS = 1 << 19  # points a reader hands over at a time
@@ -41,6 +41,8 @@ class Piece:
     warnings: tuple[str, ...] = ()
     done: float = 0.0  # share of the file read so far
     intensities: Array | None = None  # (n,) float32, in whatever the file counts in
+    classes: Array | None = None  # (n,) int32, of what the points lie on, as the file counts them; -1: none
+    landmarks: Landmarks = field(default_factory=Landmarks)  # in the file's frame and unit
 
 
 def refuse_pointer(path: Path) -> None:
@@ -136,6 +138,7 @@ class ReadOptions:
             of a topic with poses. None: what lies beside the scans, or what the bag holds.
         one_frame: read all files of a folder as parts of one cloud, whose points lie in one frame.
         topic: of a bag, where it has several with points or maps.
+        text: read signs and tags on pictures. True: must; None: where the packages for that are installed; False: don't.
     """
 
     up: str | None = None
@@ -149,6 +152,7 @@ class ReadOptions:
     poses: str | None = None
     topic: str | None = None
     one_frame: bool = False
+    text: bool | None = None
 
     @property
     def factor(self) -> float:
@@ -156,7 +160,7 @@ class ReadOptions:
         return UNITS[self.unit or "m"] * self.scale
 
 
-OPTION_NAMES = tuple(field.name for field in fields(ReadOptions))
+OPTION_NAMES = tuple(option.name for option in fields(ReadOptions))
 LENGTH_NAMES = ("scale", "resolution", "extrude", "spacing")
 
 
@@ -253,7 +257,7 @@ ARRAYS = {  # of a piece
 def read_in_subprocess(
     module: str, kind: str, path: Path, options: ReadOptions, seconds: int | None = None, room: int | None = None
 ) -> Iterator[Piece]:
-    """Yield the pieces of ``module.read_in_process(path, options)``, labels and free space left out.
+    """Yield the pieces of ``module.read_in_process(path, options)``, labels, classes and free space left out.
 
     Args:
         module: of `topomerge.io`.
@@ -295,14 +299,21 @@ def _receive_piece(path: Path, kind: str, stream: IO[bytes]) -> Piece | None:
         raise build_damage_error(path, kind, header["fault"])
     arrays: dict[str, Any] = {name: _receive_array(stream, ARRAYS[name], shape) for name, shape in header["arrays"].items()}
     rooms = tuple(TrueRoom(**{**room, "polygon": np.array(room["polygon"], float).reshape(-1, 2)}) for room in header["rooms"])
-    return replace(Piece(**arrays), rooms=rooms, warnings=tuple(header["warnings"]), done=header["done"])
+    values, sources, size = header["landmarks"]
+    table = np.frombuffer(_read_exactly(stream, size), LANDMARK_DTYPE)
+    landmarks = Landmarks(table, tuple(values), tuple(sources))
+    return replace(Piece(**arrays), rooms=rooms, warnings=tuple(header["warnings"]), landmarks=landmarks, done=header["done"])
 
 
 def _receive_array(stream: IO[bytes], kind: Any, shape: list[int]) -> Array:
-    data = stream.read(int(np.prod(shape)) * np.dtype(kind).itemsize)
-    if len(data) < int(np.prod(shape)) * np.dtype(kind).itemsize:
+    return np.frombuffer(_read_exactly(stream, int(np.prod(shape)) * np.dtype(kind).itemsize), kind).reshape(shape)
+
+
+def _read_exactly(stream: IO[bytes], size: int) -> bytes:
+    data = stream.read(size)
+    if len(data) < size:
         raise EOFError
-    return np.frombuffer(data, kind).reshape(shape)
+    return data
 
 
 def main() -> None:
@@ -328,8 +339,10 @@ def _iter_messages(
             arrays = {name: getattr(piece, name) for name in ARRAYS}
             given = {name: np.ascontiguousarray(v, ARRAYS[name]) for name, v in arrays.items() if v is not None}
             rooms = [{**vars(room), "polygon": np.asarray(room.polygon).tolist()} for room in piece.rooms]
-            header = {"arrays": {name: v.shape for name, v in given.items()}, "rooms": rooms}
-            yield {**header, "warnings": piece.warnings, "done": piece.done}, list(given.values())
+            header: dict[str, Any] = {"arrays": {name: v.shape for name, v in given.items()}, "rooms": rooms}
+            found = piece.landmarks
+            header["landmarks"] = (found.values, found.sources, found.table.nbytes)
+            yield {**header, "warnings": piece.warnings, "done": piece.done}, [*given.values(), found.table.view("u1")]
             limit(seconds=seconds)
     except InputError as error:
         yield {"refused": str(error)}, []

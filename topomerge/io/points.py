@@ -23,7 +23,8 @@ from topomerge.errors import InputError, is_memory_short
 from topomerge.io import frame
 from topomerge.io.frame import get_axis_rotation
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_options, refuse_pointer
-from topomerge.types import Array, PointCloud, TrueRoom, VoxelGrid
+from topomerge.io.sightings import ObjectFinder
+from topomerge.types import Array, Landmarks, PointCloud, TrueRoom, VoxelGrid, join_landmarks
 
 LARGE, HIGH = 2000.0, 100.0  # m, extents beyond what is scanned as one building
 SLAB_THICKNESS = 0.1  # m
@@ -188,6 +189,8 @@ class Gatherer:
         self.poses: Array | None = None
         self.free: VoxelGrid | None = None
         self.rooms: tuple[TrueRoom, ...] = ()
+        self.landmarks: list[Landmarks] = []
+        self.objects = ObjectFinder()
         self.pending: PointCloud | None = None  # the last full cloud, held back because the last one carries the warnings
 
     def add(self, piece: Piece) -> Iterator[PointCloud]:
@@ -214,12 +217,15 @@ class Gatherer:
         if self.dropped:
             self.warnings.append(f"{self.dropped:,} points were not finite and are left out")
         self.warnings += warn_about(self.sample.points, self.up)
-        yield replace(self.pending, warnings=tuple(dict.fromkeys(self.warnings)))
+        found = join_landmarks([*self.landmarks, self.objects.find_objects("classes of points")])
+        yield replace(self.pending, warnings=tuple(dict.fromkeys(self.warnings)), landmarks=found if len(found) else None)
 
     def _update_metadata(self, piece: Piece) -> None:
         """Keep what a piece says about the whole file."""
         self.warnings += piece.warnings
         self.rooms += frame.scale_rooms(piece.rooms, self.factor)
+        if len(piece.landmarks):
+            self.landmarks.append(frame.transform_landmarks(piece.landmarks, self.rotation, self.factor))
         if piece.poses is not None:
             placed = frame.transform_poses(piece.poses, self.rotation, self.factor)
             self.poses = placed if self.poses is None else np.concatenate([self.poses, placed])
@@ -228,6 +234,8 @@ class Gatherer:
 
     def _transform_piece(self, piece: Piece) -> _Part:
         points = frame.transform_points(piece.points, self.rotation, self.factor)
+        if piece.classes is not None:
+            self.objects.add(points, piece.classes)
         part = _Part(points, piece.colors, piece.labels, piece.pose_of, piece.intensities)
         if not (points.min() > -BEYOND and points.max() < BEYOND):  # so of nan, too
             finite = np.asarray((np.abs(points) < BEYOND).all(axis=1))
@@ -316,7 +324,7 @@ def read_points(path: str | Path, *, progress: Progress | None = None, **options
         progress: called now and then with the share done and a text.
         options: those of `topomerge.io.piece.ReadOptions`: ``up``, ``unit``, ``scale`` of the coordinates; ``resolution``,
             ``extrude``, ``ceiling`` of floor plans; ``spacing`` of points on surfaces; ``doors`` of building models; ``poses``
-            and ``topic`` of scans; ``one_frame`` of a folder whose files are parts of one cloud.
+            and ``topic`` of scans; ``one_frame`` of a folder whose files are parts of one cloud; ``text`` of pictures.
 
     Raises:
         InputError: anything that keeps the file from being read, or a wrong option, in one line.
@@ -329,8 +337,8 @@ def read_chunks(
 ) -> Iterator[PointCloud]:
     """Read the points of a file as clouds of at most `chunk` points, for files larger than memory.
 
-    All clouds share one shift. Poses, free space and true rooms come with the first, warnings about the whole file with the
-    last. Meshes, building models, OctoMaps and NumPy archives are read whole and then cut.
+    All clouds share one shift. Poses, free space and true rooms come with the first, landmarks and warnings about the whole file
+    with the last. Meshes, building models, OctoMaps and NumPy archives are read whole and then cut.
 
     Args:
         path: of the file or folder.

@@ -5,7 +5,15 @@ points of map b into the frame of map a. A room label of -1 means "no room".
 """
 
 from topomerge.types.grid import Array, LogFn, PointCloud, Sim3, TrueRoom, VoxelGrid, select_lowest_of_column
-from topomerge.types.landmarks import LANDMARK_DTYPE, LANDMARK_KINDS, Landmarks, build_landmarks, join_landmarks, move_landmarks
+from topomerge.types.landmarks import (
+    LANDMARK_DTYPE,
+    LANDMARK_KINDS,
+    Landmarks,
+    build_landmarks,
+    join_landmarks,
+    move_landmarks,
+    transform_landmarks,
+)
 from topomerge.types.placement import Deformation, Placement
 from topomerge.types.topometric_map import (
     AREA_DTYPE,
@@ -67,5 +75,6 @@ __all__ = [
     "read_levelling",
     "select_lowest_of_column",
     "select_rooms",
+    "transform_landmarks",
     "transform_points",
 ]

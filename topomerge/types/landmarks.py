@@ -10,6 +10,7 @@ import numpy as np
 from topomerge.types.grid import Array, Sim3, require
 
 LANDMARK_KINDS = ("text", "tag", "radio", "pressure", "object", "name")
+LEVEL = 0.5  # of a unit vector: its part along z up to which it has a heading
 LANDMARK_DTYPE = np.dtype(
     [
         ("kind", "u1"),  # index into LANDMARK_KINDS
@@ -114,11 +115,24 @@ def join_landmarks(parts: Iterable[Landmarks]) -> Landmarks:
     return Landmarks(np.concatenate(tables), tuple(values), tuple(sources))
 
 
+def transform_landmarks(landmarks: Landmarks, matrix: Array, scale: float = 1.0) -> Landmarks:
+    """Carry landmarks into another frame by a motion (4, 4), which may also tilt them; a heading that is no longer level is lost.
+
+    Args:
+        landmarks: any.
+        matrix: p -> R p + t; R may be `scale` times a rotation.
+        scale: of lengths.
+    """
+    table = landmarks.table.copy()
+    table["position"] = table["position"] @ matrix[:3, :3].T + matrix[:3, 3]
+    table["sigma"] *= scale
+    turned = landmarks.is_kind("tag", "text")
+    heading = table["number"][turned]
+    x, y, z = (np.stack([np.cos(heading), np.sin(heading), np.zeros(len(heading))], axis=1) @ matrix[:3, :3].T / scale).T
+    table["number"][turned] = np.where(np.abs(z) <= LEVEL, np.arctan2(y, x), np.nan)
+    return replace(landmarks, table=table)
+
+
 def move_landmarks(landmarks: Landmarks, pose: Sim3) -> Landmarks:
     """Carry landmarks into another frame: positions, their uncertainty, and headings of tags and signs."""
-    table = landmarks.table.copy()
-    table["position"] = pose.apply(table["position"])
-    table["sigma"] *= pose.scale
-    turned = landmarks.is_kind("tag", "text")
-    table["number"][turned] = (table["number"][turned] + pose.yaw + np.pi) % (2 * np.pi) - np.pi
-    return replace(landmarks, table=table)
+    return transform_landmarks(landmarks, pose.matrix, pose.scale)
