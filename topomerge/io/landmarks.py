@@ -116,18 +116,19 @@ def _parse_reals(path: Path, lines: Sequence[int], name: str, texts: Sequence[st
     """(n,) float64, nan where nothing stands."""
     if not texts:
         return np.full(len(lines), np.nan)
+    stripped = [text.strip() for text in texts]
     try:
-        numbers = np.array([text.strip() or "nan" for text in texts], np.float64)
+        numbers = np.array([float(text) if text else math.nan for text in stripped])
     except ValueError:
-        numbers = np.array([_parse_real(text) for text in texts], np.float64)
-    said = np.array([bool(text.strip()) for text in texts], bool)
-    _require(path, lines, np.isfinite(numbers) | ~said, f"{name} is no finite number; write it as 12.5, or leave it empty")
+        numbers = np.array([_parse_real(text) for text in stripped])
+    empty = np.array([not text for text in stripped], bool)
+    _require(path, lines, np.isfinite(numbers) | empty, f"{name} is no finite number; write it as 12.5, or leave it empty")
     return numbers
 
 
 def _parse_real(text: str) -> float:
     try:
-        return float(text.strip() or "nan")
+        return float(text) if text else math.nan
     except ValueError:
         return math.inf
 
