@@ -65,7 +65,9 @@ def wall_texture(far: bool, signs: tuple[Sign, ...]) -> np.ndarray:
             tag = draw_tag(int(sign.text[9:]), int(PIXELS * TAG_SIZE))
             image.paste(tag, (int(x - tag.width / 2), int(y - tag.height / 2)))
             continue
-        font = ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", int(PIXELS * sign.height * 1.35))
+        font = ImageFont.truetype(
+            Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", int(PIXELS * sign.height * 1.35)
+        )
         left, top, right, bottom = draw.textbbox((x, y), sign.text, font, anchor="mm")
         draw.rectangle((left - 20, top - 20, right + 20, bottom + 20), fill=255)
         draw.text((x, y), sign.text, fill=0, font=font, anchor="mm")

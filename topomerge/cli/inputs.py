@@ -127,12 +127,12 @@ def _load_map(path: str, args: argparse.Namespace, start_task: Starter) -> Loade
     Raises:
         InputError: as `iter_input_maps`.
     """
-    from topomerge.io.maps import load_map
+    from topomerge.extraction.landmarks import load_map_with_landmarks
 
     began = time.perf_counter()
     try:
         if is_map(path):
-            topomap = load_map(path)
+            topomap = load_map_with_landmarks(path)
         else:
             from topomerge.extraction.extract import extract
             from topomerge.io.points import read_chunks

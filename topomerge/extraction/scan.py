@@ -39,7 +39,7 @@ class Scan:
         levelling: (4, 4) that took the points of a tilted cloud into the frame of the grid; None where it was level.
         raised: is it a robot's grid or a drawing, whose walls were all raised alike (`slices.is_raised`)?
         flat: is it a slice, in which nothing tells walls from what else stands about (`slices.is_slice`)?
-        landmarks: what its file holds beside points, in the frame of the grid.
+        landmarks: of its file, in the frame of the grid.
     """
 
     grid: VoxelGrid
@@ -108,7 +108,8 @@ def read_scan(
         chunks.warnings.append("the scan is large: doors are read off its plan alone, not off its walls")
     if least_neighbours:
         grid = coarsen_until_dense(grid, least_neighbours, chunks.warnings)
-    scan = Scan(grid, close, chunks.rays, chunks.free, chunks.source, tuple(chunks.warnings), landmarks=chunks.landmarks)
+    landmarks = join_landmarks(chunks.landmarks)
+    scan = Scan(grid, close, chunks.rays, chunks.free, chunks.source, tuple(chunks.warnings), landmarks=landmarks)
     return scan if levelled is None else replace(scan, levelling=levelled.matrix, warnings=(*levelled.warnings, *scan.warnings))
 
 
@@ -140,7 +141,7 @@ class _Chunks:
         self.source = ""
         self.free: VoxelGrid | None = None
         self.warnings: list[str] = []
-        self.landmarks = Landmarks()
+        self.landmarks: list[Landmarks] = []
         self._rays: list[tuple[Array, Array]] = []
         self._step = 1  # of the rays, every one or every second, fourth ... is held
 
@@ -152,8 +153,7 @@ class _Chunks:
             self.source = chunk.source
             self.free = chunk.free or self.free
             self.warnings += [w for w in chunk.warnings if w not in self.warnings]
-            if chunk.landmarks is not None:
-                self.landmarks = join_landmarks([self.landmarks, chunk.landmarks])
+            self.landmarks += [] if chunk.landmarks is None else [chunk.landmarks]
             if chunk.poses is not None and chunk.pose_of is not None and len(chunk):
                 self._add_rays(*_select_rays(chunk, chunk.poses, chunk.pose_of))
             if self.fine is not None:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from topomerge.types import Array, Landmarks, TrueRoom, VoxelGrid
-from topomerge.types import transform_landmarks as apply_motion
+from topomerge.types import Array, TrueRoom, VoxelGrid
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "in": 0.0254}
 FLOAT32_REACH = 1e4  # m from the origin from where float32 would lose millimetres
@@ -54,13 +53,6 @@ def transform_grid(grid: VoxelGrid, rotation: Array, factor: float) -> VoxelGrid
     cells = np.where(signs > 0, cells, shape - 1 - cells)
     nx, ny, nz = (int(s) for s in shape)
     return VoxelGrid.from_cells(cells, origin, grid.edge * factor, (nx, ny, nz), grid.properties)
-
-
-def transform_landmarks(landmarks: Landmarks, rotation: Array, factor: float) -> Landmarks:
-    """Return landmarks in the placed frame."""
-    motion = np.eye(4)
-    motion[:3, :3] = factor * rotation
-    return apply_motion(landmarks, motion, factor)
 
 
 def scale_rooms(rooms: tuple[TrueRoom, ...], factor: float) -> tuple[TrueRoom, ...]:

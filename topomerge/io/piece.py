@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from numbers import Real
 from pathlib import Path
 from typing import IO, Any
@@ -29,7 +29,8 @@ MOST_POINTS = 100_000_000  # points that a sampled or extruded file may become; 
 @dataclass(frozen=True)
 class Piece:
     """Some of the points of a file. `free` and `rooms` describe the whole file and come with its first piece; `poses` come with
-    the first piece whose points need them, and are counted by `pose_of` over all pieces."""
+    the first piece whose points need them, and are counted by `pose_of` over all pieces; `landmarks` come with any, also with
+    one without points."""
 
     points: Array  # (n, 3) float, in the file's frame and unit
     colors: Array | None = None  # (n, 3) uint8
@@ -42,7 +43,7 @@ class Piece:
     done: float = 0.0  # share of the file read so far
     intensities: Array | None = None  # (n,) float32, in whatever the file counts in
     classes: Array | None = None  # (n,) int32, of what the points lie on, as the file counts them; -1: none
-    landmarks: Landmarks = field(default_factory=Landmarks)  # in the file's frame and unit
+    landmarks: Landmarks | None = None  # positions in the file's frame and unit
 
 
 def refuse_pointer(path: Path) -> None:
@@ -160,7 +161,7 @@ class ReadOptions:
         return UNITS[self.unit or "m"] * self.scale
 
 
-OPTION_NAMES = tuple(option.name for option in fields(ReadOptions))
+OPTION_NAMES = tuple(field.name for field in fields(ReadOptions))
 LENGTH_NAMES = ("scale", "resolution", "extrude", "spacing")
 
 
@@ -251,13 +252,14 @@ def decode_colors(rows: np.ndarray[Any, Any]) -> np.ndarray[Any, Any] | None:
 
 ARRAYS = {  # of a piece
     "points": np.float64, "colors": np.uint8, "poses": np.float64, "pose_of": np.int32, "intensities": np.float32,
+    "landmarks": LANDMARK_DTYPE,
 }  # fmt: skip
 
 
 def read_in_subprocess(
     module: str, kind: str, path: Path, options: ReadOptions, seconds: int | None = None, room: int | None = None
 ) -> Iterator[Piece]:
-    """Yield the pieces of ``module.read_in_process(path, options)``, labels, classes and free space left out.
+    """Yield the pieces of ``module.read_in_process(path, options)``, labels and free space left out.
 
     Args:
         module: of `topomerge.io`.
@@ -299,21 +301,16 @@ def _receive_piece(path: Path, kind: str, stream: IO[bytes]) -> Piece | None:
         raise build_damage_error(path, kind, header["fault"])
     arrays: dict[str, Any] = {name: _receive_array(stream, ARRAYS[name], shape) for name, shape in header["arrays"].items()}
     rooms = tuple(TrueRoom(**{**room, "polygon": np.array(room["polygon"], float).reshape(-1, 2)}) for room in header["rooms"])
-    values, sources, size = header["landmarks"]
-    table = np.frombuffer(_read_exactly(stream, size), LANDMARK_DTYPE)
-    landmarks = Landmarks(table, tuple(values), tuple(sources))
-    return replace(Piece(**arrays), rooms=rooms, warnings=tuple(header["warnings"]), landmarks=landmarks, done=header["done"])
+    if "landmarks" in arrays:
+        arrays["landmarks"] = Landmarks(arrays["landmarks"], *map(tuple, header["strings"]))
+    return replace(Piece(**arrays), rooms=rooms, warnings=tuple(header["warnings"]), done=header["done"])
 
 
 def _receive_array(stream: IO[bytes], kind: Any, shape: list[int]) -> Array:
-    return np.frombuffer(_read_exactly(stream, int(np.prod(shape)) * np.dtype(kind).itemsize), kind).reshape(shape)
-
-
-def _read_exactly(stream: IO[bytes], size: int) -> bytes:
-    data = stream.read(size)
-    if len(data) < size:
+    data = stream.read(int(np.prod(shape)) * np.dtype(kind).itemsize)
+    if len(data) < int(np.prod(shape)) * np.dtype(kind).itemsize:
         raise EOFError
-    return data
+    return np.frombuffer(data, kind).reshape(shape)
 
 
 def main() -> None:
@@ -336,13 +333,13 @@ def _iter_messages(
     try:
         limit(seconds=seconds)
         for piece in reader.read_in_process(path, options):
-            arrays = {name: getattr(piece, name) for name in ARRAYS}
+            marks = piece.landmarks
+            arrays = {name: getattr(piece, name) for name in ARRAYS} | {"landmarks": None if marks is None else marks.table}
             given = {name: np.ascontiguousarray(v, ARRAYS[name]) for name, v in arrays.items() if v is not None}
             rooms = [{**vars(room), "polygon": np.asarray(room.polygon).tolist()} for room in piece.rooms]
-            header: dict[str, Any] = {"arrays": {name: v.shape for name, v in given.items()}, "rooms": rooms}
-            found = piece.landmarks
-            header["landmarks"] = (found.values, found.sources, found.table.nbytes)
-            yield {**header, "warnings": piece.warnings, "done": piece.done}, [*given.values(), found.table.view("u1")]
+            header = {"arrays": {name: v.shape for name, v in given.items()}, "rooms": rooms}
+            header["strings"] = [] if marks is None else [marks.values, marks.sources]
+            yield {**header, "warnings": piece.warnings, "done": piece.done}, list(given.values())
             limit(seconds=seconds)
     except InputError as error:
         yield {"refused": str(error)}, []

@@ -14,6 +14,7 @@ import logging
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,9 +23,19 @@ import numpy as np
 from topomerge.errors import InputError, is_memory_short
 from topomerge.io import frame
 from topomerge.io.frame import get_axis_rotation
+from topomerge.io.landmarks import find_landmark_file, read_landmark_file
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_options, refuse_pointer
 from topomerge.io.sightings import ObjectFinder
-from topomerge.types import Array, Landmarks, PointCloud, TrueRoom, VoxelGrid, join_landmarks
+from topomerge.types import (
+    Array,
+    Landmarks,
+    PointCloud,
+    TrueRoom,
+    VoxelGrid,
+    clean_landmarks,
+    join_landmarks,
+    transform_landmarks,
+)
 
 LARGE, HIGH = 2000.0, 100.0  # m, extents beyond what is scanned as one building
 SLAB_THICKNESS = 0.1  # m
@@ -187,10 +198,10 @@ class Gatherer:
         self.parts: list[_Part] = []
         self.size = 0
         self.poses: Array | None = None
-        self.free: VoxelGrid | None = None
-        self.rooms: tuple[TrueRoom, ...] = ()
         self.landmarks: list[Landmarks] = []
         self.objects = ObjectFinder()
+        self.free: VoxelGrid | None = None
+        self.rooms: tuple[TrueRoom, ...] = ()
         self.pending: PointCloud | None = None  # the last full cloud, held back because the last one carries the warnings
 
     def add(self, piece: Piece) -> Iterator[PointCloud]:
@@ -224,11 +235,12 @@ class Gatherer:
         """Keep what a piece says about the whole file."""
         self.warnings += piece.warnings
         self.rooms += frame.scale_rooms(piece.rooms, self.factor)
-        if len(piece.landmarks):
-            self.landmarks.append(frame.transform_landmarks(piece.landmarks, self.rotation, self.factor))
         if piece.poses is not None:
             placed = frame.transform_poses(piece.poses, self.rotation, self.factor)
             self.poses = placed if self.poses is None else np.concatenate([self.poses, placed])
+        if piece.landmarks is not None and len(piece.landmarks):
+            place = partial(frame.transform_points, rotation=self.rotation, factor=self.factor)
+            self.landmarks.append(transform_landmarks(clean_landmarks(piece.landmarks), place, scale=self.factor))
         if piece.free is not None and len(piece.free):
             self.free = frame.transform_grid(piece.free, self.rotation, self.factor)
 
@@ -319,6 +331,8 @@ def list_suffixes() -> tuple[str, ...]:
 def read_points(path: str | Path, *, progress: Progress | None = None, **options: Any) -> PointCloud:
     """Read the points of a file as one cloud, in metres, z up: ``read_points("a.ply", up="y", unit="mm")``.
 
+    Landmarks in a file beside it (docs/landmarks.md) come along.
+
     Args:
         path: the file, whose suffix names the format, or a folder of scans.
         progress: called now and then with the share done and a text.
@@ -337,7 +351,7 @@ def read_chunks(
 ) -> Iterator[PointCloud]:
     """Read the points of a file as clouds of at most `chunk` points, for files larger than memory.
 
-    All clouds share one shift. Poses, free space and true rooms come with the first, landmarks and warnings about the whole file
+    All clouds share one shift. Poses, free space and true rooms come with the first, warnings about the whole file and landmarks
     with the last. Meshes, building models, OctoMaps and NumPy archives are read whole and then cut.
 
     Args:
@@ -365,7 +379,10 @@ def read_chunks(
         reading = replace(reading, unit=None, up=None)
     up = None if file_format.fixed else reading.up or file_format.up
     gatherer = Gatherer(str(path), up, reading.factor, chunk, warnings)
-    return _iter_chunks(path, _iter_pieces(path, file_format, reading), gatherer, progress)
+    pieces = _iter_pieces(path, file_format, reading)
+    if (beside := find_landmark_file(path)) is not None:
+        pieces = itertools.chain([Piece(np.empty((0, 3)), landmarks=read_landmark_file(beside))], pieces)
+    return _iter_chunks(path, pieces, gatherer, progress)
 
 
 def detect_format(path: Path) -> Format:

@@ -192,7 +192,7 @@ class PointCloud:
         warnings: what looked wrong while it was read.
         intensities: (N,) float32, how much of its light came back, in whatever the file counts in.
         upright: z is known to be up, so that nobody needs to level it: of a plan, a building model, a simulated scan.
-        landmarks: what the file holds beside points, in the file's frame, m; None: nothing. They come with the last cloud of it.
+        landmarks: signs, tags, radio, pressure, objects and names in the file's frame, m; of portions the last one has them.
 
     Raises:
         ValueError: arrays of other shapes, or points that are no array of numbers.

@@ -17,6 +17,7 @@ import numpy as np
 from topomerge import __version__
 from topomerge.errors import InputError
 from topomerge.fusion.result import BEND_PARAMETER
+from topomerge.fusion.transfer import LANDMARK_PARAMETER
 from topomerge.io.archive import replace_on_success
 from topomerge.types import Array, TopometricMap
 from topomerge.viz.plan import StoreyPlan, build_scene_data
@@ -149,6 +150,7 @@ def render_parameters(map: TopometricMap) -> Markup:
     values = {"source": map.source or "–", "voxel_size": float(map.grid.edge), **map.parameters}
     if isinstance(values.get(BEND_PARAMETER), list):  # hundreds of numbers
         values[BEND_PARAMETER] = f"of {len(values[BEND_PARAMETER])} of its maps"
+    values.pop(LANDMARK_PARAMETER, None)  # the table of landmarks shows them
     return render_properties(values, "Parameters")
 
 
