@@ -100,3 +100,9 @@ def walk_poses(count: int = 14) -> np.ndarray:
     there = [looking(np.pi / 2 - 0.25, (x, 0.5, 1.4)) for x in out]
     back = [looking(-np.pi / 2 + 0.25, (x, 1.9, 1.4)) for x in out[::-1]]
     return np.stack([*there, *back])
+
+
+def poses_before_signs() -> np.ndarray:
+    """A camera in front of each sign and tag, askew."""
+    places = [(sign.x - 0.2, 0.7 if sign.far else SIZE[1] - 0.7, 1.4) for sign in SIGNS + TAG_SIGNS]
+    return np.stack([looking(-sign.heading + 0.15, place) for sign, place in zip(SIGNS + TAG_SIGNS, places, strict=True)])

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import minimum_filter
+from scipy.ndimage import minimum_filter, rank_filter
 
 from topomerge.errors import InputError
 from topomerge.io.bag_file import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, Bag, Message, Topic, get_time
@@ -139,7 +139,8 @@ def render_depth(points: Array, camera: Camera, pose: Array, shape: tuple[int, .
     columns, rows = (np.floor(local[:, k] / local[:, 2] * small.focal[k] + small.centre[k]).astype(np.int64) for k in (0, 1))
     inside = (columns >= 0) & (columns < depth.shape[1]) & (rows >= 0) & (rows < depth.shape[0])
     np.minimum.at(depth, (rows[inside], columns[inside]), local[inside, 2])
-    filled = np.where(np.isfinite(depth), depth, minimum_filter(depth, 3, mode="nearest"))
+    near = np.minimum(depth, rank_filter(depth, 3, 3, mode="nearest"))  # of gaps in a wall, the wall and not what is behind it
+    filled = np.where(np.isfinite(near), near, minimum_filter(depth, 3, mode="nearest"))
     return np.where(np.isfinite(filled), filled, 0), small
 
 
@@ -392,10 +393,5 @@ class LandmarkReader:
         if not rows:
             return Landmarks()
         values, numbers, times, groups, places = zip(*rows, strict=True)
-        known: dict[str, Any] = {
-            "number": np.array(numbers),
-            "time": np.array(times),
-            "group": np.array(groups),
-            "sigma": READING_SIGMA,
-        }
-        return build_landmarks(kind, values, "bag", np.array(places), sigma=READING_SIGMA, **known)
+        columns = {"number": np.array(numbers), "time": np.array(times), "group": np.array(groups)}
+        return build_landmarks(kind, values, "bag", np.array(places), sigma=READING_SIGMA, **columns)

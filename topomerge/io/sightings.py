@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from topomerge.types import Array, Landmarks, build_landmarks, join_landmarks
 
@@ -17,6 +18,7 @@ LONGEST_TEXT = 64  # letters that are kept of a text, a name or an address
 MOST_SIGHTINGS = 20_000  # of a recording; further ones are not looked at
 SAME_TEXT_REACH, OTHER_TEXT_REACH = 1.5, 0.4  # m between sightings of one sign, of equal texts and of similar ones
 OBJECT_REACH = 0.8  # m between sightings of one object
+FRAGMENT_REACH = 0.6  # m between the middles of a text and of a part of it
 MOST_EDITS = 0.34  # of the letters of the longer one, by which texts of one sign differ
 FACING_LEVEL = 0.5  # length of the level part of a sign's normal, from which on it has a heading
 FACING = 0.0  # cosine between headings of one sign: the two sides of a board are two
@@ -68,14 +70,14 @@ def is_legible(text: str, confidence: float) -> bool:
     return letters > FEW_LETTERS or (letters > 0 and confidence >= FEW_LETTERS_CONFIDENCE)
 
 
-def count_edits(a: str, b: str) -> int:
-    """Count the letters to insert, leave out or replace that turn one text into the other."""
-    row = list(range(len(b) + 1))
+def count_edits(a: str, b: str, within: bool = False) -> int:
+    """Count the letters to insert, leave out or replace that turn one text into the other, or into any part of it."""
+    row = [0] * (len(b) + 1) if within else list(range(len(b) + 1))
     for i, letter in enumerate(a, 1):
         before, row[0] = row[0], i
         for j, other in enumerate(b, 1):
             before, row[j] = row[j], min(row[j] + 1, row[j - 1] + 1, before + (letter != other))
-    return row[-1]
+    return min(row) if within else row[-1]
 
 
 def fuse_sightings(sightings: Sequence[Sighting], source: str) -> Landmarks:
@@ -104,6 +106,7 @@ def fuse_sightings(sightings: Sequence[Sighting], source: str) -> Landmarks:
             best = len(groups) - 1
             near.setdefault((x, y, z), []).append(best)
         groups[best].append(sighting)
+    groups = _drop_fragments(groups)
     kinds = list(dict.fromkeys(group[0].kind for group in groups))
     fused = [_build_fused(kind, [g for g in groups if g[0].kind == kind], source) for kind in kinds]
     return join_landmarks(fused)
@@ -113,7 +116,9 @@ def _measure_distance(group: Sequence[Sighting], sighting: Sighting) -> float:
     """How far a sighting is from those of one thing, m; inf: it is another."""
     first = group[0]
     distance = float(np.linalg.norm(np.median([s.position for s in group[-5:]], axis=0) - sighting.position))
-    if first.kind != sighting.kind or np.cos(first.heading - sighting.heading) < FACING:  # false for nan
+    if first.kind != sighting.kind or (
+        first.kind == "text" and np.cos(first.heading - sighting.heading) < FACING
+    ):  # false for nan
         return math.inf
     same = any(other.value == sighting.value for other in group)
     if same:
@@ -126,14 +131,41 @@ def _measure_distance(group: Sequence[Sighting], sighting: Sighting) -> float:
     return OTHER_TEXT_REACH + distance if similar else math.inf
 
 
+def _drop_fragments(groups: list[list[Sighting]]) -> list[list[Sighting]]:
+    """The things without texts that are parts of another one nearby, as pictures show that cut it off."""
+    texts = [number for number, group in enumerate(groups) if group[0].kind == "text"]
+    if len(texts) < 2:
+        return groups
+    places = np.array([np.median([s.position for s in groups[number]], axis=0) for number in texts])
+    votes = [_count_votes(groups[number]) for number in texts]
+    values = [max(vote, key=lambda v: (vote[v], v)) for vote in votes]
+    dropped = set()
+    for a, b in cKDTree(places).query_pairs(FRAGMENT_REACH, output_type="ndarray").tolist():
+        part, whole = (a, b) if len(values[a]) < len(values[b]) else (b, a)
+        one, other = groups[texts[part]], groups[texts[whole]]
+        if len(values[part]) == len(values[whole]) or np.cos(one[0].heading - other[0].heading) < FACING or len(one) > len(other):
+            continue
+        together = {s.picture for s in one} & {s.picture for s in other} - {-1}
+        if not together and count_edits(values[part], values[whole], within=True) <= MOST_EDITS * len(values[part]):
+            dropped.add(texts[part])
+    return [group for number, group in enumerate(groups) if number not in dropped]
+
+
+def _count_votes(group: Sequence[Sighting]) -> dict[str, float]:
+    """How surely each value was read, all sightings together."""
+    votes: dict[str, float] = {}
+    for sighting in group:
+        votes[sighting.value] = votes.get(sighting.value, 0.0) + sighting.confidence
+    return votes
+
+
 def _build_fused(kind: str, groups: Sequence[Sequence[Sighting]], source: str) -> Landmarks:
     values, rows = [], []
     for group in groups:
-        votes: dict[str, float] = {}
-        for sighting in group:
-            votes[sighting.value] = votes.get(sighting.value, 0.0) + sighting.confidence
+        votes = _count_votes(group)
         value = max(votes, key=lambda v: (votes[v], v))
-        share = votes[value] / max(sum(votes.values()), 1e-9)
+        against = sum(vote for other, vote in votes.items() if count_edits(other, value, within=True))  # what was cut off agrees
+        share = votes[value] / max(votes[value] + against, 1e-9)
         sure = max(s.confidence for s in group if s.value == value)
         position, sigma = _average_positions(group)
         headings = np.array([s.heading for s in group if math.isfinite(s.heading)])
