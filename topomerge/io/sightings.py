@@ -8,9 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from topomerge.types import Array, Landmarks, build_landmarks, join_landmarks
 
@@ -133,6 +130,8 @@ def _measure_distance(group: Sequence[Sighting], sighting: Sighting) -> float:
 
 def _drop_fragments(groups: list[list[Sighting]]) -> list[list[Sighting]]:
     """The things without texts that are parts of another one nearby, as pictures show that cut it off."""
+    from scipy.spatial import cKDTree
+
     texts = [number for number, group in enumerate(groups) if group[0].kind == "text"]
     if len(texts) < 2:
         return groups
@@ -253,6 +252,9 @@ def _sum_cells(keys: Array, values: Array) -> Array:
 
 def _label_clusters(keys: Array) -> Array:
     """(n,) number of the cluster of each cell (n, 4) of class and place, which are sorted."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     low = keys.min(axis=0)
     span = keys.max(axis=0) - low + 3
     scale = np.array([span[1] * span[2] * span[3], span[2] * span[3], span[3], 1])
