@@ -179,11 +179,11 @@ def render_landmarks(map: TopometricMap, key: str = "") -> list[Markup]:
 
 def render_rooms_table(map: TopometricMap, key: str = "", only: Iterable[int] | None = None) -> Markup:
     """Render all rooms, or some of them; rows carry `data-room`, `data-storey` and `data-sure`."""
-    names = ("room", "storey", "area m²", "height m", "seen", "entered", "confidence", "doors")
-    marks = list_room_landmarks(map)
-    columns = [*((name, "number") for name in names), *([("landmarks", "text")] if any(marks) else []), ("leads to", "text")]
-    several_storeys = len(map.storeys) > 1
-    columns = [column for column in columns if several_storeys or column[0] != "storey"]
+    names = ("area m²", "height m", "seen", "entered", "confidence", "doors")
+    marks, several_storeys = list_room_landmarks(map), len(map.storeys) > 1
+    columns = [("room", "number"), *([("storey", "number")] if several_storeys else [])]
+    columns += [("landmarks", "text")] if any(marks) else []
+    columns += [*((name, "number") for name in names), ("leads to", "text")]
     colours = assign_room_colours(map)
     doors = np.bincount(map.edges["rooms"].ravel(), minlength=len(map.rooms))
     rows = []
@@ -198,12 +198,12 @@ def render_rooms_table(map: TopometricMap, key: str = "", only: Iterable[int] | 
         cells = [
             render_cell(join([swatch, str(i)]), i),
             *([render_cell(str(room["storey"]), int(room["storey"]))] if several_storeys else []),
+            *([render_cell(_join_shown(marks[i]), kind="text")] if any(marks) else []),
             measure(room["area"], 1),
             measure(room["height"], 2, room["height"] > 0),
             render_cell(seen, float(room["completeness"])),
             *(render_cell(f"{100 * room[name]:.0f} %", float(room[name])) for name in ("entered", "confidence")),
             render_cell(str(doors[i]), int(doors[i])),
-            *([render_cell(_join_shown(marks[i]), kind="text")] if any(marks) else []),
             render_cell(leads, kind="text"),
         ]
         place = {"data_room": f"{key}{i}", "data_storey": int(room["storey"]), "data_sure": format_room_confidence(room)}
