@@ -80,19 +80,21 @@ def _check_place(args: argparse.Namespace, map: TopometricMap) -> None:
 
 
 def _build_added(args: argparse.Namespace) -> Landmarks:
+    import numpy as np
+
     from topomerge.io.room_names import load_landmark_source
     from topomerge.types import build_landmarks, join_landmarks
 
     if args.source:
         return load_landmark_source(Path(args.source))
     columns: dict[str, Any] = collect_given(args, "room", "storey")
-    at = getattr(args, "at", None)
+    at = np.array(args.at) if hasattr(args, "at") else None
     parts = []
     for kind in MARKED_KINDS:
         values = getattr(args, kind, [])
         if not all(value.strip() for value in values):
             raise InputError(f"--{kind}: is empty; write the {kind}")
-        parts.append(build_landmarks(kind, values, BY_HAND, None if at is None else [at] * len(values), **columns))
+        parts.append(build_landmarks(kind, values, BY_HAND, None if at is None else np.tile(at, (len(values), 1)), **columns))
     return join_landmarks(parts)
 
 
@@ -120,8 +122,10 @@ def _select_rows(args: argparse.Namespace, landmarks: Landmarks) -> Array:
 
 
 def match_values(landmarks: Landmarks, kinds: Sequence[str], patterns: Sequence[str]) -> Array:
-    """Return (n,) bool: is it of these kinds, and its string one of the patterns? Case and blanks do not count; `*` stands for any
-    signs, `?` for one."""
+    """Return (n,) bool: is it of these kinds, and its string one of the patterns?
+
+    Case and blanks do not count; `*` stands for any signs, `?` for one.
+    """
     import numpy as np
 
     words = ["".join(pattern.casefold().split()) for pattern in patterns]
@@ -192,7 +196,7 @@ def _parse_place(text: str) -> tuple[float, float, float]:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
         x = y = z = float("nan")
-    if not max(abs(x), abs(y), abs(z)) <= 1e9:
+    if not all(abs(value) <= 1e9 for value in (x, y, z)):
         raise argparse.ArgumentTypeError(f"must be X,Y,Z in metres, as 3.2,-1,1.5, not {text!r}")
     return x, y, z
 
@@ -225,7 +229,7 @@ MARK = Command(
             dest="source",
             default=None,
             metavar="FILE",
-            help="take landmarks and names of rooms from a table (.csv), JSON, GeoJSON, IndoorGML, a scene graph or another .tmap",
+            help="take landmarks and names of rooms from a table (.csv), JSON, GeoJSON, IndoorGML or a scene graph",
         ),
         build_option("--remove", action="store_true", default=False, help="take out what the other options say"),
         build_option("--list", action="store_true", default=False, help="print them as a table that can lie beside a scan"),
@@ -246,6 +250,6 @@ FIND = Command(
         build_json_option("print JSON instead of a table"),
     ),
     paths=("inputs",),
-    description="Find landmarks: map, storey, room and place of each. Case and blanks do not count; `*` and `?` stand for any signs. "
-    "--text also finds names of rooms. Status 2: nothing was found.",
+    description="Find landmarks: map, storey, room and place of each. Case and blanks do not count; `*` and `?` stand for any "
+    "signs. --text also finds names of rooms. Status 2: nothing was found.",
 )

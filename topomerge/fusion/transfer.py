@@ -200,7 +200,7 @@ class PlacedLandmarks(NamedTuple):
     landmarks: Landmarks
     rooms: PartRooms
     floors: Array  # (S,) m in the joined map, of the part's storeys
-    count: int  # of its rooms
+    total: int  # of its rooms
 
 
 def transform_part_landmarks(part: TopometricMap, placement: Placement, rooms: PartRooms) -> PlacedLandmarks:
@@ -232,7 +232,7 @@ def _assign_joined_rooms(joined: TopometricMap, part: PlacedLandmarks) -> Landma
     """Landmarks of a part with rooms and storeys of the joined map: by their position; without one by the room that they had."""
     table = part.landmarks.table.copy()
     known = np.isfinite(table["position"]).all(axis=1)
-    room = np.append(vote_rooms(part.rooms.room, find_rooms_at(joined, part.rooms.places), part.count), -1)[table["room"]]
+    room = np.append(vote_rooms(part.rooms.room, find_rooms_at(joined, part.rooms.places), part.total), -1)[table["room"]]
     floors = joined.storeys["floor"]
     level = (
         np.abs(floors[None] - part.floors[:, None]).argmin(axis=1) if len(floors) and len(part.floors) else np.zeros(0, np.int64)

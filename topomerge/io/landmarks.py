@@ -198,6 +198,8 @@ def parse_landmarks(rows: Iterable[Mapping[str, Any]], source: str) -> Landmarks
         for name, column in columns.items():
             if column:
                 table[name] = column
+    except InputError:  # of what makes the rows
+        raise
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         reason = " ".join(str(error).split())[:100]
         raise InputError(f"{source}: landmark {len(columns['kind'])} is damaged ({reason}); write it again") from error

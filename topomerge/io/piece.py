@@ -250,7 +250,7 @@ def decode_colors(rows: np.ndarray[Any, Any]) -> np.ndarray[Any, Any] | None:
     return convert_to_uint8(np.stack([rows[name] for name in COLOR_NAMES], axis=1))
 
 
-ARRAYS = {  # of a piece
+ARRAYS: dict[str, Any] = {  # of a piece
     "points": np.float64, "colors": np.uint8, "poses": np.float64, "pose_of": np.int32, "intensities": np.float32,
     "landmarks": LANDMARK_DTYPE,
 }  # fmt: skip
@@ -334,7 +334,8 @@ def _iter_messages(
         limit(seconds=seconds)
         for piece in reader.read_in_process(path, options):
             marks = piece.landmarks
-            arrays = {name: getattr(piece, name) for name in ARRAYS} | {"landmarks": None if marks is None else marks.table}
+            arrays: dict[str, Any] = {name: getattr(piece, name) for name in ARRAYS}
+            arrays["landmarks"] = None if marks is None else marks.table
             given = {name: np.ascontiguousarray(v, ARRAYS[name]) for name, v in arrays.items() if v is not None}
             rooms = [{**vars(room), "polygon": np.asarray(room.polygon).tolist()} for room in piece.rooms]
             header = {"arrays": {name: v.shape for name, v in given.items()}, "rooms": rooms}

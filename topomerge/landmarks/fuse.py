@@ -177,8 +177,8 @@ class _Fusion:
         agreeing = room[own[np.isin(code[own], code[before])]]
         before, own = (rows[~taken[rows] & ~np.isin(room[rows], agreeing)] for rows in (before, own))
         known = self.known
-        signs = [rows[known[rows] & self.landmarks.is_kind("text")[rows]] for rows in (before, own)]
-        pairs = _pair_nearest(*signs, *_find_nearest(self.table["position"], room, *signs, SAME_DOOR))
+        old, new = (rows[known[rows] & self.landmarks.is_kind("text")[rows]] for rows in (before, own))
+        pairs = _pair_nearest(old, new, *_find_nearest(self.table["position"], room, old, new, SAME_DOOR))
         self._note("number", *pairs)
         before, own = (np.setdiff1d(rows, pair) for rows, pair in zip((before, own), pairs, strict=True))
         alone = self.landmarks.is_kind("name") | ~known | np.append(self.doors < 2, False)[room]  # one number a room
@@ -199,10 +199,9 @@ class _Fusion:
         for a, b in list(zip(one.tolist(), other.tolist(), strict=True))[: MOST_LISTED - len(self.contradictions)]:
             apart = float(np.linalg.norm(self.table["position"][a] - self.table["position"][b]))
             values = [self.landmarks.values[self.table["value"][row]] for row in (a, b)]
-            about = {"what": what, "values": values, "maps": [int(self.owner[a]), int(self.owner[b])]}
-            room = int(self.table["room"][b])
-            about |= {"room": room if room >= 0 else None, "apart_m": round(apart, 2) if np.isfinite(apart) else None}
-            self.contradictions.append(about)
+            room, maps = int(self.table["room"][b]), [int(self.owner[a]), int(self.owner[b])]
+            place = {"room": room if room >= 0 else None, "apart_m": round(apart, 2) if np.isfinite(apart) else None}
+            self.contradictions.append({"what": what, "values": values, "maps": maps, **place})
 
 
 def _find_nearest(position: Array, group: Array, before: Array, own: Array, reach: float) -> tuple[Array, Array]:
