@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from scipy import ndimage
-from topomerge.datasets.plans.drafting_hands import Hand, draw_plan, spoil_page
-from topomerge.datasets.plans.drawing_shapes import DrawingShapes, OpeningShape, RoomShape
+from topomerge.datasets.drawings.hands import Hand, draw_plan, spoil_page
+from topomerge.datasets.drawings.shapes import DrawingShapes, OpeningShape, RoomShape
 
 from topomerge.io.drawing import (
     PictureText,

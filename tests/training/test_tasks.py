@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from tests.training import tiny
+from topomerge.archive import VARIABLE, find_weights_file, read_weights_json
 from topomerge.embedding.engineered import scale_features
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.elevation import compute_place_probabilities
@@ -32,7 +33,6 @@ from topomerge.extraction.plans.plan_network import compute_column_probabilities
 from topomerge.extraction.plans.plan_network import load_weights as plan_weights
 from topomerge.extraction.room_odds import load_room_weights
 from topomerge.fusion.match_belief import load_belief_weights
-from topomerge.io.archive import VARIABLE, find_weights_file, read_weights_json
 from topomerge.matching.consistency import load_odds_weights
 from topomerge.matching.room_matcher import load_matcher_weights
 from topomerge.networks.drawing import compute_drawing_probabilities

@@ -18,12 +18,12 @@ from scipy import ndimage
 
 from topomerge.code_digest import compute_code_digest
 from topomerge.datasets.core.building import find_physical_building
-from topomerge.datasets.plans.drafting_hands import Drawing, choose_hand, draw_plan, spoil_page
-from topomerge.datasets.plans.drawing_shapes import DrawingRecipe, DrawingShapes, build_drawing_shapes
+from topomerge.datasets.drawings.hands import Drawing, choose_hand, draw_plan, spoil_page
+from topomerge.datasets.drawings.shapes import DrawingRecipe, DrawingShapes, build_drawing_shapes
 from topomerge.evaluation.documents import group_rows, write_mean, write_share, write_table
 from topomerge.evaluation.tasks import Row, TaskSettings, find_optional_data, limit_cases, measure_missing
 from topomerge.extraction.extract import extract
-from topomerge.io.drawing import estimate_scale, find_name, has_text_reader, parse_drawing, read_texts
+from topomerge.io.drawing import estimate_scale, find_name, parse_drawing, read_texts
 from topomerge.io.points import read_points
 from topomerge.metrics import match_places, score_rooms
 from topomerge.networks.drawing import DOOR, WALL, WINDOW
@@ -116,8 +116,7 @@ def measure_page(page: Page, texts: bool) -> Row:
     row |= score_map(map, drawing, resolution)
     parsed = parse_drawing(drawing.picture, resolution)
     row["walls"] = score_walls(parsed.occupied, drawing, parsed.zoom)
-    if texts and has_text_reader() and not page.spoilt:
-        found = read_texts(drawing.picture)
+    if texts and not page.spoilt and (found := read_texts(drawing.picture)) is not None:
         scale = estimate_scale(parse_drawing(drawing.picture), found)
         if any("m" in t.text or "'" in t.text for t in drawing.texts if t.room >= 0 and any(c.isdigit() for c in t.text)):
             row["scale"] = bool(scale and abs(np.log(scale.resolution / resolution)) < SCALE_NEAR)

@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from topomerge.archive import read_weights_json
 from topomerge.blas import limit_blas_threads
 from topomerge.errors import InputError
 from topomerge.extraction.attributes import estimate_attributes
 from topomerge.extraction.elevations.doorways import StoreyWalls
 from topomerge.extraction.elevations.wall_doors import WALL_DOOR_FEATURES, build_door_candidates
+from topomerge.extraction.landmarks import add_landmarks
 from topomerge.extraction.navigable import add_crossed_cells, compute_navigable_volume, find_free_space
 from topomerge.extraction.parameters import DefaultParameters, Parameters, ThesisParameters, resolve_parameters
 from topomerge.extraction.plans.part_rooms import PartRooms
@@ -39,7 +41,6 @@ from topomerge.extraction.stopwatch import Progress, Stopwatch
 from topomerge.extraction.topology import build_topometric_map, select_rooms_with_floor
 from topomerge.extraction.views.view_rooms import segment_views
 from topomerge.extraction.walls import relabel_walls, unroll_walls
-from topomerge.io.archive import read_weights_json
 from topomerge.numpy_nn import sigmoid
 from topomerge.types import EDGE_DTYPE, LEVELLED, Array, PointCloud, TopometricMap, VoxelGrid, add_outline_odds
 
@@ -197,7 +198,7 @@ def extract(
     chosen = {**asdict(p), **floor.chosen_parameters, "voxel_size": scan.grid.edge}
     if scan.levelling is not None:
         chosen[LEVELLED] = scan.levelling.tolist()
-    return replace(
+    map = replace(
         map,
         free=free,
         source=scan.source if name is None else name,
@@ -205,6 +206,7 @@ def extract(
         seconds=watch.end(),
         warnings=(*scan.warnings, *doubts, *_list_warnings(map)),
     )
+    return add_landmarks(map, scan.landmarks)
 
 
 def read_navigable(

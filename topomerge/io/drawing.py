@@ -6,16 +6,15 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
-from typing import Any
 
 import numpy as np
 from scipy import ndimage
 
-from topomerge.errors import InputError
+from topomerge.io.pictures import load_text_reader
+from topomerge.io.sightings import clean_text
 from topomerge.networks.drawing import DOOR, FLOOR, PAGE, WALL, WINDOW, compute_drawing_probabilities
 from topomerge.networks.network import Run
-from topomerge.types import Array
+from topomerge.types import Array, Landmarks, build_landmarks, join_landmarks
 
 FINEST, COARSEST = 0.03, 0.12  # m a pixel: what the network was trained on lies between 0.02 and 0.125
 LONGEST_SIDE = 900  # px at which a picture of unknown scale is looked at
@@ -35,6 +34,8 @@ AREA = re.compile(NUMBER + r"\s*(m²|m2|m\^2|qm|sqm|sq\.?\s*m\.?|kvm|㎡|sq\.?\s
 SIDES = re.compile(NUMBER + r"\s*(mm|cm|m)?\s*[x×X*]\s*" + NUMBER + r"\s*(mm|cm|m)?(?![\d'\"′])")
 SIDE_IN_FEET = r"(\d{1,3})\s*['’′]\s*(?:(\d{1,2})\s*(?:[\"”″]|'')?)?"
 FEET = re.compile(SIDE_IN_FEET + r"\s*[x×X*]\s*" + SIDE_IN_FEET)
+NUMBERED = re.compile(r"[A-Za-z]{0,3}[-. ]?\d{1,3}(?:[.\-]\d{1,4}){0,2}[a-z]?(?<=..)")
+NAME_SIGMA = 1.0  # m, of where a name stands in its room
 WORD = re.compile(r"[^\W\d_]{2,}")
 
 
@@ -188,8 +189,23 @@ def find_name(text: str) -> str:
     """Find the name or number of a room in a text: what is left without areas and sides; "" where that is no name."""
     left = FEET.sub(" ", SIDES.sub(" ", AREA.sub(" ", text)))
     left = " ".join(left.split()).strip(" -:;,/|()")
-    is_number = bool(re.fullmatch(r"[A-Za-z]{0,3}[-. ]?\d{1,3}(?:[.\-]\d{1,4}){0,2}[a-z]?", left)) and len(left) >= 2
-    return left if WORD.search(left) or is_number else ""
+    return left if WORD.search(left) or NUMBERED.fullmatch(left) else ""
+
+
+def find_names(texts: Sequence[PictureText], source: str, resolution: float, height: int) -> Landmarks:
+    """Find names and numbers of rooms among texts; numbers are what signs at doors show.
+
+    Args:
+        source: the picture; resolution: m a pixel of it; height: px.
+    """
+    parts = []
+    for kind in ("name", "text"):
+        found = [(name, t) for t in texts if (name := find_name(t.text)) and (kind == "text") == bool(NUMBERED.fullmatch(name))]
+        places = np.array([t.place for _, t in found]).reshape(-1, 2)
+        position = np.column_stack([places[:, 0], height - places[:, 1], np.zeros(len(places))]) * resolution
+        confidence = np.array([t.confidence for _, t in found])
+        parts.append(build_landmarks(kind, [n for n, _ in found], source, position, sigma=NAME_SIGMA, confidence=confidence))
+    return join_landmarks(parts)
 
 
 def estimate_scale(drawing: ParsedDrawing, texts: Sequence[PictureText]) -> DrawingScale | None:
@@ -256,36 +272,14 @@ def _estimate_scale_by_doors(drawing: ParsedDrawing) -> DrawingScale | None:
     return DrawingScale(DOOR_WIDTH / width * drawing.zoom, spread, (f"{count} doors of usual width",), written=False)
 
 
-def read_texts(picture: Array) -> tuple[PictureText, ...]:
-    """Read the texts of a picture (h, w, 3), upright ones and those along either side.
-
-    Raises:
-        InputError: the extra `text` is not installed.
-    """
-    engine = load_text_reader()
-    out: list[PictureText] = []
-    found, _ = engine(np.ascontiguousarray(picture[..., ::-1]))
-    for box, text, confidence in found or ():
-        corners = np.array(box, float)
+def read_texts(picture: Array) -> tuple[PictureText, ...] | None:
+    """Read the texts of a picture (h, w, 3); None where the extra `text` is not installed."""
+    reader = load_text_reader()
+    if reader is None:
+        return None
+    out = []
+    for corners, text, confidence in reader(picture):
         middle = corners.mean(axis=0)
         height = float(np.hypot(*(corners[3] - corners[0])))
-        out.append(PictureText(" ".join(str(text).split()), (float(middle[0]), float(middle[1])), height, float(confidence)))
+        out.append(PictureText(clean_text(text), (float(middle[0]), float(middle[1])), height, confidence))
     return tuple(out)
-
-
-def has_text_reader() -> bool:
-    """Return whether the extra `text` is installed."""
-    return find_spec("rapidocr_onnxruntime") is not None
-
-
-def load_text_reader() -> Any:
-    """Load the reader of texts.
-
-    Raises:
-        InputError: the extra `text` is not installed.
-    """
-    try:
-        from rapidocr_onnxruntime import RapidOCR
-    except ImportError as error:
-        raise InputError("texts on pictures need rapidocr-onnxruntime: pip install topomerge[text]") from error
-    return RapidOCR()

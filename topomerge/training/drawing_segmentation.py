@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from topomerge.datasets.plans.drafting_hands import sample_drawing
-from topomerge.datasets.plans.drawing_shapes import DrawingShapes, build_drawing_shapes
+from topomerge.datasets.drawings.hands import sample_drawing
+from topomerge.datasets.drawings.shapes import DrawingShapes, build_drawing_shapes
 from topomerge.errors import InputError
 from topomerge.models.convolutional import DrawingProbabilities, DrawingUNet
 from topomerge.networks.drawing import DRAWING_CLASSES, DRAWING_FILE, DRAWING_SIGNATURE

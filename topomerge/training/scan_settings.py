@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from topomerge.datasets.drawings.shapes import DrawingRecipe
 from topomerge.datasets.pairs.plan_examples import PlanRecipe
-from topomerge.datasets.plans.drawing_shapes import DrawingRecipe
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.elevation import WALL_CLASSES
 from topomerge.training.settings import NetworkTask, RasterTask, TaskSettings

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFilter, ImageFont
 from scipy import ndimage
-from topomerge.datasets.plans.drawing_shapes import DrawingShapes, OpeningShape, mirror_shapes
+from topomerge.datasets.drawings.shapes import DrawingShapes, OpeningShape, mirror_shapes
 
 from topomerge.networks.drawing import DOOR, FLOOR, PAGE, STAIRS, SYMBOL, TEXT, WALL, WINDOW
 from topomerge.types import Array

@@ -14,8 +14,8 @@ import numpy as np
 from topomerge.datasets.core.building import Difficulty, Plan
 from topomerge.datasets.plans import splits
 
+from topomerge.archive import replace_on_success
 from topomerge.errors import InputError
-from topomerge.io.archive import replace_on_success
 from topomerge.types import Array, LogFn
 
 SHAPES_FORMAT = 1  # raised when what is drawn of a plan changes
