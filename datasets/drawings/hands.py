@@ -54,7 +54,7 @@ TITLES = (
     "GROUND FLOOR", "First Floor Plan", "Erdgeschoss 1:100", "Plan d'évacuation", "Sketch plan for illustrative purposes only",
     "Approx. gross internal area 84 sq m / 904 sq ft", "Scale 1:50", "NOT TO SCALE", "Planritning", "You are here", "N",
 )  # fmt: skip
-WALL_STYLES = (("filled", 0.5), ("grey", 0.12), ("double", 0.14), ("hatched", 0.08), ("single", 0.16))
+WALL_STYLES = {"filled": 0.5, "grey": 0.12, "double": 0.14, "hatched": 0.08, "single": 0.16}
 WARM = ((253, 246, 227), (235, 245, 235), (230, 240, 250), (250, 235, 235), (240, 240, 240), (222, 205, 175), (255, 250, 205))
 
 
@@ -109,10 +109,9 @@ class Hand:
 
 def choose_hand(rng: np.random.Generator) -> Hand:
     """Choose a hand."""
-    styles, chances = zip(*WALL_STYLES, strict=True)
     dark = int(rng.integers(0, 70)) if rng.random() < 0.8 else int(rng.integers(70, 130))
     ink = (dark, dark, dark) if rng.random() < 0.85 else tuple(int(v) for v in rng.integers(0, 140, 3))
-    style = str(rng.choice(styles, p=np.array(chances) / sum(chances)))
+    style = str(rng.choice(list(WALL_STYLES), p=np.array(list(WALL_STYLES.values())) / sum(WALL_STYLES.values())))
     return Hand(
         walls=style,
         ink=(ink[0], ink[1], ink[2]),
@@ -443,7 +442,7 @@ def _draw_routes(sheet: Sheet, shapes: DrawingShapes, rng: np.random.Generator) 
 
 
 def _fill_with_treads(sheet: Sheet, mask: Array, hand: Hand, rng: np.random.Generator) -> None:
-    i, j = np.indices(mask.shape, sparse=True)
+    i, j = np.arange(mask.shape[0])[:, None], np.arange(mask.shape[1])[None]
     step = max(int(0.28 * sheet.scale), 6)
     lines = mask & ((i if rng.random() < 0.5 else j) % step < max(hand.line, 2))
     sheet.paint(lines, hand.ink, STAIRS)
@@ -602,7 +601,7 @@ def _warp(pixels: Array, truth: Array, numbers: Array, rng: np.random.Generator)
 def spoil_light(pixels: Array, rng: np.random.Generator) -> Array:
     """Return (h, w, 3) uint8 pixels after light, lens, sensor and compression."""
     h, w = pixels.shape[:2]
-    out = np.array(pixels, np.float32)
+    out: Array = np.array(pixels, np.float32)
     if rng.random() < 0.3:
         out = out.mean(axis=2, keepdims=True).repeat(3, axis=2)
     if rng.random() < 0.25:  # shade and folds

@@ -33,8 +33,10 @@ MAKERS = ("topomerge.io.drawing", "topomerge.io.grid", "topomerge.networks.drawi
 LARGEST_SIDE, FEWEST_ROOMS = 1100, 3  # px of a page; rooms of a plan
 WALL_NEAR, DOOR_NEAR, SCALE_NEAR = 0.1, 0.5, 0.03  # m, m, share
 EVERY = {"r2v": 3, "campus": 1, "procedural": 1}  # of a source's plans, every n-th
-COLUMNS = ("pages", "of", "rooms' IoU", "precision", "recall", "walls' F1", "doors found", "doors right", "names", "scale")
-COLUMNS += ("outside",)
+COLUMNS = (
+    *("pages", "of", "rooms' IoU", "precision", "recall", "walls' F1"),
+    *("doors found", "doors right", "names", "scale", "outside"),
+)
 
 
 @dataclass
