@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from tests.matching.turned_maps import turned
 from tests.scenes_map import building
-from topomerge.embedding.sheets import build_sheet_arrays, estimate_wall_direction, rasterise_sheet
+from topomerge.embedding.sheets import build_sheet_arrays, estimate_wall_directions, rasterise_sheet
 from topomerge.embedding.surroundings import (
     CEILING_UNIT,
     CROP,
@@ -112,12 +112,12 @@ def test_the_direction_of_walls_is_that_of_most_of_them(degrees):
     angle = np.radians(degrees)
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     walls = (np.concatenate([along, across, slanted]) + rng.normal(0, 0.02, (1350, 2))) @ turn
-    off = np.degrees(estimate_wall_direction(walls)) - degrees
+    off = np.degrees(estimate_wall_directions(walls)[0]) - degrees
     assert abs((off + 45) % 90 - 45) < 0.35
 
 
 def test_no_walls_have_no_direction():
-    assert estimate_wall_direction(np.zeros((0, 2))) == 0.0
+    assert estimate_wall_directions(np.zeros((0, 2))) == (0.0,)
 
 
 def test_a_wide_crop_shows_twice_as_far_in_means_of_pixels():
