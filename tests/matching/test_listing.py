@@ -42,7 +42,7 @@ def test_the_table_names_matches_and_the_first_hypotheses():
     [
         ([(np.pi, 0.5), (0.0, 0.48), (1.0, 0.02)], "two turns fit (0 and 180 degrees)"),
         ([(k * np.pi / 2 - np.pi / 2, 0.25) for k in range(4)], "four turns fit (-90, 0, 90 and 180 degrees)"),
-        ([(np.radians(-72.3), 0.6), (np.radians(-144.0), 0.3), (0.0, 0.1)], "two turns fit (-144 and -72 degrees)"),
+        ([(np.radians(-72.3), 0.65), (np.radians(-144.0), 0.3), (0.0, 0.05)], "two turns fit (-144 and -72 degrees)"),
         ([(0.5, 0.95), (2.0, 0.05)], None),
     ],
 )

@@ -79,8 +79,8 @@ def test_a_plan_that_is_the_same_from_both_ends_fits_at_two_turns(method):
     assert sorted(round(np.degrees(yaw)) for yaw, _ in found.fitting_turns) == [-90, 90]
     assert sum(p for _, p in found.turns) == pytest.approx(1.0)
     assert format_turns(found)[-1] == "two turns fit (-90 and 90 degrees)"
-    if method == "attention":  # each room may be one or the other
-        assert (found.probability < 0.8).all()
+    if method == "attention":  # each room may be one or the other, but for the corridor in the middle
+        assert (found.probability[:4] < 0.9).all() and found.probability[4] > 0.9
 
 
 @pytest.mark.parametrize("method", ["consistent", "attention"])
