@@ -49,7 +49,7 @@ def _align_rows(a: Rows, b: Rows) -> tuple[Array, Array]:
     if not isinstance(a, TurnedRows) or not isinstance(b, TurnedRows):
         return np.asarray(a), np.asarray(b)
     mean: Array = np.sum([turn.probability * b.flatten(turn.quarters) for turn in estimate_turns(a, b)], axis=0)
-    return a.flatten(), mean.astype(a.rows.dtype)
+    return a.flatten(), mean
 
 
 def _build_rows(rows: Array, graph: Mapping[str, Tensor]) -> Rows:
