@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from tests.matching.turned_maps import turned
 from tests.scenes_map import building
-from topomerge.embedding.sheets import build_sheet_arrays, estimate_wall_direction, rasterise_sheet
+from topomerge.embedding.sheets import build_sheet_arrays, estimate_wall_directions, rasterise_sheet
 from topomerge.embedding.surroundings import (
     CEILING_UNIT,
     CROP,
@@ -112,12 +112,35 @@ def test_the_direction_of_walls_is_that_of_most_of_them(degrees):
     angle = np.radians(degrees)
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     walls = (np.concatenate([along, across, slanted]) + rng.normal(0, 0.02, (1350, 2))) @ turn
-    off = np.degrees(estimate_wall_direction(walls)) - degrees
+    off = np.degrees(estimate_wall_directions(walls)[0]) - degrees
     assert abs((off + 45) % 90 - 45) < 0.35
 
 
+@pytest.mark.parametrize("between", [18.0, 36.0, 50.0])
+def test_walls_of_a_second_wing_have_a_direction_of_their_own(between):
+    rng = np.random.default_rng(1)
+    wings = []
+    for degrees, length in ((12.0, 30.0), (12.0 + between, 18.0)):
+        along = np.column_stack([rng.uniform(0, length, 900), np.repeat([0.0, 4.0, 9.0], 300)])
+        across = np.column_stack([np.repeat([2.0, 11.0], 150), rng.uniform(0, 9, 300)])
+        angle = np.radians(degrees)
+        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        wings.append(np.concatenate([along, across])[: 1200 if length > 20 else 700] @ turn + (0, length))
+    walls = np.concatenate(wings) + rng.normal(0, 0.02, (1900, 2))
+    assert np.degrees(estimate_wall_directions(walls)) == pytest.approx([12.0, 12.0 + between], abs=0.5)
+    assert len(estimate_wall_directions(wings[0])) == 1
+
+
+def test_a_sheet_of_another_direction_is_turned_by_it():
+    flat = rasterise_sheet(building(3))
+    tilted = rasterise_sheet(building(3), tilt=np.radians(30))
+    assert flat.tilts == () and np.degrees(tilted.turn - flat.turn) == pytest.approx(30.0)
+    ways = [(sheet.anchor[0] - sheet.anchor[-1]) @ np.array([1, 1j]) for sheet in (flat, tilted)]
+    assert np.degrees(np.angle(ways[1] / ways[0])) == pytest.approx(-30.0, abs=0.1)
+
+
 def test_no_walls_have_no_direction():
-    assert estimate_wall_direction(np.zeros((0, 2))) == 0.0
+    assert estimate_wall_directions(np.zeros((0, 2))) == (0.0,)
 
 
 def test_a_wide_crop_shows_twice_as_far_in_means_of_pixels():

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tests.scenes_map import building
+from topomerge.embedding.quarter_turns import YawProbability
 from topomerge.matching.match import Matching, format_matching, serialise_matching
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3
@@ -32,3 +35,20 @@ def test_the_table_names_matches_and_the_first_hypotheses():
     assert lines[7].split() == ["0", "0.88", "2", "90.0", "1.00", "-2.00", "0.50", "1.250"]
     assert len(lines) == 12  # five of seven hypotheses
     assert format_matching(Matching(), building(2), building(1)) == "0 matches of 5 and 3 rooms"
+
+
+@pytest.mark.parametrize(
+    ("shares", "line"),
+    [
+        ([(np.pi, 0.5), (0.0, 0.48), (1.0, 0.02)], "two turns fit (0 and 180 degrees)"),
+        ([(k * np.pi / 2 - np.pi / 2, 0.25) for k in range(4)], "four turns fit (-90, 0, 90 and 180 degrees)"),
+        ([(np.radians(-72.3), 0.65), (np.radians(-144.0), 0.3), (0.0, 0.05)], "two turns fit (-144 and -72 degrees)"),
+        ([(0.5, 0.95), (2.0, 0.05)], None),
+    ],
+)
+def test_turns_that_fit_are_named_where_it_is_more_than_one(shares, line):
+    matching = replace(MATCHING, turns=tuple(YawProbability(*share) for share in shares))
+    last = format_matching(matching, building(2), building(1)).splitlines()[-1]
+    assert last == line or (line is None and "fit" not in last)
+    listed = serialise_matching(matching, building(2), building(1))["turns"]
+    assert [turn["probability"] for turn in listed] == [p for _, p in shares] and listed[0]["yaw"] == shares[0][0]

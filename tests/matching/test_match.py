@@ -10,9 +10,10 @@ import pytest
 from tests.embedding.test_descriptors import permuted
 from tests.matching.turned_maps import turned, uneven
 from tests.scenes_map import building
+from topomerge.embedding.quarter_turns import YawProbability
 from topomerge.errors import InputError
 from topomerge.matching.consistency import compute_match_probability, find_voted_pose
-from topomerge.matching.match import GrowingLimits, match, select_marginal_matches
+from topomerge.matching.match import GrowingLimits, format_turns, match, select_marginal_matches, weigh_turns
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3
 
@@ -69,6 +70,34 @@ def test_rooms_that_look_alike_keep_alternatives():
     yaws = sorted(round(np.degrees(h.transform.yaw)) % 180 for h in found.alternatives[:2])
     assert len(found.alternatives) > 1 and yaws == [90, 90]
     assert found.alternatives[0].probability < 0.7 and found.alternatives[1].probability > 0.2
+
+
+@pytest.mark.parametrize("method", ["consistent", "attention", "assignment"])
+def test_a_plan_that_is_the_same_from_both_ends_fits_at_two_turns(method):
+    b, _ = turned(building(2), (7.0, -3.0, 1.5))
+    found = match(building(2), b, method=method)
+    assert sorted(round(np.degrees(yaw)) for yaw, _ in found.fitting_turns) == [-90, 90]
+    assert sum(p for _, p in found.turns) == pytest.approx(1.0)
+    assert format_turns(found)[-1] == "two turns fit (-90 and 90 degrees)"
+    if method == "attention":  # each room may be one or the other, but for the corridor in the middle
+        assert (found.probability[:4] < 0.9).all() and found.probability[4] > 0.9
+
+
+@pytest.mark.parametrize("method", ["consistent", "attention"])
+def test_a_plan_without_symmetry_fits_at_one_turn(method):
+    b, true = turned(uneven(), (7.0, -3.0, 1.5))
+    (fitting,) = match(uneven(), b, method=method).fitting_turns
+    assert np.degrees(fitting.yaw) == pytest.approx(np.degrees(true.yaw), abs=1.0) and fitting.probability > 0.9
+    assert match(uneven(), b, "engineered").turns == ()
+
+
+def test_walls_have_a_say_in_turns():
+    turns = (YawProbability(0.0, 0.5), YawProbability(np.pi, 0.4), YawProbability(np.pi / 2, 0.1))
+    ranked = [PoseHypothesis(Sim3(yaw), probability=p) for yaw, p in ((np.pi, 0.7), (-np.pi + 0.05, 0.2), (1.0, 0.04))]
+    weight = np.array([0.5 * 0.02, 0.4 * 0.92, 0.1 * 0.02])  # what is left, .06, is shared
+    found = weigh_turns(turns, ranked)
+    assert found[0].yaw == np.pi and [p for _, p in found] == pytest.approx(np.sort(weight / weight.sum())[::-1])
+    assert weigh_turns(turns, []) == turns and weigh_turns((), ranked) == ()
 
 
 def test_order_of_rooms():

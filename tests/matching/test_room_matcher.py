@@ -14,7 +14,7 @@ from topomerge.models.export import read_weights, run_with_torch
 from topomerge.models.room_matcher import MatcherStage, RoomMatcher, build_stages
 
 from topomerge.archive import VARIABLE, find_weights_file
-from topomerge.embedding.quarter_turns import FACTS, compute_room_features
+from topomerge.embedding.quarter_turns import FACTS, Turn, TurnedRows, compute_room_features
 from topomerge.errors import InputError
 from topomerge.matching import room_matcher
 from topomerge.matching.room_matcher import (
@@ -175,11 +175,23 @@ def test_a_part_that_does_not_exist_can_not_be_left_out() -> None:
         RoomMatcher(ROWS, width=16).leave_out(["layers"])
 
 
-def test_turns_are_as_likely_as_they_are_sure() -> None:
-    sure = room_matcher.RoomOdds(np.array([[1.0, 0.0]]), np.array([[1.0, 0.0]]), 2)
-    none = room_matcher.RoomOdds(np.array([[0.0, 1.0]]), np.array([[0.0, 1.0]]), 0)
+def test_certainty_is_the_mean_over_turns() -> None:
+    sure = room_matcher.RoomOdds(np.array([[1.0, 0.0]]), np.array([[1.0, 0.0]]), 2, probability=0.8)
+    none = room_matcher.RoomOdds(np.array([[0.0, 1.0]]), np.array([[0.0, 1.0]]), 0, probability=0.2)
     assert sure.confidence == 1.0 and none.confidence == 0.0
-    assert combine_turn_certainties([none, sure]) == pytest.approx(np.e / (1 + np.e))
+    assert combine_turn_certainties([none, sure]) == pytest.approx(0.8)
+
+
+def test_evidence_of_rows_and_of_the_network_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    a = TurnedRows(np.full((1, 4, 1), 1.0), np.zeros((1, 2)), "", np.zeros((1, FACTS)), direction=0.5)
+    turns = [Turn(a, a, k, probability=p) for k, p in enumerate((0.6, 0.39, 0.01, 1e-6))]
+    odds = iter([room_matcher.RoomOdds(np.array([[c, 1 - c]]), np.array([[c, 1 - c]])) for c in (0.0, 1.0, 0.0)])
+    monkeypatch.setattr(room_matcher, "estimate_turns", lambda a, b: tuple(turns))
+    monkeypatch.setattr(room_matcher, "run_network", lambda *args: next(odds))
+    found = room_matcher.match_turns(a, a, network())
+    expected = np.array([0.6, 0.39 * np.e, 0.01])  # the last turn is too unlikely to be looked at
+    assert [turned.probability for turned in found] == pytest.approx(expected / expected.sum())
+    assert [turned.quarters for turned in found] == [0, 1, 2] and found[1].yaw == pytest.approx(np.pi / 2)
 
 
 def test_the_network_that_ships_is_that_of_the_embedder_that_ships() -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +29,14 @@ from topomerge.embedding.quarter_turns import (
     Descriptor,
     Rows,
     TurnedRows,
-    align_rows,
     compute_edge_positions,
     compute_room_features,
+    compute_similarity,
     rotate_graph,
     rotate_to_walls,
 )
 from topomerge.embedding.shapedna import build_shapedna
-from topomerge.embedding.sheets import build_sheet_arrays
+from topomerge.embedding.sheets import build_tilted_sheet_arrays
 from topomerge.embedding.surroundings import CROP_SHAPES, cut_crops
 from topomerge.embedding.weights import read_embedder_card
 from topomerge.errors import InputError
@@ -81,28 +82,33 @@ class LearnedEmbedder:
         self.embedder = embedder
 
     def __call__(self, map: TopometricMap) -> Rows:
-        return self.embed_graph(self.build_arrays(map))[0]
+        return self.embed_views(self.build_views(map))[0]
 
     def at_scales(self, map: TopometricMap) -> Callable[[float], Rows]:
         """Return a function that embeds a map of unknown scale, given the m that its unit is taken for."""
         of_map = self._build_graph_arrays(map)
 
         def rows(scale: float) -> Rows:
-            arrays = rescale_graph(of_map, scale)
-            return self.embed_graph(arrays if self.network.turns == 1 else arrays | build_sheet_arrays(map, scale))[0]
+            return self.embed_views(self._add_sheets(rescale_graph(of_map, scale), map, scale))[0]
 
         return rows
 
     def compute_matchability(self, map: TopometricMap) -> Array:
         """(R,) float64: how alike a room of another map must at least be, as a cosine, before it is rather this one than none."""
-        return self.temperature * self.embed_graph(self.build_arrays(map))[1]
+        return self.temperature * self.embed_graph(self.build_views(map)[0])[1]
 
     def compute_probabilities(self, a: TopometricMap, b: TopometricMap) -> tuple[Array, Array]:
         """That each room of a (R_a, R_b + 1) is each of b, in the last place none of them; and of b likewise (R_b, R_a + 1)."""
-        (ea, da), (eb, db) = (self.embed_graph(self.build_arrays(m)) for m in (a, b))
-        ea, eb = align_rows(ea, eb)
-        logits = ea @ eb.T / self.temperature
+        (ea, da), (eb, db) = (self.embed_views(self.build_views(m)) for m in (a, b))
+        logits = compute_similarity(ea, eb) / self.temperature
         return softmax(np.column_stack([logits, da])), softmax(np.column_stack([logits.T, db]))
+
+    def embed_views(self, views: Sequence[Mapping[str, Array]]) -> tuple[Rows, Array]:
+        """Return embeddings of a map in each direction of its walls (`build_views`), and dustbins of the first one."""
+        (first, dustbin), *others = (self.embed_graph(arrays) for arrays in views)
+        if not isinstance(first, TurnedRows):
+            return first, dustbin
+        return replace(first, others=tuple(rows for rows, _ in others if isinstance(rows, TurnedRows))), dustbin
 
     def embed_graph(self, arrays: Mapping[str, Array]) -> tuple[Rows, Array]:
         """Return embeddings and dustbins (R,), as logits, of what `arrays` gives."""
@@ -127,17 +133,22 @@ class LearnedEmbedder:
             return rows[0], bins[0]
         dustbin = np.mean(bins, axis=0)
         facts = compute_room_features(arrays["x"], dustbin, arrays["pos"][:, 2])
-        return TurnedRows(np.stack(rows, axis=1), rotate_to_walls(arrays), self.embedder, facts), dustbin
+        direction = float(arrays["turn"][0]) if len(arrays["turn"]) else 0.0
+        return TurnedRows(np.stack(rows, axis=1), rotate_to_walls(arrays), self.embedder, facts, direction), dustbin
 
     @property
     def needs_points(self) -> bool:
         """Does the network read the points of rooms, or what is reckoned from them?"""
         return bool(set(self.network.geometry.parts) - {"scalars", *CROP_SHAPES})
 
-    def build_arrays(self, map: TopometricMap) -> dict[str, Array]:
-        """Build the arrays of a map that `graph` takes."""
-        arrays = self._build_graph_arrays(map)
-        return arrays if self.network.turns == 1 else arrays | build_sheet_arrays(map)
+    def build_views(self, map: TopometricMap) -> list[dict[str, Array]]:
+        """Build the arrays of a map that `embed_graph` takes, in each direction of its walls, the first one first."""
+        return self._add_sheets(self._build_graph_arrays(map), map, 1.0)
+
+    def _add_sheets(self, arrays: dict[str, Array], map: TopometricMap, scale: float) -> list[dict[str, Array]]:
+        if self.network.turns == 1:
+            return [arrays]
+        return [arrays | sheet for sheet in build_tilted_sheet_arrays(map, scale)]
 
     def _build_graph_arrays(self, map: TopometricMap) -> dict[str, Array]:
         return build_graph_arrays(map, POINTS_PER_ROOM if self.needs_points else 1)

@@ -1,13 +1,15 @@
-"""Rows of rooms that depend on how a map is turned: one for each quarter turn, and the turn that two maps have to each other.
+"""Rows of rooms that depend on how a map is turned: one for each quarter turn; and how two maps may be turned to each other.
 
-An embedder gives (R, D), or `TurnedRows`. Those of two maps are compared at one quarter turn for the whole pair: that at which
-most rooms that look alike are moved by the same way.
+An embedder gives (R, D), or `TurnedRows`. Those of two maps are compared under each turn at which directions of their walls
+coincide. None is chosen: each has a probability, and how alike two rooms are is the mean over all turns.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,10 +19,13 @@ from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, Array, TopometricMap
 
 QUARTERS = 4
 FACTS = count_columns("x") + 2
-SHARPNESS = 6.0  # that cosines are multiplied with before rooms choose partners; chosen, as those below, on validation pairs
-PARTNERS = 4  # pairs of rooms that vote, times the number of rooms
-WAYS_ALIKE = 0.5  # m, standard deviation of how far rooms that are one are moved
-ONE_PLACE = 1.0  # m, that of the middles of one room in two maps, of which one may have looked into it only
+LIKENESS, EVEN = 20.0, 0.65  # log odds that rooms are one grow so fast with the cosine of their rows, and are even at this one
+PARTNERED = 0.5  # probability that a room has a partner
+WAYS_ALIKE = 0.5  # m, standard deviation of how far rooms that are one are moved; chosen, as those above, by validation pairs
+ONE_PLACE = 1.0  # m, standard deviation between the middles of one room in two maps, of which one may have looked into it only
+PARTNERS, MOST_PAIRS = 4, 2000  # pairs of rooms that are taken, the most alike ones: times the number of rooms, and at most
+CREDIBLE = 0.9  # turns fit, of which the likeliest have this probability together
+SAME_YAW = np.radians(10.0)  # turns that differ by less are one
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +37,16 @@ class TurnedRows:
         places: (R, 2) m, middles of the rooms; both in the direction of the map's walls (`sheets.Sheet.turn`).
         embedder: hash of the weights that made them, where there is one.
         facts: (R, FACTS) what a matcher of two maps reads besides (`compute_room_features`), where there is one.
+        direction: rad, of the walls in the map's frame.
+        others: the same in other directions that walls have.
     """
 
     rows: Array
     places: Array
     embedder: str = ""
     facts: Array | None = None
+    direction: float = 0.0
+    others: tuple[TurnedRows, ...] = ()
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -68,50 +77,131 @@ def get_rows(rows: Rows) -> Array:
     return rows.rows if isinstance(rows, TurnedRows) else rows
 
 
-def align_rows(a: Rows, b: Rows) -> tuple[Array, Array]:
-    """Rows (R_a, D), (R_b, D) of two maps, of which the second one is turned so that it stands as the first one does.
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """A way to turn b so that it stands as a does.
 
-    All four turns of both maps have a say in how alike two rooms are. Plain rows stay as they are.
+    Args:
+        a, b: rows of both maps in those directions of walls that coincide.
+        quarters: quarter turns by which b is turned beyond that, counter-clockwise.
+        shift: x + i y, m, by which most rooms of b are moved then.
+        probability: that it is the true one, if one is.
     """
-    if not isinstance(a, TurnedRows) or not isinstance(b, TurnedRows):
-        return np.asarray(a), np.asarray(b)
-    return a.flatten(), b.flatten(estimate_quarter_turns(a, b))
+
+    a: TurnedRows
+    b: TurnedRows
+    quarters: int
+    shift: complex = 0j
+    probability: float = 1.0
+
+    @property
+    def yaw(self) -> float:
+        """rad, by which the frame of b is turned."""
+        return self.a.direction - self.b.direction + self.quarters * np.pi / 2
+
+    @cached_property
+    def cosine(self) -> Array:
+        """(R_a, R_b) how alike rooms are; all four turns of both maps have a say in it."""
+        out: Array = self.a.flatten() @ self.b.flatten(self.quarters).T
+        return out
+
+    @property
+    def ways(self) -> Array:
+        """(R_a, R_b) x + i y, m, from each room of b, as it is turned, to each of a."""
+        out: Array = _convert_to_complex(self.a.places)[:, None] - _convert_to_complex(self.b.places)[None] * 1j**self.quarters
+        return out
+
+    @property
+    def coincidence(self) -> Array:
+        """(R_a, R_b) from 0 to 1: is a room of b, turned and moved, where a room of a is?"""
+        out: Array = np.exp(-(np.abs(self.ways - self.shift) ** 2) / (2 * ONE_PLACE**2))
+        return out
 
 
-def estimate_quarter_turns(a: TurnedRows, b: TurnedRows) -> int:
-    """Quarter turns by which b is to be turned (`estimate_relative_position`)."""
-    return estimate_relative_position(a, b)[0]
+class YawProbability(NamedTuple):
+    """How likely a yaw of b in a is, rad in (-pi, pi]."""
+
+    yaw: float
+    probability: float
 
 
-def estimate_relative_position(a: TurnedRows, b: TurnedRows) -> tuple[int, complex]:
-    """Quarter turns by which b is to be turned, and the way that its rooms are moved by then, m: those on which the most votes
-    agree. Each two rooms vote for the way between them, the more the more alike they are, and the less alike others are to
-    them."""
+def estimate_turns(a: TurnedRows, b: TurnedRows) -> tuple[Turn, ...]:
+    """Return all turns at which directions of walls coincide, with their probabilities, which sum to 1.
+
+    The evidence of a turn is the mean over shifts of b of the likelihood of all rooms: each has a partner or none, and its
+    partner is as alike as rooms are that are one, and lies where the shift brings it.
+    """
+    turns = [Turn(v, w, k) for v in (a, *a.others) for w in (b, *b.others) for k in range(QUARTERS)]
     if not len(a) or not len(b):
-        return 0, 0j
-    flat, x, y = a.flatten(), _convert_to_complex(a.places), _convert_to_complex(b.places)
-    voted = [_find_most_votes(flat @ b.flatten(k).T, x, y * 1j**k) for k in range(QUARTERS)]
-    best = int(np.argmax([votes for votes, _ in voted]))
-    return best, voted[best][1]
+        return tuple(replace(turn, probability=1 / len(turns)) for turn in turns)
+    scored = [_score_turn(turn) for turn in turns]
+    turns = [replace(turn, shift=shift) for turn, (_, shift) in zip(turns, scored, strict=True)]
+    shares = compute_shares(np.array([evidence for evidence, _ in scored]))
+    return tuple(replace(turn, probability=float(share)) for turn, share in zip(turns, shares, strict=True))
 
 
-def score_common_motion(a: TurnedRows, b: TurnedRows, quarters: int, way: complex) -> Array:
-    """Return (R_a, R_b) from 0 to 1: is a room of b, turned and moved (`estimate_relative_position`), where a room of a is?"""
-    off = _convert_to_complex(a.places)[:, None] - _convert_to_complex(b.places)[None] * 1j**quarters - way
-    out: Array = np.exp(-(np.abs(off) ** 2) / (2 * ONE_PLACE**2))
+def compute_shares(log_evidence: Array) -> Array:
+    """Return probabilities (T,) of hypotheses of which one is true, from the logarithms of their evidence."""
+    weight = np.exp(log_evidence - log_evidence.max())
+    out: Array = weight / weight.sum()
     return out
 
 
-def _find_most_votes(cosine: Array, x: Array, y: Array) -> tuple[float, complex]:
-    weight = np.exp(SHARPNESS * (cosine - 1))
-    vote = weight / np.sqrt(weight.sum(axis=1, keepdims=True) * weight.sum(axis=0))
-    most = min(PARTNERS * (len(x) + len(y)), vote.size)
-    first, second = np.unravel_index(np.argpartition(-vote, most - 1, axis=None)[:most], vote.shape)
-    way = x[first] - y[second]
-    near = np.exp(-(np.abs(way[:, None] - way[None]) ** 2) / (2 * WAYS_ALIKE**2)) * vote[first, second]
-    total = near.sum(axis=1)
-    best = int(total.argmax())
-    return float(total[best]), complex(near[best] @ way / total[best])
+def _score_turn(turn: Turn) -> tuple[float, complex]:
+    """Logarithm of the evidence of a turn, and the shift that explains most of it."""
+    cosine, ways = turn.cosine, turn.ways
+    most = min(PARTNERS * sum(cosine.shape), MOST_PAIRS, cosine.size)
+    rooms = np.unravel_index(np.argpartition(-cosine, most - 1, axis=None)[:most], cosine.shape)
+    way, odds = ways[rooms], np.exp(LIKENESS * (cosine[rooms] - EVEN))
+    near = np.exp(-(np.abs(way[:, None] - way[None]) ** 2) / (2 * WAYS_ALIKE**2)) * odds
+    log_likelihood = np.zeros(most)  # of the shift that each pair of rooms says
+    for side, count in zip(rooms, cosine.shape, strict=True):
+        of_room = near @ (side[:, None] == np.arange(count))
+        log_likelihood += np.log1p(PARTNERED * (of_room - 1)).sum(axis=1) / 2  # each pair has two rooms, and counts once
+    best = int(log_likelihood.argmax())
+    evidence = log_likelihood[best] + np.log(np.exp(log_likelihood - log_likelihood[best]).sum())
+    return float(evidence), complex(near[best] @ way / near[best].sum())
+
+
+def compute_similarity(a: Rows, b: Rows) -> Array:
+    """(R_a, R_b) cosines of rows of length 1; where these depend on turns, the mean over all turns of b (`estimate_turns`)."""
+    if not isinstance(a, TurnedRows) or not isinstance(b, TurnedRows):
+        plain: Array = np.asarray(a) @ np.asarray(b).T
+        return plain
+    return average_turns(estimate_turns(a, b), lambda turn: turn.cosine)
+
+
+def average_turns(turns: Sequence[Turn], measure: Callable[[Turn], Array]) -> Array:
+    """Return the mean over turns, each as likely as it is, of (R_a, R_b) values."""
+    out: Array = np.sum([turn.probability * measure(turn) for turn in turns], axis=0)
+    return out
+
+
+def merge_yaws(found: Sequence[tuple[float, float]]) -> tuple[YawProbability, ...]:
+    """Return yaws with their probabilities, likeliest first; those of nearly the same yaw are one."""
+    merged: list[YawProbability] = []
+    for yaw, probability in sorted(found, key=lambda one: -one[1]):
+        near = [k for k, one in enumerate(merged) if is_same_yaw(one.yaw, yaw)]
+        if near:
+            merged[near[0]] = merged[near[0]]._replace(probability=merged[near[0]].probability + probability)
+        else:
+            merged.append(YawProbability(_wrap_angle(yaw), probability))
+    return tuple(sorted(merged, key=lambda one: -one.probability))
+
+
+def select_credible(yaws: Sequence[YawProbability]) -> tuple[YawProbability, ...]:
+    """Return the fewest yaws, likeliest first, that have the probability `CREDIBLE` together; yaws as of `merge_yaws`."""
+    before = np.cumsum([0.0, *(one.probability for one in yaws)])
+    return tuple(one for one, sum_before in zip(yaws, before, strict=False) if sum_before < CREDIBLE)
+
+
+def is_same_yaw(a: float, b: float) -> bool:
+    """Return whether two yaws, rad, are nearly the same."""
+    return abs(_wrap_angle(a - b)) < SAME_YAW
+
+
+def _wrap_angle(angle: float) -> float:
+    return float(-((-angle + np.pi) % (2 * np.pi) - np.pi))
 
 
 def _convert_to_complex(places: Array) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
 from topomerge.embedding.surroundings import CEILING_UNIT, GAP, SHEET_PIXEL, SHEET_PLANES, TIE
 from topomerge.extraction.plans.storey_plan import (
@@ -28,6 +29,8 @@ BELOW_FLOOR = 0.3  # m
 DOOR_RADIUS = 0.5  # m about a door's middle that is marked
 TURN_STEPS = (np.radians(1.0), np.radians(0.1))  # in which the direction of walls is sought
 MOST_DOORS = 8  # of a room
+MOST_DIRECTIONS, DIRECTIONS_APART = 3, np.radians(10.0)  # of walls that are told apart
+OTHER_DIRECTION = 0.15  # of the sharpness of the first direction, beyond what any has, that another one must have
 MOST_WALLS = 6000  # columns whose direction is taken
 BIN = 0.1  # m, into which walls are projected; columns are laid no farther apart
 
@@ -44,6 +47,7 @@ class Sheet:
         doors: (R, MOST_DOORS, 2) float32 pixels, doors of each room, those nearest to its middle first; nan where it has fewer.
         turn: (S,) float64 rad, direction of each storey's walls in the map's frame: that of the lowest in [0, pi/2), those of the
             others no more than pi/4 away from it.
+        tilts: rad, by how much other directions in which walls of the lowest storey line up differ from its first one.
     """
 
     planes: Array
@@ -51,17 +55,19 @@ class Sheet:
     anchor: Array
     doors: Array
     turn: Array
+    tilts: tuple[float, ...] = ()
 
 
-def rasterise_sheet(map: TopometricMap, scale: float = 1.0) -> Sheet:
+def rasterise_sheet(map: TopometricMap, scale: float = 1.0, tilt: float = 0.0) -> Sheet:
     """Return the sheet of a map; the same map gives the same one.
 
     Args:
         scale: m that the unit of a map of unknown scale is taken for; heights stay as they are.
+        tilt: rad, by which it is turned away from the first direction of walls.
     """
     storeys: list[Sheet] = []
     for s in range(len(map.storeys)):
-        storeys.append(_rasterise_storey(map, s, storeys[0].turn[0] if storeys else np.pi / 4, scale))
+        storeys.append(_rasterise_storey(map, s, storeys[0].turn[0] - tilt if storeys else np.pi / 4, scale, tilt))
     height = sum(len(s.room) + GAP for s in storeys)
     width = max((s.room.shape[1] for s in storeys), default=0)
     planes, room = np.zeros((height, width, len(SHEET_PLANES)), np.uint8), np.full((height, width), -1, np.int16)
@@ -73,23 +79,32 @@ def rasterise_sheet(map: TopometricMap, scale: float = 1.0) -> Sheet:
         of = map.rooms["storey"] == s
         anchor[of], doors[of] = storey.anchor[of] + (row, 0), storey.doors[of] + (row, 0)
         row += nx + GAP
-    return Sheet(planes, room, anchor, doors, np.array([s.turn[0] for s in storeys]))
+    return Sheet(planes, room, anchor, doors, np.array([s.turn[0] for s in storeys]), storeys[0].tilts if storeys else ())
 
 
 def build_sheet_arrays(map: TopometricMap, scale: float = 1.0) -> dict[str, Array]:
     """Return the sheet of a map by the names that it has among the tensors of a graph."""
-    drawn = rasterise_sheet(map, scale)
+    return _name_arrays(rasterise_sheet(map, scale))
+
+
+def build_tilted_sheet_arrays(map: TopometricMap, scale: float = 1.0) -> list[dict[str, Array]]:
+    """Return `build_sheet_arrays` in each direction in which walls line up, the first one first."""
+    first = rasterise_sheet(map, scale)
+    return [_name_arrays(sheet) for sheet in (first, *(rasterise_sheet(map, scale, tilt) for tilt in first.tilts))]
+
+
+def _name_arrays(drawn: Sheet) -> dict[str, Array]:
     places = {"anchor": drawn.anchor, "door_anchor": drawn.doors, "turn": drawn.turn}
     return {"sheet": drawn.planes, "sheet_room": drawn.room, **places}
 
 
-def _rasterise_storey(map: TopometricMap, storey: int, near: float, scale: float) -> Sheet:
-    """One storey by itself, turned by the direction of its walls that is no more than pi/4 from another, rad; anchors of other
-    storeys' rooms mean nothing."""
+def _rasterise_storey(map: TopometricMap, storey: int, near: float, scale: float, tilt: float) -> Sheet:
+    """One storey by itself, turned by the direction of its walls that is no more than pi/4 from another, rad, and the tilt;
+    anchors of other storeys' rooms mean nothing."""
     grid, nav = map.grid, map.navigable
     masks, ceiling = _classify_columns(map, storey)
-    turn = estimate_wall_direction(_compute_middles(grid.origin, np.argwhere(masks[0]), grid.edge))
-    turn = near + (turn - near + np.pi / 4) % (np.pi / 2) - np.pi / 4
+    first, *others = estimate_wall_directions(_compute_middles(grid.origin, np.argwhere(masks[0]), grid.edge))
+    turn = near + (first - near + np.pi / 4) % (np.pi / 2) - np.pi / 4 + tilt
     origin, edge = scale * grid.origin, scale * grid.edge
     wall, low, high, explored = (_sample_column_points(origin, np.argwhere(mask), edge, turn) for mask in masks)
     inside = np.flatnonzero((map.navigable_room >= 0) & (map.rooms["storey"][np.maximum(map.navigable_room, 0)] == storey))
@@ -109,7 +124,8 @@ def _rasterise_storey(map: TopometricMap, storey: int, near: float, scale: float
     anchor = (_rotate_points(middles[:, :2], turn) - raster.corner) / SHEET_PIXEL
     doors_of = (_rotate_points(of_rooms, turn).reshape(-1, MOST_DOORS, 2) - raster.corner) / SHEET_PIXEL
     rooms = raster.label(ground, label, np.column_stack([map.rooms["centroid"], map.rooms["area"]]))
-    return Sheet(planes.astype(np.uint8), rooms, anchor.astype(np.float32), doors_of.astype(np.float32), np.array([turn]))
+    tilts = tuple(other - first for other in others)
+    return Sheet(planes.astype(np.uint8), rooms, anchor.astype(np.float32), doors_of.astype(np.float32), np.array([turn]), tilts)
 
 
 def _classify_columns(map: TopometricMap, storey: int) -> tuple[tuple[Array, ...], Array]:
@@ -163,19 +179,26 @@ def _locate_room_doors(map: TopometricMap) -> Array:
     return out
 
 
-def estimate_wall_direction(walls: Array) -> float:
-    """The direction in [0, pi/2), rad, along which walls (n, 2), m, line up: that in which they fall into the fewest, fullest
-    bins of both axes; 0 without any."""
+def estimate_wall_directions(walls: Array) -> tuple[float, ...]:
+    """Return directions in [0, pi/2), rad, along which walls (n, 2), m, line up, the sharpest first: there they fall into
+    the fewest, fullest bins of both axes; 0 without any walls."""
     if not len(walls):
-        return 0.0
+        return (0.0,)
     walls = walls[np.linspace(0, len(walls) - 1, min(len(walls), MOST_WALLS)).astype(int)]
     walls = walls - walls.mean(axis=0)
-    best, around = 0.0, np.pi / 4
-    for step in TURN_STEPS:
-        turns = best + np.arange(-round(around / step), round(around / step)) * step
-        best = float(turns[int(np.argmax([_measure_sharpness(walls, float(turn)) for turn in turns]))])
-        around = step
-    return best % (np.pi / 2)
+    turns = np.arange(-45, 45) * TURN_STEPS[0]
+    sharpness = np.array([_measure_sharpness(walls, float(turn)) for turn in turns])
+    excess = sharpness - np.median(sharpness)
+    around = ndimage.maximum_filter1d(sharpness, 2 * round(DIRECTIONS_APART / TURN_STEPS[0]) - 1, mode="wrap")
+    peaks = np.flatnonzero((sharpness == around) & (excess >= OTHER_DIRECTION * excess.max()))
+    best = peaks[np.argsort(-sharpness[peaks], kind="stable")[:MOST_DIRECTIONS]]
+    return tuple(_refine_direction(walls, float(turns[k])) % (np.pi / 2) for k in best)
+
+
+def _refine_direction(walls: Array, turn: float) -> float:
+    around = round(TURN_STEPS[0] / TURN_STEPS[1])
+    turns = turn + np.arange(-around, around) * TURN_STEPS[1]
+    return float(turns[int(np.argmax([_measure_sharpness(walls, float(near)) for near in turns]))])
 
 
 def _measure_sharpness(walls: Array, turn: float) -> float:

@@ -18,7 +18,7 @@ from topomerge.archive import convert_to_plain
 from topomerge.code_digest import compute_code_digest
 from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, load_evaluation_pair
 from topomerge.embedding.learned import EMBEDDERS, POINT_TABLES, build_embedder
-from topomerge.embedding.quarter_turns import Descriptor, Rows, align_rows, get_rows
+from topomerge.embedding.quarter_turns import Descriptor, Rows, get_rows
 from topomerge.errors import InputError
 from topomerge.evaluation.settings import Evaluation, Variant, iter_variants
 from topomerge.fusion.match_belief import update_match_probabilities
@@ -43,25 +43,28 @@ class Inputs:
     """What networks read of the maps of a pair: made once, as several read the same; the seconds count for each that reads it."""
 
     def __init__(self) -> None:
-        self.arrays: dict[tuple[int, bool, bool], dict[str, Array]] = {}
+        self.views: dict[tuple[int, bool, bool], list[dict[str, Array]]] = {}
         self.seconds: dict[tuple[int, bool, bool, str], float] = {}
 
     def embed_rows(self, learned: Any, side: int, m: TopometricMap) -> tuple[Rows, float]:
         """Return descriptors of a map by a network, and the seconds."""
         key = (side, learned.needs_points, learned.network.turns > 1)
-        if key not in self.arrays:
+        if key not in self.views:
             began = time.process_time()
-            self.arrays[key] = learned.build_arrays(m)
+            self.views[key] = learned.build_views(m)
             self.seconds[*key, ""] = time.process_time() - began
-        arrays = self.arrays[key]
+        views = self.views[key]
+        arrays = views[0]
         extras = [name for name in POINT_TABLES if name in learned.network.geometry.parts]
         for name in extras:
             if name not in arrays and len(arrays["x"]):
                 began = time.process_time()
-                arrays[name] = POINT_TABLES[name](arrays["room_points"])
+                table = POINT_TABLES[name](arrays["room_points"])
+                for view in views:
+                    view[name] = table
                 self.seconds[*key, name] = time.process_time() - began
         began = time.process_time()
-        rows: Rows = learned.embed_graph(arrays)[0]
+        rows: Rows = learned.embed_views(views)[0]
         spent = sum(self.seconds.get((*key, name), 0.0) for name in ("", *extras))
         return rows, time.process_time() - began + spent
 
@@ -145,9 +148,7 @@ def predict(path: Path, target: Path, settings: Evaluation) -> str:
     rows = {v.name: describe_maps(v, maps, path, settings, inputs) for v in evaluated_variants}
     record["seconds"] = {name: seconds for name, (_, seconds) in rows.items()}
     for v in evaluated_variants:
-        a, b = align_rows(*rows[v.name][0])
-        arrays[f"{v.name}/a"], arrays[f"{v.name}/b"] = a.astype(np.float32), b.astype(np.float32)
-        arrays[f"{v.name}/cost"] = compute_descriptor_costs(a, b).astype(np.float32)
+        arrays[f"{v.name}/cost"] = compute_descriptor_costs(*rows[v.name][0]).astype(np.float32)
         for method in v.methods:
             arrays |= {
                 f"{v.name}/{method}/{key}": value

@@ -43,7 +43,6 @@ from topomerge.datasets.plans.sealed import SEALED_FOLDERS, is_sealed, is_sealed
 from topomerge.datasets.public.sources import iter_public_pairs
 from topomerge.datasets.simulation.floor_truth import evaluate_map
 from topomerge.embedding.learned import build_embedder
-from topomerge.embedding.quarter_turns import align_rows
 from topomerge.errors import InputError
 from topomerge.evaluation.groups import compute_value
 from topomerge.evaluation.merges import compare_pose, time_registration
@@ -79,8 +78,7 @@ def count_pair_ranks(pair: Pair, place: str) -> list[Row]:
     out = []
     for name in RANKED:
         describe = build_embedder(name)
-        a, b = align_rows(describe(maps[0]), describe(maps[1]))
-        counts = count_ranks(judged, compute_descriptor_costs(a, b))
+        counts = count_ranks(judged, compute_descriptor_costs(describe(maps[0]), describe(maps[1])))
         out.append({"place": place, "building": place, "pair": pair.name, "embedder": name, **counts})
     return out
 

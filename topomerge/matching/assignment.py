@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from topomerge.embedding.quarter_turns import Rows, align_rows, find_neighbours
+from topomerge.embedding.quarter_turns import Rows, TurnedRows, compute_similarity, find_neighbours
 from topomerge.types import Array, Sim3, TopometricMap
 
 
@@ -68,13 +68,16 @@ def match_by_overlap(
 
 def compute_descriptor_costs(a: Rows, b: Rows, standardise: bool = False) -> Array:
     """(R_a, R_b) Euclidean distances of the rows of a (R_a, D) and b (R_b, D), over the root of D; where rooms have a row for
-    each quarter turn, at that which both maps have to each other (`embedding.turns`).
+    each quarter turn, as far apart as rows of length 1 of their mean cosine over turns (`embedding.quarter_turns`).
 
     Args:
         standardise: scale each column by its standard deviation over the rooms of both maps first. Rooms that only one map has
             then change the costs of all, so it is not for descriptors that are scaled already.
     """
-    a, b = align_rows(a, b)
+    if isinstance(a, TurnedRows) and isinstance(b, TurnedRows):
+        apart: Array = np.sqrt(np.maximum(2 - 2 * compute_similarity(a, b), 0.0))
+        return apart / np.sqrt(max(a.rows[0].size, 1) if len(a) else 1)
+    a, b = np.asarray(a), np.asarray(b)
     if standardise and len(a) + len(b):
         spread = np.concatenate([a, b]).std(axis=0)
         scale = np.where(spread > 1e-9, spread, 1.0)

@@ -12,7 +12,16 @@ import numpy as np
 from topomerge.archive import convert_to_plain
 from topomerge.embedding.learned import DEFAULT
 from topomerge.embedding.learned import build_embedder as make_embedder
-from topomerge.embedding.quarter_turns import Descriptor, Rows, TurnedRows
+from topomerge.embedding.quarter_turns import (
+    Descriptor,
+    Rows,
+    TurnedRows,
+    YawProbability,
+    estimate_turns,
+    is_same_yaw,
+    merge_yaws,
+    select_credible,
+)
 from topomerge.errors import InputError
 from topomerge.matching.assignment import (
     align,
@@ -43,6 +52,7 @@ class Matching:
         transform: T_ab of the best hypothesis; None where rooms were matched without geometry.
         alternatives: all hypotheses, best first (the first one is that of `transform`).
         statistics: of the cost matrix and the search.
+        turns: how the frame of b may be turned to stand as that of a, likeliest first; none where rows tell nothing of turns.
     """
 
     rooms: Array = field(default_factory=_build_empty_rooms)
@@ -50,6 +60,12 @@ class Matching:
     transform: Sim3 | None = None
     alternatives: tuple[PoseHypothesis, ...] = ()
     statistics: Mapping[str, float] = field(default_factory=dict)
+    turns: tuple[YawProbability, ...] = ()
+
+    @property
+    def fitting_turns(self) -> tuple[YawProbability, ...]:
+        """The fewest turns of which one is the true one with probability 0.9: several, where a plan is symmetric."""
+        return select_credible(self.turns)
 
     def __post_init__(self) -> None:
         if self.rooms.shape != (len(self.probability), 2):
@@ -118,22 +134,43 @@ def match(
     statistics["usual_best_cost"] = compute_usual_best_cost(cost)
     if method == "assignment":
         pairs = assign(cost, 2 * compute_usual_best_cost(cost) if largest_cost is None else largest_cost)
-        return Matching(pairs, similarity[tuple(pairs.T)], statistics=statistics)
+        return Matching(pairs, similarity[tuple(pairs.T)], statistics=statistics, turns=find_turns(rows, ()))
     odds: tuple[RoomOdds, ...] = ()
     if method in ("attention", "consistent"):
         odds = _compute_odds(describe, rows, b, scale_free, statistics)
     if method == "attention":
         return _match_by_attention(a, b, odds, statistics)
+    turns = find_turns(rows, odds)
     if method == "consistent":
         likely = combine_turn_certainties(odds) if odds else similarity
         ranked = propose_hypotheses(
             a, b, 1 - likely if odds else cost, likely, scale_free, MOST_HYPOTHESES, statistics.get("scale") if odds else None
         )
         rooms, probability = select_marginal_matches(a, b, ranked)
+        turns = weigh_turns(turns, ranked)
     else:  # one hypothesis wins as a whole, as in the thesis
         ranked = _grow_ranked_hypotheses(a, b, cost, similarity, growing)
         rooms, probability = (ranked[0].rooms, ranked[0].fit) if ranked else (np.zeros((0, 2), np.int64), np.zeros(0))
-    return Matching(rooms, probability, ranked[0].transform if ranked else None, ranked, statistics)
+    return Matching(rooms, probability, ranked[0].transform if ranked else None, ranked, statistics, turns)
+
+
+def find_turns(rows: tuple[Rows, Rows], odds: Sequence[RoomOdds]) -> tuple[YawProbability, ...]:
+    """Return how likely each turn is by `room_matcher`, or by rows alone where it has no say."""
+    a, b = rows
+    if not odds and isinstance(a, TurnedRows) and isinstance(b, TurnedRows):
+        return merge_yaws([(turn.yaw, turn.probability) for turn in estimate_turns(a, b)])
+    return merge_yaws([(turned.yaw, turned.probability) for turned in odds])
+
+
+def weigh_turns(turns: Sequence[YawProbability], ranked: Sequence[PoseHypothesis]) -> tuple[YawProbability, ...]:
+    """Return turns with the evidence of walls in their probabilities: that of the hypotheses so turned, and a share of what is
+    left for none of them."""
+    rest = max(1 - sum(h.probability for h in ranked), 0.0) / max(len(turns), 1)
+    walls = [sum(h.probability for h in ranked if is_same_yaw(h.transform.yaw, turn.yaw)) + rest for turn in turns]
+    weight = np.array([turn.probability for turn in turns]) * walls
+    if not weight.sum():
+        return tuple(turns)
+    return merge_yaws([(turn.yaw, float(p)) for turn, p in zip(turns, weight / weight.sum(), strict=True)])
 
 
 def _compute_odds(
@@ -149,19 +186,20 @@ def _compute_odds(
 
 
 def _match_by_attention(a: TopometricMap, b: TopometricMap, odds: Sequence[RoomOdds], statistics: dict[str, float]) -> Matching:
-    """Matches of `room_matcher`, and the pose that most of their doors and middles vote for.
+    """Matches of `room_matcher` at the likeliest turn, and the pose that most of their doors and middles vote for; how probable a
+    match is, is the mean over turns.
 
     Raises:
         InputError: the rows are of another embedder.
     """
     if not odds:
         raise InputError("method attention needs the embedder that ships; take method consistent")
-    certain = max(odds, key=lambda turned: turned.confidence).certainty
-    rooms = assign_certain(certain, LEAST_CERTAINTY)
-    pose = find_voted_pose(a, b, certain, statistics.get("scale"))
-    probability = certain[tuple(rooms.T)]
+    likeliest = max(odds, key=lambda turned: turned.probability)
+    rooms = assign_certain(likeliest.certainty, LEAST_CERTAINTY)
+    pose = find_voted_pose(a, b, likeliest.certainty, statistics.get("scale"))
+    probability = combine_turn_certainties(odds)[tuple(rooms.T)]
     ranked = () if pose is None else (PoseHypothesis(pose, float(len(rooms)), 1.0, {}, True, rooms, probability),)
-    return Matching(rooms, probability, pose, ranked, statistics)
+    return Matching(rooms, probability, pose, ranked, statistics, find_turns((np.zeros(0), np.zeros(0)), odds))
 
 
 def check(a: TopometricMap, b: TopometricMap) -> None:
@@ -238,6 +276,7 @@ def serialise_matching(matching: Matching, a: TopometricMap, b: TopometricMap) -
         "hypotheses": [
             _serialise_hypothesis(h, convert_pose_to_files(h.transform, b.levelling, a.levelling)) for h in matching.alternatives
         ],
+        "turns": [{"yaw": turn.yaw, "probability": round(turn.probability, 4)} for turn in matching.turns],
         "statistics": dict(matching.statistics),
     }
     out: dict[str, Any] = convert_to_plain(listing)
@@ -273,4 +312,16 @@ def format_matching(matching: Matching, a: TopometricMap, b: TopometricMap) -> s
         numbers = "  ".join(f"{v:>7.2f}" for v in h.transform.translation)
         yaw = math.degrees(h.transform.yaw)
         lines.append(f"{k:>10}  {h.probability:>11.2f}  {len(h.rooms):>7}  {yaw:>7.1f}  {numbers}  {h.transform.scale:>5.3f}")
-    return "\n".join(lines)
+    return "\n".join([*lines, *format_turns(matching)])
+
+
+COUNT_WORDS = {2: "two", 3: "three", 4: "four"}
+
+
+def format_turns(matching: Matching) -> list[str]:
+    """Return a line that names the turns that fit, where more than one does."""
+    degrees = sorted(round(math.degrees(turn.yaw)) for turn in matching.fitting_turns)
+    if len(degrees) < 2:
+        return []
+    named = f"{', '.join(map(str, degrees[:-1]))} and {degrees[-1]}"
+    return ["", f"{COUNT_WORDS.get(len(degrees), str(len(degrees)))} turns fit ({named} degrees)"]

@@ -10,7 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from topomerge.archive import find_weights_file
-from topomerge.embedding.quarter_turns import FACTS, QUARTERS, Rows, TurnedRows, estimate_quarter_turns
+from topomerge.embedding.quarter_turns import (
+    FACTS,
+    QUARTERS,
+    Rows,
+    Turn,
+    TurnedRows,
+    compute_shares,
+    estimate_turns,
+)
 from topomerge.errors import InputError
 from topomerge.kernels.registration import sum_votes
 from topomerge.networks.network import WEIGHTS_PACKAGE, Run, Signature, Tensor, load_network, read_card
@@ -31,6 +39,7 @@ MOST_VOTERS = 2000  # and at most
 MOST_VOTED = 20_000  # pairs of rooms that are voted for, the likeliest ones
 FIRST_SHARPNESS = 25.0  # that cosines are multiplied with for the first votes
 LIKENESS_SCALE = 10.0  # that likeness is multiplied with, times what is learned
+LEAST_TURN = 1e-4  # probability of a turn by rows alone, below which the network does not look at it
 UNUSUAL = 4.0  # standard deviations by which a fact differs from what is usual, at most
 MOST_SIZE = 4096  # of a network; more is a mistake, or a file that was made to take all memory
 
@@ -76,12 +85,16 @@ class RoomOdds:
     Args:
         rows: (R_a, R_b + 1) probability of each partner of each room of a, in the last place none.
         columns: (R_b, R_a + 1) likewise of the rooms of b.
-        quarters: quarter turns by which b stands in a.
+        quarters: quarter turns by which b stands in a, beyond the directions of walls.
+        yaw: rad, by which the frame of b is turned.
+        probability: of this turn.
     """
 
     rows: Array
     columns: Array
     quarters: int = 0
+    yaw: float = 0.0
+    probability: float = 1.0
 
     @property
     def certainty(self) -> Array:
@@ -96,11 +109,11 @@ class RoomOdds:
 
 
 def compute_room_odds(a: Rows, b: Rows, likeliest: bool = False) -> tuple[RoomOdds, ...]:
-    """Partners of the rooms of two maps at each of four quarter turns of the second one; none where the rows are not those of the
-    embedder that the network was trained with, or a map has no rooms. Which map is given first changes nothing.
+    """Partners of the rooms of two maps at each turn of the second one that may be true (`match_turns`); none where the rows are
+    not those of the embedder that the network was trained with, or a map has no rooms. Which map is given first changes nothing.
 
     Args:
-        likeliest: only at the turn that rows vote for (`turns.estimate_quarter_turns`).
+        likeliest: only at the turn that is likeliest by rows alone.
 
     Raises:
         InputError: the network is damaged.
@@ -111,12 +124,33 @@ def compute_room_odds(a: Rows, b: Rows, likeliest: bool = False) -> tuple[RoomOd
             return ()
     assert isinstance(a, TurnedRows) and isinstance(b, TurnedRows)
     if _compute_order_key(b) < _compute_order_key(a):  # rows are read as they are turned: the second map as the first one stands
-        swapped = [RoomOdds(o.columns, o.rows, -o.quarters % QUARTERS) for o in compute_room_odds(b, a, likeliest)]
-        return tuple(sorted(swapped, key=lambda turned: turned.quarters))
+        return tuple(
+            RoomOdds(odds.columns, odds.rows, -odds.quarters % QUARTERS, -odds.yaw, odds.probability)
+            for odds in match_turns(b, a, matcher, likeliest)
+        )
+    return match_turns(a, b, matcher, likeliest)
+
+
+def match_turns(a: TurnedRows, b: TurnedRows, matcher: Matcher, likeliest: bool = False) -> tuple[RoomOdds, ...]:
+    """Run the network at each turn that is not unlikely by rows alone. What it is sure of is evidence: the logarithm of a turn's
+    probability by rows (`estimate_turns`) and the confidence at it add up.
+
+    Args:
+        a, b: rows with facts.
+        likeliest: only at the likeliest turn.
+    """
+    turns = estimate_turns(a, b)
     if likeliest:
-        k = estimate_quarter_turns(a, b)
-        return (replace(run_network(build_rooms_seen(a), build_rooms_seen(b, k), matcher), quarters=k),)
-    return match_every_turn(build_rooms_seen(a), [build_rooms_seen(b, k) for k in range(QUARTERS)], matcher)
+        turns = (max(turns, key=lambda turn: turn.probability),)
+    turns = tuple(turn for turn in turns if turn.probability >= LEAST_TURN)
+    found = [_match_turn(turn, matcher) for turn in turns]
+    evidence = np.log([turn.probability for turn in turns]) + [odds.confidence for odds in found]
+    return tuple(replace(odds, probability=float(p)) for odds, p in zip(found, compute_shares(evidence), strict=True))
+
+
+def _match_turn(turn: Turn, matcher: Matcher) -> RoomOdds:
+    odds = run_network(build_rooms_seen(turn.a), build_rooms_seen(turn.b, turn.quarters), matcher)
+    return replace(odds, quarters=turn.quarters, yaw=turn.yaw)
 
 
 def _compute_order_key(rows: TurnedRows) -> tuple[int, float]:
@@ -126,10 +160,8 @@ def _compute_order_key(rows: TurnedRows) -> tuple[int, float]:
 
 
 def combine_turn_certainties(odds: Sequence[RoomOdds]) -> Array:
-    """Return (R_a, R_b) certainty of pairs over all turns, each as likely as it is sure of itself."""
-    sure = np.array([turned.confidence for turned in odds])
-    share = np.exp(sure - sure.max())
-    out: Array = np.tensordot(share / share.sum(), [turned.certainty for turned in odds], axes=1)
+    """Return (R_a, R_b) certainty of pairs, the mean over turns."""
+    out: Array = np.sum([turned.probability * turned.certainty for turned in odds], axis=0)
     return out
 
 
@@ -143,11 +175,6 @@ def build_rooms_seen(rows: TurnedRows, quarters: int = 0) -> RoomsSeen:
     turned = (rows.places @ np.array([1, 1j])) * 1j**quarters
     places = np.stack([turned.real, turned.imag], axis=1)
     return RoomsSeen(rows.flatten(quarters), places - places.mean(axis=0), rows.facts[:, -1], rows.facts)
-
-
-def match_every_turn(a: RoomsSeen, turned: Sequence[RoomsSeen], matcher: Matcher) -> tuple[RoomOdds, ...]:
-    """Return the network on a map and another one in each of its quarter turns."""
-    return tuple(replace(run_network(a, b, matcher), quarters=k) for k, b in enumerate(turned))
 
 
 def run_network(a: RoomsSeen, b: RoomsSeen, matcher: Matcher) -> RoomOdds:
@@ -244,7 +271,7 @@ RowsAt = Callable[[float], Rows]
 
 
 def find_best_scale(of_a: Rows, of_b: Rows, rows_at: RowsAt) -> tuple[float, tuple[RoomOdds, ...]]:
-    """m that the unit of the second map is taken for, and the partners of the rooms of both maps at each quarter turn then; 1 and
+    """m that the unit of the second map is taken for, and the partners of the rooms of both maps at each likely turn then; 1 and
     none where the rows are of an embedder for which there is no such network.
 
     Args:
@@ -257,7 +284,7 @@ def find_best_scale(of_a: Rows, of_b: Rows, rows_at: RowsAt) -> tuple[float, tup
     rows: dict[float, Rows] = {}
 
     def sureness(scale: float) -> float:
-        """At the quarter turn that most rooms which look alike vote for: all four take four times as long."""
+        """At the turn that is likeliest by rows alone: all of them take longer."""
         rows[scale] = rows[scale] if scale in rows else rows_at(scale)
         return compute_room_odds(of_a, rows[scale], likeliest=True)[0].confidence
 

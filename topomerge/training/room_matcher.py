@@ -22,7 +22,7 @@ from topomerge.embedding.quarter_turns import QUARTERS, TurnedRows, compute_room
 from topomerge.embedding.weights import read_embedder_card
 from topomerge.errors import InputError
 from topomerge.matching.assignment import assign_certain, count_pairs, has_twin, rank_partners
-from topomerge.matching.room_matcher import Matcher, RoomsSeen, build_rooms_seen, build_signature, match_every_turn, read_matcher
+from topomerge.matching.room_matcher import Matcher, RoomsSeen, build_rooms_seen, build_signature, match_turns, read_matcher
 from topomerge.models.embedder import Embedder
 from topomerge.models.export import build_sample
 from topomerge.models.losses import NEVER_LOGIT
@@ -197,7 +197,7 @@ def compute_deep_loss(layers: Sequence[Partners], links: Tensor) -> Tensor:
 
 
 def compute_confidence(partners: Partners) -> Tensor:
-    """Compute the confidence of a matching, by which the turn is chosen (`RoomOdds.confidence`)."""
+    """Compute the confidence of a matching, which is evidence of the turn (`RoomOdds.confidence`)."""
     return (partners.rows[:, :-1] + partners.columns[:, :-1].T).exp().sum()
 
 
@@ -206,10 +206,7 @@ def score_matcher(watched: Sequence[MatcherExample], matcher: Matcher) -> dict[s
     ranks, twins, turns, counts = [], [], [], np.zeros((len(LEAST_CERTAINTIES), 4), int)
     for example in watched:
         a, b, matches = example.a[0], example.b[0], example.pair.matches.numpy()
-        odds = max(
-            match_every_turn(a.compute_rooms_seen(0), [b.compute_rooms_seen(k) for k in range(QUARTERS)], matcher),
-            key=lambda turned: turned.confidence,
-        )
+        odds = max(match_turns(a.rows, b.rows, matcher), key=lambda turned: turned.probability)
         counts += [count_pairs(assign_certain(odds.certainty, least), matches) for least in LEAST_CERTAINTIES]
         if len(matches) and example.quarters is not None:
             turns.append(odds.quarters == example.quarters)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from topomerge.embedding.graph import is_door_edge
-from topomerge.embedding.quarter_turns import Rows, TurnedRows, align_rows, rotate_to_walls
+from topomerge.embedding.quarter_turns import Rows, TurnedRows, estimate_turns, rotate_to_walls
 from topomerge.matching.assignment import assign_certain, compute_certainty, count_pairs, has_twin, rank_partners
 from topomerge.models.embedder import Embedder, match_scores
 from topomerge.training.batches import find_well_seen_rooms, make_batch
@@ -26,7 +26,8 @@ LEAST_CERTAINTIES = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)  # certainty of 
 
 @torch.no_grad()
 def embed(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu") -> list[tuple[Tensor, Tensor]]:
-    """Return (embedding, dustbin) of each map, a0 b0 a1 b1 ..., on the CPU; where turns matter, b is turned as its rooms tell."""
+    """Return (embedding, dustbin) of each map, a0 b0 a1 b1 ..., on the CPU; where turns matter, that of b is the mean over its
+    turns, each as likely as it is (`estimate_turns`)."""
     training = network.training
     network.eval()
     out: list[tuple[Tensor, Tensor]] = []
@@ -35,12 +36,20 @@ def embed(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu") ->
         embedding, dustbin = network.embed_rotations(batch.tensors)
         rows, bins = (part.float().cpu().split(batch.rooms) for part in (embedding, dustbin))
         for k, pair in zip(range(0, len(rows), 2), pairs[start : start + PAIRS_AT_ONCE], strict=True):
-            sides = align_rows(
+            sides = _align_rows(
                 *(_build_rows(of.numpy(), graph) for of, graph in zip(rows[k : k + 2], (pair.a, pair.b), strict=True))
             )
             out += [(torch.from_numpy(of), bins[k + i]) for i, of in enumerate(sides)]
     network.train(training)
     return out
+
+
+def _align_rows(a: Rows, b: Rows) -> tuple[Array, Array]:
+    """Rows of two maps of which the products are the mean cosines over turns (`compute_similarity`)."""
+    if not isinstance(a, TurnedRows) or not isinstance(b, TurnedRows):
+        return np.asarray(a), np.asarray(b)
+    mean: Array = np.sum([turn.probability * b.flatten(turn.quarters) for turn in estimate_turns(a, b)], axis=0)
+    return a.flatten(), mean
 
 
 def _build_rows(rows: Array, graph: Mapping[str, Tensor]) -> Rows:

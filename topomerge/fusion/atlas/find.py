@@ -1,8 +1,8 @@
 """Which maps and rooms of an atlas does a new map show? The rows of all rooms are compared, and it is laid coarsely on the maps
 that show most of them; nothing is registered.
 
-Each room of the new map has one vote. It goes to the rooms of the atlas that look most like it, shared by how alike they are; a
-map is turned by the one quarter turn, and moved by the one way, at which all of it is most alike. A map's share is that of the
+Each room of the new map has one vote. It goes to the rooms of the atlas that look most like it, shared by how alike they are, and
+by whether they lie where all of it is most alike; both are means over the turns of a map. A map's share is that of the
 votes that its rooms got: it says where to look first, not whether the place is there at all. That is what `merge` is for.
 The first `LAID_COARSELY` are ordered by how well their walls fit: rooms of small maps look like those of many others.
 
@@ -20,7 +20,7 @@ import numpy as np
 
 from topomerge.embedding.learned import DEFAULT
 from topomerge.embedding.learned import build_embedder as make_embedder
-from topomerge.embedding.quarter_turns import Rows, TurnedRows, estimate_relative_position, score_common_motion
+from topomerge.embedding.quarter_turns import Rows, TurnedRows, average_turns, estimate_turns
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.folder import StoredAtlas, read_atlas
 from topomerge.fusion.atlas.maps import Maps
@@ -144,9 +144,9 @@ def _compute_similarity(new: Rows, rows: Rows) -> tuple[Array, Array]:
     if not isinstance(new, TurnedRows) or not isinstance(rows, TurnedRows):
         cosine = _normalise_rows(np.asarray(new)) @ _normalise_rows(np.asarray(rows)).T
         return cosine, np.ones_like(cosine)
-    quarters, way = estimate_relative_position(new, rows)
-    there = ELSEWHERE + (1 - ELSEWHERE) * score_common_motion(new, rows, quarters, way)
-    return _normalise_rows(new.flatten()) @ _normalise_rows(rows.flatten(quarters)).T, there
+    turns = estimate_turns(new, rows)
+    there = ELSEWHERE + (1 - ELSEWHERE) * average_turns(turns, lambda turn: turn.coincidence)
+    return average_turns(turns, lambda turn: turn.cosine), there
 
 
 def _normalise_rows(rows: Array) -> Array:
