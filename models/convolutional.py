@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from topomerge.extraction.elevations.elevation import DEPTHS, DILATIONS, PLACES, STRIP_CHANNELS, TAPS, WALL_CLASSES
 from topomerge.extraction.plans.plan_network import DOWN_LEVELS, EVIDENCE_CHANNELS, UP_LEVELS
 from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES
+from topomerge.networks.drawing import DRAWING_CLASSES
 from topomerge.registration.evidence.places import CONVOLUTIONS, PLANES
 
 
@@ -148,3 +149,46 @@ class PlaceLogOdds(nn.Module):
         """(n, side, side, PLANES) to (n,)."""
         odds: Tensor = self.network(planes.permute(0, 3, 1, 2))
         return odds
+
+
+class DrawingUNet(nn.Module):
+    """(n, 3, h, w) pages to (n, 8, h, w) scores of `networks.drawing.DRAWING_CLASSES`; sides are multiples of 32.
+
+    Args:
+        widths: channels of the page's own pixels, and of the five levels below, each of half the side (Ronneberger et al. 2015).
+    """
+
+    def __init__(self, widths: Sequence[int]) -> None:
+        super().__init__()
+        first, *lower = widths
+        self.first = nn.Sequential(_build_layer(3, first), _build_layer(first, first))
+        self.down, self.up = nn.ModuleList(), nn.ModuleList()
+        for wide, width in zip(widths, lower, strict=False):
+            self.down.append(nn.Sequential(_build_layer(wide, width, 2), _build_layer(width, width)))
+        for wide, width in zip(reversed(lower), reversed(widths[:-1]), strict=True):
+            self.up.append(_build_layer(wide + width, width))
+        self.out = nn.Conv2d(first, len(DRAWING_CLASSES), 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return scores, not normalised."""
+        skips = [self.first(x)]
+        for layer in self.down:
+            skips.append(layer(skips[-1]))
+        x = skips.pop()
+        for layer in self.up:
+            x = layer(torch.cat([nn.functional.interpolate(x, scale_factor=2.0), skips.pop()], dim=1))
+        scores: Tensor = self.out(x)
+        return scores
+
+
+class DrawingProbabilities(nn.Module):
+    """The network with probabilities for scores: what is exported, for `networks.drawing.DRAWING_SIGNATURE`."""
+
+    def __init__(self, network: DrawingUNet) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, picture: Tensor) -> Tensor:
+        """(n, 3, h, w) to (n, 8, h, w)."""
+        probabilities: Tensor = self.network(picture).softmax(dim=1)
+        return probabilities

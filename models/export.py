@@ -15,10 +15,10 @@ from topomerge.models.embedder import Embedder
 from torch import Tensor, nn
 
 import topomerge
+from topomerge.archive import replace_on_success
 from topomerge.embedding.network import build_embedder_signature
 from topomerge.embedding.weights import EMBEDDER_FILE, build_card
 from topomerge.errors import InputError
-from topomerge.io.archive import replace_on_success
 from topomerge.networks.network import Run, Signature, write_card
 from topomerge.types import Array
 

@@ -20,6 +20,7 @@ from topomerge.models.embedder import Embedder
 from topomerge.models.export import Ordered, read_weights, run_with_torch
 from torch import Tensor
 
+from topomerge.archive import replace_on_success
 from topomerge.embedding.network import build_embedder_signature
 from topomerge.embedding.weights import (
     STATE_FILE,
@@ -31,7 +32,6 @@ from topomerge.embedding.weights import (
     read_embedder_card,
 )
 from topomerge.errors import InputError
-from topomerge.io.archive import replace_on_success
 
 if TYPE_CHECKING:
     from topomerge.embedding.learned import LearnedEmbedder

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from topomerge import archive
 from topomerge.embedding.engineered import compute_door_layout
 from topomerge.embedding.graph import count_columns
 from topomerge.embedding.surroundings import CROP, CROP_SHAPES, SHEET_PLANES
-from topomerge.io import archive
 from topomerge.training.batches import add_views
 from topomerge.training.packed_pairs import GraphPair
 

@@ -6,8 +6,8 @@ import os
 
 import pytest
 
+from topomerge.archive import replace_on_success
 from topomerge.errors import InputError
-from topomerge.io.archive import replace_on_success
 
 
 def test_whole_or_absent(tmp_path):

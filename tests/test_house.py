@@ -19,10 +19,11 @@ RANKS = {
     "writers": 0,
     "kernels": 0,
     "types": 1,
+    "archive": 1.2,
     "structure": 1.5,  # what exports draw
     "io": 2,
     "numpy_nn": 2,
-    "networks": 2.5,
+    "networks": 1.9,  # pictures of plans are read by one
     "extraction": 3,
     "embedding": 4,
     "matching": 5,

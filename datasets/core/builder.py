@@ -18,11 +18,10 @@ from typing import Any, NoReturn, Protocol
 
 import numpy as np
 
+from topomerge import archive
+from topomerge.archive import convert_to_plain, replace_on_success
 from topomerge.code_digest import compute_code_digest
 from topomerge.errors import InputError
-from topomerge.io import archive
-from topomerge.io.archive import replace_on_success
-from topomerge.io.listing import convert_to_plain
 from topomerge.types import Array, LogFn
 
 PATIENCE = 20.0  # s to wait for the scheduler of a cluster

@@ -20,8 +20,7 @@ from topomerge.datasets.core.builder import BuildReport, build_set, check_sharin
 from topomerge.datasets.pairs.example import make_file
 from topomerge.datasets.pairs.items import Recipe, check, draw_items, load_library, select_plans
 
-from topomerge.io.archive import replace_on_success
-from topomerge.io.listing import convert_to_plain
+from topomerge.archive import convert_to_plain, replace_on_success
 
 
 @dataclass

@@ -47,8 +47,8 @@ from topomerge.datasets.simulation.sensors import (
 )
 from topomerge.datasets.simulation.session import simulate_session
 
+from topomerge import archive
 from topomerge.errors import InputError
-from topomerge.io import archive
 from topomerge.types import Array, LogFn, PointCloud, Sim3
 
 LONGEST_BENT_PAIR = 900.0  # s

@@ -17,9 +17,9 @@ import numpy as np
 import shapely
 from topomerge.datasets.pairs.pairs import Pair
 
+from topomerge import archive
 from topomerge.embedding.graph import find_column
 from topomerge.errors import InputError
-from topomerge.io import archive
 from topomerge.io.maps import load_map, save_map
 from topomerge.matching.consistency import find_matches
 from topomerge.matching.room_plans import build_room_plans

@@ -21,12 +21,12 @@ from topomerge.datasets.pairs.items import SIDES, UNCHANGED, Item, corrupt_pair,
 from topomerge.datasets.pairs.pairs import Atlas, Pair, make_pair
 from topomerge.datasets.pairs.parts import find_true_matches, match_true_rooms
 
+from topomerge import archive
+from topomerge.archive import convert_to_plain
 from topomerge.embedding.graph import build_graph_arrays, convert_to_tensors
 from topomerge.embedding.sheets import build_sheet_arrays
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
-from topomerge.io import archive
-from topomerge.io.listing import convert_to_plain
 from topomerge.types import Array, PointCloud, TopometricMap
 
 if TYPE_CHECKING:

@@ -38,8 +38,8 @@ from topomerge.datasets.pairs.grid_pairs import (
 from topomerge.datasets.pairs.items import select_plans
 from topomerge.datasets.pairs.pairs import choose_visited_places, draw_frames
 
+from topomerge import archive
 from topomerge.errors import InputError
-from topomerge.io import archive
 from topomerge.types import Array, LogFn, Sim3
 
 UNSCALED_EVERY = 3  # every third drawing has no scale

@@ -20,10 +20,10 @@ from topomerge.datasets.pairs.example import _make_first_pair
 from topomerge.datasets.pairs.items import Item, Library, Recipe, check, draw_items, load_library, select_plans
 from topomerge.datasets.pairs.pairs import Pair
 
+from topomerge import archive
 from topomerge.errors import InputError
 from topomerge.extraction.cleaning import add_means
 from topomerge.extraction.voxels import voxelise
-from topomerge.io import archive
 from topomerge.types import Array, LogFn, PointCloud, Sim3, VoxelGrid
 
 GRID_FORMAT = 2  # raise it when the same item gives other bytes: it is part of the files' names

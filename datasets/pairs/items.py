@@ -21,11 +21,11 @@ from topomerge.datasets.plans import splits
 from topomerge.datasets.simulation.scanner import transform_cloud
 from topomerge.datasets.simulation.sensors import get_sensor
 
+from topomerge.archive import convert_to_plain
 from topomerge.code_digest import compute_code_digest, compute_data_digest
 from topomerge.embedding import graph
 from topomerge.embedding.graph import POINTS_PER_ROOM
 from topomerge.errors import InputError
-from topomerge.io.listing import convert_to_plain
 from topomerge.types import Array, PointCloud, Sim3
 
 UNCHANGED = ("", 0.0)

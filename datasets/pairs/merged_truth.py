@@ -17,9 +17,9 @@ from topomerge.datasets.pairs.own_pairs import OWN_FOLDER, extract_captures
 from topomerge.datasets.pairs.own_truth import find_overlap
 from topomerge.datasets.pairs.pairs_file import PAIRS_FILE, Capture, PairsFile, PairTruth, Split, read_pairs_file
 
+from topomerge.archive import replace_on_success
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.pairs import is_same_pose
-from topomerge.io.archive import replace_on_success
 from topomerge.io.maps import load_map
 from topomerge.io.points import OCTREES, list_suffixes
 from topomerge.registration.pipeline import register

@@ -34,13 +34,13 @@ from topomerge.datasets.pairs.pairs_file import (
     read_pairs_file,
 )
 
+from topomerge import archive
+from topomerge.archive import convert_to_plain
 from topomerge.code_digest import compute_code_digest
 from topomerge.embedding.graph import POINTS_PER_ROOM, build_graph_arrays
 from topomerge.embedding.sheets import build_sheet_arrays
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
-from topomerge.io import archive
-from topomerge.io.listing import convert_to_plain
 from topomerge.io.maps import load_map, save_map
 from topomerge.io.points import OCTREES, read_chunks
 from topomerge.matching.assignment import has_twin

@@ -19,12 +19,12 @@ from topomerge.datasets.pairs.plan_examples import LONGEST_SCAN, PlanItem, PlanR
 from topomerge.datasets.pairs.plan_truth import compute_plan_truth
 from topomerge.datasets.simulation.scanner import transform_cloud
 
+from topomerge import archive
 from topomerge.extraction.extract import gather_evidence, read_navigable
 from topomerge.extraction.parameters import PRESETS, DefaultParameters
 from topomerge.extraction.plans.passages import DOOR_FEATURES, compute_door_features
 from topomerge.extraction.segment import GrowingRooms, SegmentedStorey, log_odds, score_by_plan
 from topomerge.extraction.stopwatch import Stopwatch
-from topomerge.io import archive
 from topomerge.types import Array, LogFn
 
 PASSAGE_FORMAT = 3  # raise it when the same item gives other bytes: it is part of the files' names

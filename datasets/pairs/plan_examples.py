@@ -24,6 +24,8 @@ from topomerge.datasets.simulation.scanner import scan_building, transform_cloud
 from topomerge.datasets.simulation.sensors import corrupt_cloud, cut_upper_half, get_sensor, measure_drift, remove_sensor_drift
 from topomerge.datasets.simulation.walk import sample_part
 
+from topomerge import archive
+from topomerge.archive import convert_to_plain
 from topomerge.errors import InputError
 from topomerge.extraction.navigable import add_crossed_cells, compute_navigable_volume
 from topomerge.extraction.parameters import PRESETS
@@ -32,8 +34,6 @@ from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.extraction.scan import read_scan
 from topomerge.extraction.slices import is_slice, raise_slice
 from topomerge.extraction.storeys import find_storeys, measure_floor_to_ceiling
-from topomerge.io import archive
-from topomerge.io.listing import convert_to_plain
 from topomerge.types import Array, LogFn, PointCloud, Sim3
 
 PLAN_FORMAT = 4  # raise it when the same item gives other bytes: it is part of the files' names

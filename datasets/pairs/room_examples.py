@@ -36,6 +36,7 @@ from topomerge.datasets.simulation.scanner import scan_building, scan_from_poses
 from topomerge.datasets.simulation.sensors import Sensor, get_sensor, remove_sensor_drift
 from topomerge.datasets.simulation.walk import sample_part
 
+from topomerge import archive
 from topomerge.extraction.extract import extract
 from topomerge.extraction.room_odds import (
     GRID_FEATURES,
@@ -45,7 +46,6 @@ from topomerge.extraction.room_odds import (
     compute_room_features,
 )
 from topomerge.extraction.scan import read_scan
-from topomerge.io import archive
 from topomerge.types import Array, LogFn, PointCloud, Sim3
 
 OPEN_SHARE = 0.85  # of the buildings that anything stands around

@@ -103,7 +103,7 @@ def describe_truth(building: Building, made: Pair | PointCloud, frame: Sim3) -> 
 
     `T_ab` (4 x 4, row-major) maps points of b into the frame of a; null for maps of two buildings.
     """
-    from topomerge.io.listing import convert_to_plain
+    from topomerge.archive import convert_to_plain
 
     listing: dict[str, Any] = {"format": TRUTH_FORMAT, "building": building.name, "seed": building.seed}
     if isinstance(made, PointCloud):

@@ -34,6 +34,8 @@ from topomerge.datasets.simulation.scanner import scan_building, transform_cloud
 from topomerge.datasets.simulation.sensors import get_sensor, measure_drift, remove_sensor_drift
 from topomerge.datasets.simulation.walk import sample_part
 
+from topomerge import archive
+from topomerge.archive import convert_to_plain
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.elevation import ALONG, DEPTHS, FACE_DTYPE, STRIP_CHANNELS, WALL_CLASSES, Elevations
 from topomerge.extraction.extract import cut_rooms, read_navigable
@@ -43,8 +45,6 @@ from topomerge.extraction.scan import FINE_CELL
 from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.extraction.topology import build_topometric_map
 from topomerge.extraction.voxels import voxelise
-from topomerge.io import archive
-from topomerge.io.listing import convert_to_plain
 from topomerge.types import ROOM_DTYPE, Array, LogFn, PointCloud, Sim3, TopometricMap, VoxelGrid
 
 CUPBOARDS = ("shelf", "cabinet", "wardrobe", "kitchen", "locker")  # kinds of furniture that stand before walls

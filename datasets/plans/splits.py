@@ -127,7 +127,7 @@ def write_lists(data: Path, folder: Path) -> None:
     """Write the lists from the real data that is in `data`."""
     from topomerge.datasets.plans.floorplans import Refusal, group_siblings, iter_plans
 
-    from topomerge.io.archive import replace_on_success
+    from topomerge.archive import replace_on_success
 
     lines: dict[str, list[str]] = {split: [f"procedural/{a}..{b}"] for split, (a, b) in SPLIT_SEEDS.items()}
     lines["test"] += [f"{source}/*" for source in TEST_ONLY]

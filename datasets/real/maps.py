@@ -23,10 +23,10 @@ from topomerge.datasets.pairs.pairs import Pair
 from topomerge.datasets.plans.floorplans import Refusal
 from topomerge.datasets.real.sources import FOLDERS_BY_SOURCE, collect, iter_pair_makers, iter_real_pairs
 
+from topomerge import archive
 from topomerge.code_digest import compute_code_digest
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
-from topomerge.io import archive
 from topomerge.types import LogFn
 
 LONGEST_PAIR = 600.0  # s a pair

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from topomerge import archive
+from topomerge.archive import replace_on_success
 from topomerge.cli.console import find_signal, format_failure
 from topomerge.errors import InputError, is_memory_short
 from topomerge.fusion.atlas import folder as atlas_folder
-from topomerge.io import archive
-from topomerge.io.archive import replace_on_success
 from topomerge.viz.tables import build_element
 
 SHORT = [
@@ -57,9 +57,7 @@ def test_a_limited_address_space_is_named(tmp_path: Path, megabytes: int) -> Non
 
 
 def test_what_killed_processes_left_is_cleared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    kill = (
-        "import os, sys; from topomerge.io.archive import replace_on_success\nwith replace_on_success(sys.argv[1]): os._exit(9)"
-    )
+    kill = "import os, sys; from topomerge.archive import replace_on_success\nwith replace_on_success(sys.argv[1]): os._exit(9)"
     for k in range(3):
         subprocess.run([sys.executable, "-c", kill, str(tmp_path / f"m{k}.tmap")], check=False)
     assert list(tmp_path.glob(".*.part"))

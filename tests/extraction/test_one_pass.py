@@ -12,6 +12,7 @@ import pytest
 import topomerge.extraction
 from tests.extraction.elevations.doors import three_doors
 from tests.extraction.segments import storey_of
+from topomerge.archive import read_weights_json
 from topomerge.errors import InputError
 from topomerge.extraction import extract as evidence
 from topomerge.extraction import extract as pipeline
@@ -19,7 +20,6 @@ from topomerge.extraction import segment, walls
 from topomerge.extraction.extract import PASSAGES_FILE, SCORE_INPUTS, choose_scorer
 from topomerge.extraction.plans.passages import Passage
 from topomerge.extraction.segment import find_segments
-from topomerge.io.archive import read_weights_json
 
 ONCE = (
     (pipeline, "rasterise_storeys"),

@@ -11,13 +11,13 @@ from PIL import Image
 
 from tests.scenes import two_rooms
 from topomerge import networks
+from topomerge.archive import VARIABLE
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.extraction.scan import read_scan
 from topomerge.extraction.slices import is_raised, raise_slice
 from topomerge.extraction.voxels import voxelise
 from topomerge.io import read_points
-from topomerge.io.archive import VARIABLE
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from tests import scenes
+from topomerge.archive import VARIABLE, find_weights_file
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.extraction.room_odds import (
@@ -24,7 +25,6 @@ from topomerge.extraction.room_odds import (
     measure_thin_share,
 )
 from topomerge.io import read_points
-from topomerge.io.archive import VARIABLE, find_weights_file
 from topomerge.kernels.rays import is_seen_from
 from topomerge.types import ROOM_ODDS, Array, PointCloud, Sim3, TopometricMap, add_outline_odds, is_mostly_unseen
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.fusion.atlas.atlas_scenes import office_map, stranger
+from topomerge.archive import VARIABLE
 from topomerge.cli.main import main as cli
 from topomerge.errors import InputError
 from topomerge.fusion.match_belief import (
@@ -21,7 +22,6 @@ from topomerge.fusion.match_belief import (
     measure_shared_floor,
     update_match_probabilities,
 )
-from topomerge.io.archive import VARIABLE
 from topomerge.io.maps import save_map
 from topomerge.matching.consistency import find_matches
 from topomerge.matching.match import Matching, match

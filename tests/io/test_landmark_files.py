@@ -12,9 +12,9 @@ import pytest
 from tests.io.test_maps import rewritten
 from tests.scenes import two_rooms
 from tests.scenes_map import building, same
+from topomerge import archive, read_points
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
-from topomerge.io import archive, read_points
 from topomerge.io.landmarks import find_landmark_file, format_landmark_table, parse_landmarks, read_landmark_file
 from topomerge.io.listing import convert_map_to_json, format_map
 from topomerge.io.maps import load_landmarks, load_map, save_map

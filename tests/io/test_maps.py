@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from tests.scenes_map import building, same
+from topomerge import archive
 from topomerge.errors import InputError
-from topomerge.io import archive
 from topomerge.io.maps import OLDER_ROOMS, convert_map_to_json, load_map, save_json, save_map, save_rooms_ply
 from topomerge.types import EDGE_DTYPE, OLDER_EDGE_DTYPE, ROOM_DTYPE, ROOM_ODDS, STOREY_DTYPE, Array, TopometricMap, VoxelGrid
 

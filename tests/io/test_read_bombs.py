@@ -11,8 +11,8 @@ import pytest
 
 import topomerge as tm
 from tests.scenes_map import building
+from topomerge import archive
 from topomerge.errors import InputError
-from topomerge.io import archive
 from topomerge.io.maps import load_map, save_map
 from topomerge.io.trajectory import SPARE_POSES, read_trajectory
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from topomerge.archive import VARIABLE, find_weights_file
 from topomerge.errors import InputError
 from topomerge.extraction.plans.passages import read_classifier
-from topomerge.io.archive import VARIABLE, find_weights_file
 from topomerge.matching.consistency import compute_hypothesis_probability
 from topomerge.registration.verify import load_model
 

@@ -13,9 +13,9 @@ import torch
 from topomerge.models.export import read_weights, run_with_torch
 from topomerge.models.room_matcher import MatcherStage, RoomMatcher, build_stages
 
+from topomerge.archive import VARIABLE, find_weights_file
 from topomerge.embedding.quarter_turns import FACTS, compute_room_features
 from topomerge.errors import InputError
-from topomerge.io.archive import VARIABLE, find_weights_file
 from topomerge.matching import room_matcher
 from topomerge.matching.room_matcher import (
     AGREEMENT,

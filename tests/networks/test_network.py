@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from topomerge.archive import find_weights_file
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.elevation import WALL_SIGNATURE, compute_place_probabilities
 from topomerge.extraction.plans.plan_network import GRID_NETWORK_FILE, PLAN_NETWORK_FILE, PLAN_SIGNATURE
-from topomerge.io.archive import find_weights_file
 from topomerge.networks.network import WEIGHTS_PACKAGE, Signature, Tensor, load_network, load_shipped_network, read_card
 from topomerge.registration.evidence.places import PLACE_SIGNATURE
 from topomerge.registry import TASKS

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 import topomerge as tm
 from tests.fusion.plans_of import MOVE, office, part
+from topomerge import archive
 from topomerge.cli.main import main as cli
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.store import add, read_atlas
 from topomerge.fusion.result import serialise_merge
-from topomerge.io import archive
 from topomerge.io.exports.tf2 import read_frame_poses
 from topomerge.types import (
     LEVELLED,

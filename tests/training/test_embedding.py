@@ -19,11 +19,11 @@ from topomerge.models.embedder import Embedder
 from topomerge.models.weights import read_embedder
 
 from tests.graphs import pair, write_set
+from topomerge import archive
 from topomerge.checkpoint import load_state
 from topomerge.embedding.learned import load_embedder
 from topomerge.embedding.network import Geometry, Network, Node
 from topomerge.errors import InputError
-from topomerge.io import archive
 from topomerge.training import embedding
 from topomerge.training.__main__ import main
 from topomerge.training.batches import augment_graph, make_batch

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from tests.training import tiny
+from topomerge.archive import VARIABLE, find_weights_file, read_weights_json
 from topomerge.embedding.engineered import scale_features
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.elevation import compute_place_probabilities
@@ -32,15 +33,16 @@ from topomerge.extraction.plans.plan_network import compute_column_probabilities
 from topomerge.extraction.plans.plan_network import load_weights as plan_weights
 from topomerge.extraction.room_odds import load_room_weights
 from topomerge.fusion.match_belief import load_belief_weights
-from topomerge.io.archive import VARIABLE, find_weights_file, read_weights_json
 from topomerge.matching.consistency import load_odds_weights
 from topomerge.matching.room_matcher import load_matcher_weights
+from topomerge.networks.drawing import compute_drawing_probabilities
 from topomerge.networks.network import Network
 from topomerge.registration.evidence.places import load_weights as place_weights
 from topomerge.registration.verify import load_model
 from topomerge.registry import TASKS
 from topomerge.training import (
     door_classification,
+    drawing_segmentation,
     passages,
     place_evidence,
     plan_segmentation,
@@ -54,10 +56,15 @@ from topomerge.training.plan_segmentation import score_classes
 from topomerge.training.tasks import compose_settings, evaluate_task, find_weights, train
 from topomerge.types import EDGE_DTYPE, Array
 
+PAGE = np.random.default_rng(0).integers(0, 255, (64, 96, 3), dtype=np.uint8)
 ROOT = Path(__file__).parent.parent.parent
 NETWORKS = {
     "plan_segmentation": ["epochs=2", "steps=2", "batch=2", "crop=32", "hold_out=2", "widths=[4,4,4,4,4,4,4,4]"],
     "grid_segmentation": ["epochs=2", "steps=2", "batch=2", "crop=32", "hold_out=2", "widths=[4,4,4,4,4,4,4,4]"],
+    "drawing_segmentation": [
+        *("epochs=2", "steps=2", "batch=2", "crop=64", "pages=3", "fresh=1", "watched_pages=2", "widths=[2,2,2,2,2,2]"),
+        *(f"{name}.{key}" for name in ("data", "watched", "heldout") for key in ("procedural=2", "folder=")),
+    ],
     "door_classification": ["epochs=2", "batch=64", "hidden=4", "networks=2"],
     "wall_segmentation": ["epochs=2", "steps=2", "batch=4", "length=32", "hold_out=2", "widths=[4,4,8,8]"],
     "place_evidence": ["epochs=2", "steps=2", "batch=8", "widths=[4,4,4]", "hold_out=2", "lookalikes=false"],
@@ -97,6 +104,7 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         return [
             f"task={task}",
             f"runs={tmp_path / 'runs'}",
+            f"cache={tmp_path / 'cache'}",
             "tensorboard=false",
             *NETWORKS.get(task, []),
             *WITHOUT_MORE.get(task, []),
@@ -121,6 +129,7 @@ def read(task: str) -> Any:
     return {
         "plan_segmentation": lambda: compute_column_probabilities(plan),
         "grid_segmentation": lambda: compute_column_probabilities(plan, plan_weights(raised=True)),
+        "drawing_segmentation": lambda: compute_drawing_probabilities(PAGE),
         "door_classification": lambda: predict_door(np.zeros((3, 17))),
         "place_evidence": lambda: place_weights()(planes=np.ones((1, 16, 16, 22)))[0],
         "room_matcher": matched_rows,
@@ -167,7 +176,7 @@ def test_a_task_is_trained_exported_read_and_judged(task, words, tmp_path, monke
 def test_resumed_equals_uninterrupted(task, words, tmp_path, monkeypatch) -> None:
     jobs = dict.fromkeys(("plan_segmentation", "grid_segmentation"), plan_segmentation.PlanJob)
     jobs |= {"door_classification": door_classification.DoorJob}
-    jobs |= {"wall_segmentation": wall_segmentation.WallJob}
+    jobs |= {"wall_segmentation": wall_segmentation.WallJob, "drawing_segmentation": drawing_segmentation.DrawingJob}
     kind = {**jobs, "place_evidence": place_evidence.PlaceJob, "room_matcher": room_matcher.MatcherJob}[task]
     train(compose_settings(words(task, "name=whole")), quiet)
     step, seen = kind.train_step, []

@@ -22,11 +22,11 @@ def test_steps_run_in_order_and_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(weights, "make_task", make)
     assert weights.main([f"runs={tmp_path}"]) == 130
-    scans = ["plan_segmentation", "grid_segmentation", "door_classification", "wall_segmentation"]
+    scans = ["plan_segmentation", "grid_segmentation", "drawing_segmentation", "door_classification", "wall_segmentation"]
     scans += ["passages", "wall_doors", "room_odds"]
     assert made == [*scans, "feature_scale", "match_odds"]
     assert "in all about" in capsys.readouterr().err
-    assert weights.main([f"runs={tmp_path}"]) == 0 and made[9:] == [
+    assert weights.main([f"runs={tmp_path}"]) == 0 and made[10:] == [
         "match_odds",
         "place_evidence",
         "match_belief",

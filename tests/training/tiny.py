@@ -13,6 +13,7 @@ from topomerge.datasets.pairs.plan_examples import PlanExample, PlanItem, PlanRe
 from topomerge.datasets.pairs.plan_truth import TRUE_CLASSES
 from topomerge.datasets.pairs.wall_examples import WallExample, WallItem, build_wall_arrays
 
+from topomerge import archive
 from topomerge.embedding.engineered import FEATURES
 from topomerge.embedding.quarter_turns import FACTS, TurnedRows
 from topomerge.extraction.elevations.elevation import ALONG, BANDS, DEPTHS, FACE_DTYPE, STRIP_CHANNELS
@@ -21,7 +22,6 @@ from topomerge.extraction.plans.plan import build_profile_bands
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.extraction.room_odds import GRID_FEATURES, POSE_FEATURES, ROOM_FEATURES
 from topomerge.fusion.match_belief import BELIEVED_METHODS
-from topomerge.io import archive
 from topomerge.matching.consistency import compute_hypothesis_features
 from topomerge.registration.evidence.places import LOOKED, SIDE
 from topomerge.training.feature_scale import PairFeatures

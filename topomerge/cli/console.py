@@ -285,7 +285,7 @@ def check_outputs(outputs: Sequence[str | Path], inputs: Sequence[str | Path] = 
     Raises:
         InputError: a folder is missing or can't be written, a path is a folder, is an input or is given twice.
     """
-    from topomerge.io.archive import replace_on_success  # here, because topomerge.io imports NumPy
+    from topomerge.archive import replace_on_success  # here, because topomerge.io imports NumPy
 
     taken = {_resolve_path(path): "is the input: it would be overwritten; give another name" for path in inputs}
     for path in map(Path, outputs):
@@ -308,7 +308,7 @@ def write_all(outputs: Sequence[tuple[str | Path, Callable[[Path], None]]]) -> N
     Raises:
         InputError: one can't be written.
     """
-    from topomerge.io.archive import replace_on_success
+    from topomerge.archive import replace_on_success
 
     with ExitStack() as stack:
         for path, save in outputs:

@@ -55,7 +55,8 @@ def run_extract(args: argparse.Namespace) -> int:
         from topomerge.io.points import read_chunks
 
         lengths = ("scale", "resolution", "extrude", "spacing")
-        reading = collect_given(args, *lengths, "up", "unit", "ceiling", "doors", "poses", "topic", "one_frame", "text")
+        others = ("up", "unit", "drawing", "ceiling", "doors", "poses", "topic", "one_frame", "text")
+        reading = collect_given(args, *lengths, *others)
         chunks = read_chunks(args.input, **reading, progress=bars.start_task("read"))
         choices = collect_given(args, "voxel_size", "preset")
         topomap = extract(chunks, **choices, name=args.input, progress=bars.start_task("extract"))
@@ -102,6 +103,13 @@ EXTRACT = Command(
         *TEXT,
         build_option("--scale", type=parse_positive, metavar="S", help="multiply coordinates by this (default 1)"),
         build_option("--resolution", type=parse_positive, metavar="R", help="m per pixel of a plain image of a floor plan"),
+        build_option(
+            "--no-drawing",
+            dest="drawing",
+            action="store_const",
+            const=False,
+            help="dark pixels of a plain image are walls, also where it is a page with a drawn plan",
+        ),
         build_option("--extrude", type=parse_positive, metavar="H", help="m of wall height for 2D maps (default 2.5)"),
         build_option("--ceiling", action="store_true", help="close 2D maps with a ceiling"),
         build_option(

@@ -75,7 +75,7 @@ def add_point_files(result: MergeResult, files: Mapping[int, Path]) -> MergeResu
 def write_points(result: MergeResult, folder: Path, args: argparse.Namespace) -> Iterator[None]:
     """Write the points of each input that the result names beside their places, and rename them on success, when what else
     belongs to the merge is written; those of an earlier merge in the folder are replaced or removed."""
-    from topomerge.io.archive import replace_on_success
+    from topomerge.archive import replace_on_success
 
     earlier = _find_earlier_points(folder, args.inputs)
     with ExitStack() as stack:

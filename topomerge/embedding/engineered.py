@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
+from topomerge.archive import read_weights_json
 from topomerge.embedding.graph import LAYOUT_FEATURES, SPECTRUM_FEATURES, THESIS_FEATURES
 from topomerge.embedding.quarter_turns import (
     Descriptor,
@@ -17,7 +18,6 @@ from topomerge.embedding.quarter_turns import (
 )
 from topomerge.embedding.shapedna import SHAPE_LEAST_CELLS, build_surface_laplacian, compute_smallest_eigenvalues, thin_points
 from topomerge.errors import InputError
-from topomerge.io.archive import read_weights_json
 from topomerge.types import Array, TopometricMap
 
 GRAPH_FEATURES = (

@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from topomerge.archive import find_weights_file
 from topomerge.embedding.graph import TABLES
 from topomerge.embedding.network import Network, build_embedder_signature, build_network, list_tensors
 from topomerge.errors import InputError
-from topomerge.io.archive import find_weights_file
 from topomerge.networks.network import WEIGHTS_PACKAGE, card_of, read_card
 
 EMBEDDER_FORMAT = 3

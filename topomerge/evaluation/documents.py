@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from topomerge.archive import replace_on_success
 from topomerge.code_digest import compute_code_digest
 from topomerge.errors import InputError
-from topomerge.io.archive import replace_on_success
 from topomerge.statistics import format_interval
 
 ROOT = Path(__file__).parent.parent.parent

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from topomerge.archive import replace_on_success
 from topomerge.code_digest import compute_code_digest
 from topomerge.datasets.pairs.build import Build, build
 from topomerge.datasets.pairs.items import Recipe
@@ -40,7 +41,6 @@ from topomerge.evaluation.tables import (
     write_csv,
     write_section,
 )
-from topomerge.io.archive import replace_on_success
 from topomerge.types import LogFn
 
 OF_MERGES = ("merging", "kinds", "decides", "sites", "independence", "reliability")  # tables that there are where maps are merged

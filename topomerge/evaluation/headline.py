@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from topomerge.archive import replace_on_success
 from topomerge.evaluation.documents import OLD_STAMP, ROOT, Stamp
-from topomerge.io.archive import replace_on_success
 
 FIGURES = ROOT / "docs" / "results" / "headline.json"
 

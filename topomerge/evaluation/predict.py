@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 
 import topomerge
+from topomerge import archive
+from topomerge.archive import convert_to_plain
 from topomerge.code_digest import compute_code_digest
 from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, load_evaluation_pair
 from topomerge.embedding.learned import EMBEDDERS, POINT_TABLES, build_embedder
@@ -22,8 +24,6 @@ from topomerge.evaluation.settings import Evaluation, Variant, iter_variants
 from topomerge.fusion.match_belief import update_match_probabilities
 from topomerge.fusion.pipeline import merge
 from topomerge.fusion.result import RoomMatch
-from topomerge.io import archive
-from topomerge.io.listing import convert_to_plain
 from topomerge.matching.assignment import compute_descriptor_costs
 from topomerge.matching.match import match
 from topomerge.registration.pipeline import Registration, register

@@ -17,6 +17,7 @@ import shapely
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from topomerge.archive import replace_on_success
 from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.core.building import Building, Difficulty, find_physical_building
 from topomerge.datasets.pairs.pairs import draw_frames
@@ -29,7 +30,6 @@ from topomerge.datasets.simulation.sensors import corrupt_cloud, get_sensor, mea
 from topomerge.datasets.simulation.session import simulate_session
 from topomerge.datasets.simulation.walk import sample_part
 from topomerge.errors import InputError
-from topomerge.io.archive import replace_on_success
 from topomerge.io.points import read_points
 from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.types import Array, PointCloud, TopometricMap, TrueRoom, VoxelGrid

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from topomerge import archive
 from topomerge.datasets.core.building import find_physical_building
 from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, convert_to_sim3, load_evaluation_pair
 from topomerge.datasets.real.sources import REAL_SOURCES, find_captures
 from topomerge.evaluation.settings import Evaluation, iter_variants
-from topomerge.io import archive
 from topomerge.matching.room_plans import DIRECTION_BLUR, build_room_plans
 from topomerge.metrics import is_on_storey, is_pose_right
 from topomerge.types import Array, Sim3, TopometricMap

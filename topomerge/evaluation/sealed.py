@@ -24,12 +24,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from topomerge import __version__
+from topomerge.archive import replace_on_success
 from topomerge.code_digest import read_commit
 from topomerge.datasets.core.builder import run_script
 from topomerge.datasets.plans.sealed import SEALED, open_sealed_set
 from topomerge.errors import InputError
 from topomerge.evaluation.sealed_measures import SEALED_PARTS, Row, SealedItem, format_tables, list_items, measured
-from topomerge.io.archive import replace_on_success
 
 ROOT = Path(__file__).parent.parent.parent
 PAGE = ROOT / "docs" / "results" / "sealed.md"

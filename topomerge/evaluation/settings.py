@@ -9,13 +9,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from topomerge.archive import convert_to_plain
 from topomerge.datasets.pairs.items import Recipe
 from topomerge.embedding.engineered import CONTEXT_KINDS
 from topomerge.embedding.learned import EMBEDDERS
 from topomerge.embedding.weights import EMBEDDER_FILE, PRETRAINED, find_embedder, read_embedder_card
 from topomerge.errors import InputError
 from topomerge.fusion.inputs import POSE_SOURCES
-from topomerge.io.listing import convert_to_plain
 
 LEARNED_METHODS = ("mutual", "attention")  # of a trained embedder only
 EVALUATED_METHODS = ("full", "assignment", "growing", "consistent", *LEARNED_METHODS)

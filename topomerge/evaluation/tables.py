@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from topomerge.archive import replace_on_success
 from topomerge.evaluation.groups import Value, compute_gain, compute_value
 from topomerge.evaluation.score import Row
 from topomerge.evaluation.settings import Evaluation
-from topomerge.io.archive import replace_on_success
 
 BY = {
     "overlap": "Share of rooms in common, or kind of hard negative",

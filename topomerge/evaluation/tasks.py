@@ -19,6 +19,7 @@ from typing import Any, Protocol, cast
 
 import numpy as np
 
+from topomerge.archive import replace_on_success
 from topomerge.code_digest import compute_code_digest
 from topomerge.config import compose, convert_to_dataclass
 from topomerge.datasets.core.building import find_physical_building
@@ -30,7 +31,6 @@ from topomerge.datasets.real.maps import iter_real_grid_pairs
 from topomerge.errors import InputError
 from topomerge.evaluation.documents import build_stamp, write_blocks
 from topomerge.evaluation.headline import write_headline
-from topomerge.io.archive import replace_on_success
 from topomerge.training.tasks import compose_settings
 from topomerge.types import Array, LogFn, Sim3
 
@@ -40,6 +40,7 @@ MODULES = {
     "doors": "doors",
     "windows": "windows",
     "walls": "walls",
+    "drawings": "drawings",
     "merges": "merges",
     "joined": "joined",
     "bending": "bending",

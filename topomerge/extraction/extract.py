@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from topomerge.archive import read_weights_json
 from topomerge.blas import limit_blas_threads
 from topomerge.errors import InputError
 from topomerge.extraction.attributes import estimate_attributes
@@ -40,7 +41,6 @@ from topomerge.extraction.stopwatch import Progress, Stopwatch
 from topomerge.extraction.topology import build_topometric_map, select_rooms_with_floor
 from topomerge.extraction.views.view_rooms import segment_views
 from topomerge.extraction.walls import relabel_walls, unroll_walls
-from topomerge.io.archive import read_weights_json
 from topomerge.numpy_nn import sigmoid
 from topomerge.types import EDGE_DTYPE, LEVELLED, Array, PointCloud, TopometricMap, VoxelGrid, add_outline_odds
 

@@ -18,10 +18,10 @@ import shapely
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from topomerge.archive import read_weights_json
 from topomerge.errors import InputError
 from topomerge.extraction.completeness import WALL_SIGHT
 from topomerge.extraction.storeys import measure_floor_to_ceiling
-from topomerge.io.archive import read_weights_json
 from topomerge.kernels.rays import is_seen_from
 from topomerge.numpy_nn import sigmoid
 from topomerge.types import ROOM_ODDS, Array, TopometricMap, select_lowest_of_column

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from topomerge.archive import read_weights_json
 from topomerge.errors import InputError
-from topomerge.io.archive import read_weights_json
 from topomerge.matching.consistency import measure_common_floor
 from topomerge.matching.match import Matching
 from topomerge.matching.poses import PlanFields

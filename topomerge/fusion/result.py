@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from topomerge.archive import convert_to_plain
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.pairs import serialise_contradiction
 from topomerge.fusion.transfer import LANDMARK_PARAMETER
-from topomerge.io.listing import convert_to_plain
 from topomerge.matching.match import describe_map
 from topomerge.registration.evidence.places import Places
 from topomerge.registration.pipeline import Registration

@@ -17,8 +17,8 @@ from typing import IO, Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.grid import PIXELS, Plan
-from topomerge.io.piece import build_damage_error, is_outside_link
+from topomerge.io.grid import Plan
+from topomerge.io.piece import PIXELS, build_damage_error, is_outside_link
 from topomerge.types import Array
 
 log = logging.getLogger(__name__)

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.grid import PIXELS
-from topomerge.io.piece import BLOCK_POINTS, Piece, build_damage_error
+from topomerge.io.piece import BLOCK_POINTS, PIXELS, Piece, build_damage_error
 from topomerge.io.trajectory import find_invalid_rotations
 from topomerge.types import Array, Landmarks
 

@@ -13,17 +13,11 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError
-from topomerge.io.piece import (
-    BLOCK_POINTS,
-    MOST_POINTS,
-    Piece,
-    ReadOptions,
-    build_count_error,
-    build_damage_error,
-    refuse_pointer,
-)
-from topomerge.types import Array
+from topomerge.io.drawing import ParsedDrawing, estimate_scale, find_names, is_drawing, parse_drawing, read_texts
+from topomerge.io.piece import BLOCK_POINTS, MOST_POINTS, PIXELS, Piece, ReadOptions, build_count_error, build_damage_error
+from topomerge.types import Array, Landmarks
 
 JUDGED_FLOOR = 4.0  # m2 of floor below which nothing is judged
 OUTSIDE_SHARE = 1 / 3  # of the floor: more outside of every wall is suspicious; of real maps that are read rightly up to .26 is
@@ -184,7 +178,6 @@ def _find_mode(counts: Array) -> int:
     return near.start + int(smooth[near].argmax())
 
 
-PIXELS = 100_000_000  # more is refused
 LARGEST_YAML = 1 << 20  # bytes
 IMAGES = (".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 # What those are by their content (PPM holds PGM): other plugins of Pillow start programs, as that of PostScript does.
@@ -211,20 +204,73 @@ class Plan:
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Read floor points, then walls layer by layer, in metres."""
+    names: Landmarks | None = None
     if path.suffix.lower() in (".yaml", ".yml"):
         plan = read_yaml(path)
         if options.resolution is not None:
             raise InputError(f"{path}: states its own resolution of {plan.resolution:g} m; leave --resolution out")
+        occupied, free, doubts = read_pixels(path, plan)
+    elif options.drawing and is_drawing(*read_image(path)):
+        plan, drawing, names = read_drawing(path, options.resolution, options.text)
+        occupied, free, doubts = drawing.occupied, drawing.free, ()
     elif options.resolution is None:
         beside = next((b for b in (path.with_suffix(".yaml"), path.with_suffix(".yml")) if b.is_file()), None)
         hint = f", or read {beside.name} instead" if beside else ""
         raise InputError(f"{path}: an image does not say how large a pixel is; give --resolution in metres a pixel{hint}")
     else:
         plan = Plan(path, options.resolution)
-    occupied, free, doubts = read_pixels(path, plan)
-    yield Piece(np.empty((0, 3)), warnings=(*plan.warnings, *doubts), done=0.1)
+        occupied, free, doubts = read_pixels(path, plan)
+    yield Piece(np.empty((0, 3)), warnings=(*plan.warnings, *doubts), landmarks=names, done=0.1)
     # The grid is metric already; only a --scale is left to undo in the lengths that are given in metres.
     yield from extrude(path, occupied, free, plan, options)
+
+
+def read_drawing(path: Path, resolution: float | None, text: bool | None = None) -> tuple[Plan, ParsedDrawing, Landmarks]:
+    """Read the walls and the floor of a drawing on a page, the plan whose pixels they are, and the names of rooms on it.
+
+    Args:
+        resolution: m a pixel; None: by what is written on it, or by its doors.
+        text: read what is written on it, as of `ReadOptions`.
+
+    Raises:
+        InputError: it shows no room, or nothing says how large it is.
+    """
+    picture = read_picture(path)
+    drawing = parse_drawing(picture, resolution)
+    if not drawing.free.any():
+        raise InputError(f"{path}: no walls around a room were found in it; if it is a robot's grid, give --no-drawing")
+    found = read_texts(picture) if text is not False else ()
+    said: tuple[str, ...] = (f"{path.name}: was read as a drawn plan, without its page, texts and furniture",)
+    if resolution is None:
+        scale = estimate_scale(drawing, found or ())
+        if scale is None:
+            more = "" if found is not None else " (pip install topomerge[text] reads what is written on it)"
+            raise InputError(f"{path}: an image does not say how large a pixel is; give --resolution in metres a pixel{more}")
+        resolution = scale.resolution
+        why = ", ".join(repr(reason) if scale.written else reason for reason in scale.reasons[:3])
+        said += (f"{path.name}: {resolution:.4g} m a pixel, give or take {scale.spread:.0%}, by {why}; --resolution sets it",)
+        if scale.is_coarse(drawing.zoom):
+            drawing = parse_drawing(picture, resolution)
+    plan = Plan(path, resolution / drawing.zoom, warnings=said)
+    return plan, drawing, find_names(found or (), path.name, resolution, picture.shape[0])
+
+
+def read_picture(path: Path) -> Array:
+    """Read (h, w, 3) uint8 colours of an image; what is transparent is white.
+
+    Raises:
+        InputError: as `read_image`.
+    """
+    from PIL import Image
+
+    bright, clear = read_image(path)
+    with Image.open(path, formats=IMAGE_FORMATS) as image:
+        if image.mode.startswith(("I", "F")):
+            grey = np.round(np.nan_to_num(bright.clip(0, 1)) * 255).astype(np.uint8)
+            return np.repeat(grey[..., None], 3, axis=2)
+        out = np.array(image.convert("RGB"))
+    out[clear] = 255
+    return out
 
 
 def read_yaml(path: Path) -> Plan:

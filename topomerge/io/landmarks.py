@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError
-from topomerge.io.piece import refuse_pointer
 from topomerge.types import LANDMARK_DTYPE, LANDMARK_KINDS, MOST_LANDMARKS, Array, Landmarks, clean_landmarks
 
 COLUMNS = ("kind", "value", "x", "y", "z", "sigma", "room", "storey", "confidence", "number", "group", "time")

@@ -34,7 +34,7 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.io.archive import replace_on_success
+from topomerge.archive import convert_to_plain, replace_on_success
 from topomerge.io.landmarks import serialise_landmarks
 from topomerge.types import LANDMARK_KINDS, ROOM_ODDS, Landmarks, TopometricMap, find_room_names
 
@@ -47,17 +47,6 @@ def describe_room(room: Any) -> list[str]:
     """Describe a row of ROOM_DTYPE: `outside`, `glimpsed` (only looked into), `doubtful` (probably no room)."""
     words = (("outside", room["outside"] > 0.5), ("glimpsed", room["glimpsed"]), ("doubtful", room["confidence"] < 0.5))
     return [word for word, so in words if so]
-
-
-def convert_to_plain(value: Any) -> Any:
-    """Return the value in Python's own types, as far as JSON has them: arrays and tuples as lists, anything odd as its text."""
-    if isinstance(value, np.ndarray | np.generic):
-        return convert_to_plain(value.tolist())
-    if isinstance(value, Mapping):
-        return {str(key): convert_to_plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        return [convert_to_plain(item) for item in (sorted(value) if isinstance(value, set | frozenset) else value)]
-    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 
 def _convert_to_strict_json(value: Any) -> Any:

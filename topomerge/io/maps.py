@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from topomerge import archive
+from topomerge.archive import ArrayHeader, convert_to_plain
 from topomerge.errors import InputError
-from topomerge.io import archive
-from topomerge.io.archive import ArrayHeader
-from topomerge.io.listing import convert_map_to_json, convert_to_plain, save_json
+from topomerge.io.listing import convert_map_to_json, save_json
 from topomerge.io.rooms_ply import save_rooms_ply
 from topomerge.kernels import voxels
 from topomerge.types import (

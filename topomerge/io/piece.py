@@ -17,11 +17,12 @@ from typing import IO, Any
 
 import numpy as np
 
+from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError, is_memory_short
 from topomerge.io.frame import TURNS, UNITS
 from topomerge.types import LANDMARK_DTYPE, Array, Landmarks, TrueRoom, VoxelGrid
 
-LFS_POINTER = b"version https://git-lfs.github.com/spec/v1"
+PIXELS = 100_000_000  # of a picture; more is refused
 BLOCK_POINTS = 1 << 19  # points a reader hands over at a time
 MOST_POINTS = 100_000_000  # points that a sampled or extruded file may become; more is a wrong unit, not a building
 
@@ -44,17 +45,6 @@ class Piece:
     intensities: Array | None = None  # (n,) float32, in whatever the file counts in
     classes: Array | None = None  # (n,) int32, of what the points lie on, as the file counts them; -1: none
     landmarks: Landmarks | None = None  # positions in the file's frame and unit
-
-
-def refuse_pointer(path: Path) -> None:
-    """Refuse a file that Git LFS put in place of the one that is wanted.
-
-    Raises:
-        InputError: it is a pointer of Git LFS.
-    """
-    with path.open("rb") as stream:
-        if stream.read(len(LFS_POINTER)) == LFS_POINTER:
-            raise InputError(f"{path}: is a Git LFS pointer, not the file; run `git lfs pull`")
 
 
 def is_outside_link(path: Path) -> bool:
@@ -129,7 +119,8 @@ class ReadOptions:
             glTF and z for all others.
         unit: of the file's coordinates: "m", "cm", "mm", "ft" or "in"; None: metres.
         scale: factor on the coordinates, beside the unit.
-        resolution: m per pixel; needed for an image without a map_server file.
+        resolution: m per pixel of an image without a map_server file; of a drawing None: by what is written on it.
+        drawing: read an image of a page as a drawn plan; False: its dark pixels are walls.
         extrude: height of the walls made from a floor plan, m.
         ceiling: also close a floor plan from above.
         spacing: distance between points sampled on meshes, building models and floor plans, m; None: 0.05 m for surfaces
@@ -146,6 +137,7 @@ class ReadOptions:
     unit: str | None = None
     scale: float = 1.0
     resolution: float | None = None
+    drawing: bool = True
     extrude: float = 2.5
     ceiling: bool = False
     spacing: float | None = None

@@ -20,11 +20,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError, is_memory_short
 from topomerge.io import frame
 from topomerge.io.frame import get_axis_rotation
 from topomerge.io.landmarks import find_landmark_file, read_landmark_file
-from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_options, refuse_pointer
+from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_options
 from topomerge.io.sightings import ObjectFinder
 from topomerge.types import (
     Array,
@@ -295,7 +296,7 @@ class Format:
 
 
 PICTURES = (".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-DRAWN = ("resolution", "extrude", "ceiling")  # options of drawings, whose walls are raised
+DRAWN = ("resolution", "drawing", "extrude", "ceiling")  # options of drawings, whose walls are raised
 FORMATS = (
     Format("a PLY file", "ply", (".ply",)),
     Format("a PCD file", "pcd", (".pcd",)),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from topomerge.io.archive import replace_on_success
+from topomerge.archive import replace_on_success
 from topomerge.types import Array, TopometricMap
 
 LIGHT = ("77AADD", "EE8866", "EEDD88", "FFAABB", "44BB99", "BBCC33", "99DDFF", "AAAA00")

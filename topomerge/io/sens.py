@@ -16,9 +16,8 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.depth_images import Camera, Frame, read_color
-from topomerge.io.grid import PIXELS
 from topomerge.io.pictures import iter_frame_pieces
-from topomerge.io.piece import Piece, ReadOptions, build_damage_error
+from topomerge.io.piece import PIXELS, Piece, ReadOptions, build_damage_error
 from topomerge.types import Array
 
 SENS_KIND = "a ScanNet recording"

@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError
-from topomerge.io.piece import is_outside_link, refuse_pointer
+from topomerge.io.piece import is_outside_link
 from topomerge.types import Array
 
 KITTI_NUMBERS, TUM_NUMBERS = 12, 8  # a line

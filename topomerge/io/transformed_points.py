@@ -10,8 +10,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from topomerge.archive import replace_on_success
 from topomerge.io import frame
-from topomerge.io.archive import replace_on_success
 from topomerge.io.piece import BLOCK_POINTS, build_damage_error, read_options
 from topomerge.io.points import Progress, detect_format, iter_guarded, read_chunks
 from topomerge.types import Array, PointCloud

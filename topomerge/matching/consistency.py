@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from topomerge.archive import read_weights_json
 from topomerge.errors import InputError
-from topomerge.io.archive import read_weights_json
 from topomerge.kernels.registration import measure_pose_evidence
 from topomerge.matching.assignment import match_by_overlap, select_best_partners
 from topomerge.matching.poses import PoseArrays, PoseHypothesis, PoseTolerance, concatenate_poses, find_distinct_poses, refine

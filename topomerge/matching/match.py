@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from topomerge.archive import convert_to_plain
 from topomerge.embedding.learned import DEFAULT
 from topomerge.embedding.learned import build_embedder as make_embedder
 from topomerge.embedding.quarter_turns import Descriptor, Rows, TurnedRows
 from topomerge.errors import InputError
-from topomerge.io.listing import convert_to_plain
 from topomerge.matching.assignment import (
     align,
     assign,

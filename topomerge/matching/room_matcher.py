@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from topomerge.archive import find_weights_file
 from topomerge.embedding.quarter_turns import FACTS, QUARTERS, Rows, TurnedRows, estimate_quarter_turns
 from topomerge.errors import InputError
-from topomerge.io.archive import find_weights_file
 from topomerge.kernels.registration import sum_votes
 from topomerge.networks.network import WEIGHTS_PACKAGE, Run, Signature, Tensor, load_network, read_card
 from topomerge.types import Array

@@ -17,9 +17,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from topomerge.archive import convert_to_plain, find_weights_file, replace_on_success
 from topomerge.errors import InputError, is_memory_short
-from topomerge.io.archive import find_weights_file, replace_on_success
-from topomerge.io.listing import convert_to_plain
 from topomerge.types import Array
 
 Dimension = int | str  # a number, or the name of what is counted

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.special import betaln
 
-from topomerge.io.archive import read_weights_json
+from topomerge.archive import read_weights_json
 from topomerge.matching.poses import PoseHypothesis, PoseTolerance, select_distinct_hypotheses
 from topomerge.registration.judge import Judge
 from topomerge.registration.posterior import compute_evidence_limit, compute_posterior, limit_posterior

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from topomerge.io.archive import replace_on_success
+from topomerge.archive import replace_on_success
 from topomerge.registry import TASKS
 from topomerge.training.run_folder import MetricsLog, begin_run, export_files, write_card
 from topomerge.training.settings import TaskSettings

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from topomerge.archive import find_weights_file, replace_on_success
 from topomerge.datasets.core.builder import derive, read_derived, read_sources
 from topomerge.datasets.pairs.plan_examples import PlanRecipe, build_plans, load_examples
 from topomerge.errors import InputError
@@ -37,7 +38,6 @@ from topomerge.extraction.plans.plan_network import (
     remove_furniture,
 )
 from topomerge.extraction.plans.storey_plan import StoreyPlan
-from topomerge.io.archive import find_weights_file, replace_on_success
 from topomerge.numpy_nn import apply_mlp, sigmoid
 from topomerge.training.loop import NetworkJob, State, derive_seed, descend_gradient, run_network
 from topomerge.training.packed_pairs import number_buildings, read_scan_building

@@ -19,11 +19,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from topomerge import archive
 from topomerge.datasets.core.building import find_physical_building
 from topomerge.embedding.engineered import compute_door_layout
 from topomerge.embedding.graph import add_proximity_edges, count_columns
 from topomerge.errors import InputError
-from topomerge.io import archive
 from topomerge.types import Array
 
 PACKED_FORMAT = 7

@@ -20,11 +20,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from topomerge.archive import convert_to_plain, replace_on_success
 from topomerge.code_digest import read_commit
 from topomerge.config import read_command
 from topomerge.errors import InputError
-from topomerge.io.archive import replace_on_success
-from topomerge.io.listing import convert_to_plain
 
 RUN_FILE, CONFIG_FILE, RUN_FORMAT = "run.json", "config.json", 1
 PACKAGES = ("torch", "torch-geometric", "numpy", "topomerge")

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 import topomerge
+from topomerge.archive import replace_on_success
 from topomerge.errors import InputError
-from topomerge.io.archive import replace_on_success
 from topomerge.networks import network as networks
 from topomerge.training.provenance import RUN_FILE, describe_data, describe_provenance, record_start
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from topomerge.datasets.drawings.shapes import DrawingRecipe
 from topomerge.datasets.pairs.plan_examples import PlanRecipe
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.elevation import WALL_CLASSES
@@ -82,6 +83,50 @@ class GridSegmentation(PlanSegmentation):
     warmup: int = 200
     rate: float = 3e-3
     augment: PlanAugment = field(default_factory=lambda: PlanAugment(upper=0.0, columns=0.0, grid_noise=0.15))
+
+
+@dataclass
+class DrawingSegmentation(RasterTask):
+    """Args:
+    data, watched: plans that are drawn to learn from and to watch; heldout: to judge.
+    steps: of an epoch; warmup: steps in which the rate rises.
+    crop: px of a side of a page, a multiple of 32.
+    pages: that are at hand at a time; fresh: of them that are drawn anew in each step.
+    widths: channels of the page's own pixels and of the five levels below.
+    classes: weights of `networks.drawing.DRAWING_CLASSES` in the cross-entropy.
+    """
+
+    task: str = "drawing_segmentation"
+    name: str = "drawing_segmentation"
+    data: DrawingRecipe = field(default_factory=DrawingRecipe)
+    watched: DrawingRecipe = field(default_factory=lambda: DrawingRecipe("drawings_watched", "validation", 40))
+    heldout: DrawingRecipe = field(default_factory=lambda: DrawingRecipe("drawings_heldout", "test", 40))
+    epochs: int = 10
+    batch: int = 8
+    steps: int = 300
+    warmup: int = 150
+    crop: int = 256
+    pages: int = 512
+    fresh: int = 2
+    watched_pages: int = 96
+    rate: float = 3e-3
+    widths: list[int] = field(default_factory=lambda: [8, 24, 40, 64, 96, 128])
+    classes: list[float] = field(default_factory=lambda: [1.0, 1.0, 2.0, 3.0, 3.0, 1.0, 2.0, 1.0])
+    watch: str = "mean_iou"
+
+    def check(self) -> None:
+        """Refuse what makes no sense."""
+        super().check()
+        if self.crop < 64 or self.crop % 32:
+            raise InputError(f"crop must be a multiple of 32 from 64 on, not {self.crop}")
+        if len(self.widths) != 6 or min(self.widths) < 1:
+            raise InputError(f"widths must be 6 numbers of channels, not {self.widths}")
+        if len(self.classes) != 8 or min(self.classes) <= 0:
+            raise InputError(f"classes must be 8 weights above 0, not {self.classes}")
+        if min(self.pages, self.fresh, self.watched_pages) < 1:
+            raise InputError(
+                f"pages, fresh and watched_pages must be 1 or more, not {self.pages}, {self.fresh}, {self.watched_pages}"
+            )
 
 
 @dataclass

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from topomerge.archive import replace_on_success
 from topomerge.errors import InputError
-from topomerge.io.archive import replace_on_success
 from topomerge.registry import TASKS, load_plugins
 from topomerge.statistics import estimate_mean
 from topomerge.training.provenance import MAY_CHANGE

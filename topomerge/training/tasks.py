@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from topomerge.archive import find_weights_file, replace_on_success
 from topomerge.errors import InputError
-from topomerge.io.archive import find_weights_file, replace_on_success
 from topomerge.registry import TASKS, load_plugins
 from topomerge.types import LogFn
 

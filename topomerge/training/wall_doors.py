@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from sklearn.linear_model import LogisticRegression
 
+from topomerge.archive import read_weights_json
 from topomerge.datasets.pairs.plan_examples import PlanRecipe
 from topomerge.datasets.pairs.wall_examples import build_walls, load_walls
 from topomerge.errors import InputError
@@ -31,7 +32,6 @@ from topomerge.extraction.elevations.wall_doors import (
 )
 from topomerge.extraction.plans.storey_plan import ClassifiedStorey
 from topomerge.extraction.walls import find_doorways
-from topomerge.io.archive import read_weights_json
 from topomerge.metrics import match_places
 from topomerge.training.closed_form import FitResult, compute_calibration_error, run_fit
 from topomerge.training.packed_pairs import number_buildings, read_scan_building

@@ -13,9 +13,9 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from topomerge.archive import replace_on_success
 from topomerge.datasets.core.builder import run_script
 from topomerge.errors import InputError
-from topomerge.io.archive import replace_on_success
 from topomerge.registry import TASKS
 from topomerge.training.tasks import compose_settings, train
 

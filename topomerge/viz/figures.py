@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from topomerge.io.archive import replace_on_success
+from topomerge.archive import replace_on_success
 from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.types import TopometricMap
 from topomerge.viz.plan import Frame, Place, StoreyPlan, compute_frame, find_label_places, rasterize_storeys

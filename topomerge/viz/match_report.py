@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from topomerge.archive import replace_on_success
 from topomerge.embedding.sheets import build_sheet_arrays
 from topomerge.embedding.surroundings import CROP, CROP_PLANES, SHEET_PIXEL, cut_crops
 from topomerge.fusion.result import RoomMatch
-from topomerge.io.archive import replace_on_success
 from topomerge.matching.match import Matching
 from topomerge.types import Array, TopometricMap
 from topomerge.viz.merge_plan import lay_out_pair, render_lines

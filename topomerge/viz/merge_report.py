@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from topomerge.archive import replace_on_success
 from topomerge.errors import InputError
 from topomerge.fusion.fuse import find_joined_rooms
 from topomerge.fusion.pipeline import format_hypothesis, format_probability, list_evidence, list_posterior
 from topomerge.fusion.result import MergeResult, build_placements, serialise_merge
 from topomerge.fusion.transfer import transform_floor
-from topomerge.io.archive import replace_on_success
 from topomerge.io.listing import format_json
 from topomerge.io.maps import save_map
 from topomerge.io.rooms_ply import assign_room_colours, save_rooms_ply

@@ -15,10 +15,10 @@ from urllib.parse import quote, unquote, urlsplit
 import numpy as np
 
 from topomerge import __version__
+from topomerge.archive import replace_on_success
 from topomerge.errors import InputError
 from topomerge.fusion.result import BEND_PARAMETER
 from topomerge.fusion.transfer import LANDMARK_PARAMETER
-from topomerge.io.archive import replace_on_success
 from topomerge.types import Array, TopometricMap
 from topomerge.viz.plan import StoreyPlan, build_scene_data
 from topomerge.viz.svg import Sheet, lay_out, render_plan_svgs

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.io.listing import convert_to_plain, describe_landmarks, describe_room
+from topomerge.archive import convert_to_plain
+from topomerge.io.listing import describe_landmarks, describe_room
 from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.types import LANDMARK_KINDS, TopometricMap, classify_door_state, find_room_names
 from topomerge.viz.plan import format_hex_colour

@@ -15,8 +15,8 @@ from topomerge.datasets.pairs.example import load_example
 from topomerge.datasets.pairs.items import Recipe, check, draw_items
 
 from tests.recipes import SMALL_HOUSES
+from topomerge import archive
 from topomerge.errors import InputError
-from topomerge.io import archive
 from topomerge.training.packed_pairs import SHEET, load_pairs
 
 THREE = Recipe(name="three", pairs=2, walks=3, **SMALL_HOUSES)

@@ -12,6 +12,7 @@ import pytest
 
 import topomerge
 from tests.fusion.atlas.atlas_scenes import NAMES, office_map, stranger
+from topomerge import archive
 from topomerge.cli.main import main as cli
 from topomerge.embedding.quarter_turns import TurnedRows
 from topomerge.errors import InputError
@@ -20,7 +21,6 @@ from topomerge.fusion.atlas.find import find, rank_sightings, register_sightings
 from topomerge.fusion.atlas.folder import read_atlas
 from topomerge.fusion.atlas.rooms_index import ROOMS_FILE
 from topomerge.fusion.atlas.store import add, remove
-from topomerge.io import archive
 from topomerge.viz.atlas_report import render_atlas_html
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.fusion.atlas.atlas_scenes import office_map
+from topomerge import archive
 from topomerge.embedding.quarter_turns import TurnedRows
 from topomerge.errors import InputError
 from topomerge.fusion.atlas import find as finding
@@ -27,7 +28,6 @@ from topomerge.fusion.atlas.rooms_index import (
     compute_embedder_signature,
     encode_signature,
 )
-from topomerge.io import archive
 from topomerge.types import Array
 
 MAPS, KINDS, SIZE = 300, 40, 8  # kinds of rooms, of which maps draw theirs: many maps have rooms that look alike

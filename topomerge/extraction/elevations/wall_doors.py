@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from topomerge.archive import read_weights_json
 from topomerge.extraction.elevations.doorways import STRAIGHT, StoreyWalls, merge_openings
 from topomerge.extraction.elevations.elevation import ALONG, BANDS, BEFORE, BEHIND, PLACES, Elevations
 from topomerge.extraction.plans.storey_plan import PLAN_SIGNS, ClassifiedStorey, compute_plan_features
 from topomerge.extraction.topology import DOOR_MOST_WIDTH
-from topomerge.io.archive import read_weights_json
 from topomerge.numpy_nn import sigmoid
 from topomerge.types import EDGE_DTYPE, Array, TopometricMap
 

@@ -17,9 +17,9 @@ import edt
 import numpy as np
 from scipy import ndimage
 
+from topomerge.archive import find_weights_file
 from topomerge.errors import InputError
 from topomerge.extraction.plans.storey_plan import DOORWAY_CLASS, SHUT_CLASS, WALL_CLASS, StoreyPlan
-from topomerge.io.archive import find_weights_file
 from topomerge.kernels import rays
 from topomerge.kernels.rasters import compute_watershed, find_contacts
 from topomerge.numpy_nn import apply_mlp, sigmoid

@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from topomerge import archive
 from topomerge.embedding.learned import DEFAULT
 from topomerge.embedding.quarter_turns import Descriptor, Rows, TurnedRows, get_rows
 from topomerge.embedding.weights import read_embedder_card
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.folder import Entry, StoredAtlas
 from topomerge.fusion.atlas.partners import ROOM_NEIGHBOURS, compute_vectors, list_owners
-from topomerge.io import archive
 from topomerge.io.maps import load_map
 from topomerge.matching.match import embed_rooms
 from topomerge.types import Array

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from topomerge import __version__
+from topomerge.archive import convert_to_plain
 from topomerge.embedding.quarter_turns import Descriptor
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.link_evidence import Link
@@ -35,7 +36,6 @@ from topomerge.fusion.inputs import (
     resolve_link_threshold,
 )
 from topomerge.fusion.pose_graph import Assembler, Assembly, compute_residual
-from topomerge.io.listing import convert_to_plain
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.registration.bend.bend import NEITHER_BENDS
 from topomerge.registration.posterior import check_same

@@ -31,6 +31,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from topomerge import __version__
+from topomerge.archive import convert_to_plain
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.folder import (
     ATLAS_FORMAT,
@@ -59,7 +60,7 @@ from topomerge.fusion.atlas.solve import (
     solve,
 )
 from topomerge.fusion.result import serialise_transform
-from topomerge.io.listing import convert_to_plain, format_json
+from topomerge.io.listing import format_json
 from topomerge.io.maps import save_map
 from topomerge.io.rooms_ply import save_rooms_ply
 from topomerge.types import LEVELLED, Array, Sim3, TopometricMap, convert_pose_to_files, is_level

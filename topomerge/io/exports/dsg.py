@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from topomerge.io.archive import replace_on_success
+from topomerge.archive import replace_on_success
 from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.structure.floors import build_floor_polygons, find_inside_point
 from topomerge.types import LANDMARK_KINDS, ROOM_ODDS, Array, TopometricMap, find_room_names

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import shapely
 
+from topomerge.archive import replace_on_success
 from topomerge.errors import InputError
-from topomerge.io.archive import replace_on_success
 from topomerge.io.landmarks import serialise_landmarks
 from topomerge.structure.floors import compute_jambs, is_flight, measure_room_levels
 from topomerge.structure.plan_structure import build_plan_structure

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from topomerge.io.archive import replace_on_success
+from topomerge.archive import replace_on_success
 from topomerge.io.exports.markup import replace_forbidden
 from topomerge.io.listing import describe_room
 from topomerge.structure.floors import is_flight, measure_room_levels

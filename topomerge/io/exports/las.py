@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from topomerge.io.archive import replace_on_success
+from topomerge.archive import replace_on_success
 from topomerge.io.rooms_ply import NO_ROOM, assign_room_colours
 from topomerge.types import TopometricMap
 

@@ -17,8 +17,8 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
+from topomerge.archive import replace_on_success
 from topomerge.errors import InputError
-from topomerge.io.archive import replace_on_success
 from topomerge.structure.floors import is_flight
 from topomerge.types import Array, TopometricMap
 

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from topomerge.io.archive import replace_on_success
+from topomerge.archive import replace_on_success
 from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.structure.floors import build_floor_polygons, compute_jambs, find_inside_point
 from topomerge.types import Array, TopometricMap

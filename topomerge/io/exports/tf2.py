@@ -18,8 +18,8 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from topomerge.archive import replace_on_success
 from topomerge.errors import InputError
-from topomerge.io.archive import replace_on_success
 from topomerge.types import Array, Sim3, TopometricMap, is_level, read_levelling
 
 LISTINGS = ("merge.json", "atlas.json")

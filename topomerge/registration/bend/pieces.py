@@ -10,8 +10,8 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from topomerge.archive import read_weights_json
 from topomerge.errors import InputError
-from topomerge.io.archive import read_weights_json
 from topomerge.matching.poses import PlanFields
 from topomerge.registration.storeys import find_slices, is_extruded
 from topomerge.types import Array, TopometricMap, VoxelGrid

@@ -22,11 +22,35 @@ from typing import IO, Any, NamedTuple, TypeVar
 import numpy as np
 
 from topomerge.errors import InputError, is_memory_short
-from topomerge.io.piece import refuse_pointer
 from topomerge.types import Array
 
 PART_SUFFIX = ".part"  # of the folders in which files are written
 PART_NAME = re.compile(r"\.([0-9a-f]{8})-(\d+)\.[^.]*\.part$")  # machine and process of the one that writes
+
+
+LFS_POINTER = b"version https://git-lfs.github.com/spec/v1"
+
+
+def refuse_pointer(path: Path) -> None:
+    """Refuse a file that Git LFS put in place of the one that is wanted.
+
+    Raises:
+        InputError: it is a pointer of Git LFS.
+    """
+    with path.open("rb") as stream:
+        if stream.read(len(LFS_POINTER)) == LFS_POINTER:
+            raise InputError(f"{path}: is a Git LFS pointer, not the file; run `git lfs pull`")
+
+
+def convert_to_plain(value: Any) -> Any:
+    """Return the value in Python's own types, as far as JSON has them: arrays and tuples as lists, anything odd as its text."""
+    if isinstance(value, np.ndarray | np.generic):
+        return convert_to_plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {str(key): convert_to_plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [convert_to_plain(item) for item in (sorted(value) if isinstance(value, set | frozenset) else value)]
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 
 @contextmanager

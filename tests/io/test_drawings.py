@@ -1,0 +1,192 @@
+"""Drawn floor plans: what is page, wall and floor, and what the texts on them say."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+from topomerge.datasets.drawings.hands import Hand, draw_plan, spoil_page
+from topomerge.datasets.drawings.shapes import DrawingShapes, OpeningShape, RoomShape
+
+from topomerge.io.drawing import (
+    PictureText,
+    choose_zoom,
+    estimate_scale,
+    find_name,
+    find_structure,
+    is_drawing,
+    parse_lengths,
+)
+from topomerge.networks.drawing import DRAWING_CLASSES, compute_drawing_probabilities
+
+PLAIN = Hand("filled", (0, 0, 0), 0.25, 0.1, 2, False, "arc", "lines", 0.0, 0.0, 1.0, "m2", False, 3, 0.3)
+
+
+def rectangle(x0, y0, x1, y1):
+    return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], float)
+
+
+def flat():
+    """A hall with two rooms, a courtyard between walls, a window and an entrance."""
+    rooms = (
+        RoomShape(rectangle(0, 0, 8, 2), "corridor"),
+        RoomShape(rectangle(0, 2.1, 4, 6), "bedroom"),
+        RoomShape(rectangle(4.1, 2.1, 8, 6), "office"),
+    )
+    doors = [((1, 2.05), (1.9, 2.05)), ((6, 2.05), (6.9, 2.05)), ((-0.05, 0.5), (-0.05, 1.4))]
+    openings = [OpeningShape("door", np.array(line), 0.1) for line in doors]
+    return DrawingShapes("flat", rooms, (*openings, OpeningShape("window", np.array([[1.0, 6.1], [2.5, 6.1]]), 0.2)))
+
+
+def draw(hand=PLAIN, seed=0, scale=30.0):
+    return draw_plan(flat(), hand, np.random.default_rng(seed), (320, 352), scale, np.array([-1.8, -2.2]))
+
+
+def one_hot(classes):
+    return np.eye(len(DRAWING_CLASSES), dtype=np.float32)[classes]
+
+
+def count_rooms(parsed):
+    return int(ndimage.label(parsed.free & ~parsed.door)[1])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_true_classes_give_the_true_rooms(seed):
+    drawing = draw(seed=seed)
+    parsed = find_structure(one_hot(drawing.classes), 1.0, 30.0)
+    assert count_rooms(parsed) == 3
+    assert int(ndimage.label(parsed.door)[1]) == 3
+    label, _ = ndimage.label(parsed.free & ~parsed.door)
+    for room in range(3):
+        inside = drawing.rooms == room
+        best = np.bincount(label[inside & (label > 0)]).argmax()
+        both, either = (inside & (label == best)).sum(), (inside | (label == best)).sum()
+        assert both / either > 0.9
+    assert not (
+        parsed.free & (drawing.rooms < 0) & ~parsed.door & ~ndimage.binary_dilation(drawing.rooms >= 0, iterations=3)
+    ).any()
+
+
+def test_the_page_stays_outside_where_a_wall_was_missed():
+    drawing = draw()
+    classes = drawing.classes.copy()
+    classes[40:60, :][classes[40:60, :] == DRAWING_CLASSES.index("wall")] = DRAWING_CLASSES.index("floor")
+    parsed = find_structure(one_hot(classes), 1.0, 30.0)
+    assert parsed.free[drawing.rooms >= 0].mean() > 0.9
+    far = ~ndimage.binary_dilation(drawing.rooms >= 0, iterations=12)
+    assert not parsed.free[far].any() and not parsed.occupied[far].any()
+
+
+def test_a_courtyard_is_page():
+    classes = np.full((100, 100), DRAWING_CLASSES.index("page"))
+    classes[10:90, 10:90] = DRAWING_CLASSES.index("wall")
+    classes[14:86, 14:86] = DRAWING_CLASSES.index("floor")
+    classes[40:60, 40:60] = DRAWING_CLASSES.index("wall")
+    classes[43:57, 43:57] = DRAWING_CLASSES.index("page")
+    parsed = find_structure(one_hot(classes), 1.0, 10.0)
+    assert parsed.free[20, 20] and not parsed.free[50, 50] and not parsed.free[5, 5]
+
+
+@pytest.mark.parametrize(
+    ("text", "area", "sides"),
+    [
+        ("BEDROOM 13.4 m²", 13.4, None),
+        ("12,5 qm", 12.5, None),
+        ("145 sq ft", 145 * 0.3048**2, None),
+        ("4.2 x 5.8 m", None, (4.2, 5.8)),
+        ("420 x 580", None, (4.2, 5.8)),
+        ("3500 mm x 2700 mm", None, (3.5, 2.7)),
+        ("10'1\" x 11'11\"", None, (10 * 0.3048 + 0.0254, 11 * 0.3048 + 11 * 0.0254)),
+        ("9' x 8'", None, (9 * 0.3048, 8 * 0.3048)),
+        ("KITCHEN", None, None),
+        ("2.113", None, None),
+        ("0.001 m²", None, None),
+        ("1:100", None, None),
+    ],
+)
+def test_lengths_are_read_from_texts(text, area, sides):
+    found_area, found_sides = parse_lengths(text)
+    assert found_area == (None if area is None else pytest.approx(area))
+    assert found_sides == (None if sides is None else pytest.approx(sides))
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("BEDROOM 13.4 m²", "BEDROOM"),
+        ("2.113", "2.113"),
+        ("A-113", "A-113"),
+        ("4.2 x 5.8 m", ""),
+        ("13,2", ""),
+        ("-", ""),
+        ("Küche", "Küche"),
+    ],
+)
+def test_names_are_what_is_left_of_texts(text, name):
+    if text == "13,2":
+        assert find_name(text) == ""
+    else:
+        assert find_name(text) == name
+
+
+def texts_of(drawing):
+    return [PictureText(t.text, t.place, 8.0, 1.0) for t in drawing.texts]
+
+
+@pytest.mark.parametrize("style", ["m2", "size", "feet"])
+@pytest.mark.parametrize("zoom", [1.0, 0.5])
+def test_areas_give_the_scale(style, zoom):
+    drawing = draw(Hand(**{**vars(PLAIN), "areas": style, "names": 0.0}))
+    step = round(1 / zoom)
+    parsed = find_structure(one_hot(drawing.classes[::step, ::step]), zoom, None)
+    scale = estimate_scale(parsed, texts_of(drawing))
+    assert scale is not None and scale.written and scale.resolution == pytest.approx(1 / 30, rel=0.04)
+
+
+def test_a_text_of_another_room_is_outvoted_and_doors_are_the_last_resort():
+    drawing = draw(Hand(**{**vars(PLAIN), "names": 0.0}))
+    parsed = find_structure(one_hot(drawing.classes), 1.0, None)
+    texts = texts_of(drawing)
+    wrong = PictureText("120 m²", texts[0].place, 8.0, 1.0)
+    assert estimate_scale(parsed, [*texts, wrong]).resolution == pytest.approx(1 / 30, rel=0.04)
+    by_doors = estimate_scale(parsed, [])
+    assert not by_doors.written and by_doors.resolution == pytest.approx(1 / 30, rel=0.2) and by_doors.spread > 0.1
+
+
+def test_grids_of_robots_are_no_drawings():
+    grid = np.full((200, 200), 205 / 255)
+    grid[50:150, 50:150] = 254 / 255
+    grid[50:150, 50] = 0
+    clear = np.zeros(grid.shape, bool)
+    assert not is_drawing(grid, clear)
+    page = draw().picture.mean(axis=2) / 255
+    assert is_drawing(page, np.zeros(page.shape, bool))
+    assert not is_drawing(1 - page, np.zeros(page.shape, bool))
+    assert not is_drawing(page[:50, :50], np.zeros((50, 50), bool))
+
+
+def test_pictures_are_looked_at_in_pixels_that_the_network_knows():
+    assert choose_zoom((800, 600), 0.05) == 1.0
+    assert choose_zoom((800, 600), 0.01) == pytest.approx(1 / 3)
+    assert choose_zoom((800, 600), 0.24) == pytest.approx(2.0)
+    assert choose_zoom((1800, 600), None) == pytest.approx(0.5) and choose_zoom((500, 600), None) == 1.0
+
+
+def test_tiles_give_what_the_whole_gives():
+    def run(picture):
+        bright = picture.mean(axis=1)[:, None]
+        return (np.repeat(bright, len(DRAWING_CLASSES), axis=1),)
+
+    picture = np.random.default_rng(0).integers(0, 255, (1500, 700, 3), dtype=np.uint8)
+    whole = compute_drawing_probabilities(picture, run)
+    assert whole.shape == (1500, 700, len(DRAWING_CLASSES))
+    assert np.allclose(whole[..., 0], picture.mean(axis=2) / 255, atol=1e-3)
+
+
+def test_spoiled_pages_keep_their_truth():
+    drawing = draw()
+    for seed in range(20):
+        page = spoil_page(drawing, np.random.default_rng(seed))
+        assert page.picture.dtype == np.uint8 and page.picture.shape[:2] == page.classes.shape == page.rooms.shape
+        shares = [np.bincount(c.ravel(), minlength=8) / c.size for c in (drawing.classes, page.classes)]
+        assert np.abs(shares[0] - shares[1]).max() < 0.2
+        again = spoil_page(drawing, np.random.default_rng(seed))
+        assert (again.picture == page.picture).all()

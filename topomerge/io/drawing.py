@@ -1,0 +1,285 @@
+"""Drawn floor plans: walls and floor of a picture with a page around it, symbols and text; its scale from what is written on it
+(beyond the thesis: docs/adr/0032)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from topomerge.io.pictures import load_text_reader
+from topomerge.io.sightings import clean_text
+from topomerge.networks.drawing import DOOR, FLOOR, PAGE, WALL, WINDOW, compute_drawing_probabilities
+from topomerge.networks.network import Run
+from topomerge.types import Array, Landmarks, build_landmarks, join_landmarks
+
+FINEST, COARSEST = 0.03, 0.12  # m a pixel: what the network was trained on lies between 0.02 and 0.125
+LONGEST_SIDE = 900  # px at which a picture of unknown scale is looked at
+BRIGHT, BRIGHT_SHARE = 0.6, 0.8  # of the brightness, and of the pixels along the border of a page
+GREY_OF_UNKNOWN, GREY_WIDTH, GREY_SHARE = 205, 6, 0.03  # levels of 255: a robot's grid has so much of it
+SMALLEST_ROOM = 0.7  # m2
+WALL_NEAR = 0.5  # m from a room: what lies farther off is no wall of the building
+GAP = 3  # px of walls that the network missed
+FOOT, INCH = 0.3048, 0.0254  # m
+PLAUSIBLE_AREA, PLAUSIBLE_SIDE = (0.8, 3000.0), (0.6, 100.0)  # m2, m
+FEWEST_PIXELS = 30  # of a room that gives a scale
+AGREEING = 0.12  # of the logarithm of the scale: texts that differ more from the median are not of their room
+DOOR_WIDTH, DOOR_SPREAD = 0.82, 0.12  # m, usual clear width of drawn doors, and its spread as a logarithm
+
+NUMBER = r"(\d{1,5}(?:[.,]\d{1,3})?)"
+AREA = re.compile(NUMBER + r"\s*(m²|m2|m\^2|qm|sqm|sq\.?\s*m\.?|kvm|㎡|sq\.?\s*ft\.?|ft²|sqft)", re.IGNORECASE)
+SIDES = re.compile(NUMBER + r"\s*(mm|cm|m)?\s*[x×X*]\s*" + NUMBER + r"\s*(mm|cm|m)?(?![\d'\"′])")
+SIDE_IN_FEET = r"(\d{1,3})\s*['’′]\s*(?:(\d{1,2})\s*(?:[\"”″]|'')?)?"
+FEET = re.compile(SIDE_IN_FEET + r"\s*[x×X*]\s*" + SIDE_IN_FEET)
+NUMBERED = re.compile(r"[A-Za-z]{0,3}[-. ]?\d{1,3}(?:[.\-]\d{1,4}){0,2}[a-z]?(?<=..)")
+NAME_SIGMA = 1.0  # m, of where a name stands in its room
+WORD = re.compile(r"[^\W\d_]{2,}")
+
+
+@dataclass(frozen=True)
+class PictureText:
+    """A text on a picture: its middle (column, row) and its height, px, and how surely it was read."""
+
+    text: str
+    place: tuple[float, float]
+    height: float
+    confidence: float
+
+
+@dataclass(frozen=True, eq=False)
+class ParsedDrawing:
+    """What a drawing shows, in pixels of `zoom` times the picture's number a side.
+
+    Args:
+        occupied: (h, w) bool, walls and windows; free: floor and open doors; door, window: (h, w) bool.
+        zoom: pixels of these for each of the picture.
+    """
+
+    occupied: Array
+    free: Array
+    door: Array
+    window: Array
+    zoom: float
+
+
+@dataclass(frozen=True)
+class DrawingScale:
+    """How large a pixel of a picture is.
+
+    Args:
+        resolution: m; spread: its standard deviation as a logarithm.
+        reasons: the texts or doors that say so; written: are they texts?
+    """
+
+    resolution: float
+    spread: float
+    reasons: tuple[str, ...]
+    written: bool = True
+
+    def is_coarse(self, zoom: float) -> bool:
+        """Were the pixels that the network saw, `zoom` for each of the picture, of another size than it knows?"""
+        return not FINEST / 1.5 <= self.resolution / zoom <= COARSEST
+
+
+LEAST_PIXELS = 100  # of a side of a page
+
+
+def is_drawing(bright: Array, clear: Array) -> bool:
+    """Return whether a picture is a drawing on a page, and not the grid of a robot.
+
+    Args:
+        bright: (h, w) of 0..1; clear: (h, w) bool, transparent.
+    """
+    if min(bright.shape) < LEAST_PIXELS:
+        return False
+    levels = np.round(np.nan_to_num(np.where(clear, 1.0, bright)).clip(0, 1) * 255).astype(np.int32)
+    histogram = np.bincount(levels.ravel(), minlength=256) / levels.size
+    unknown = histogram[GREY_OF_UNKNOWN - GREY_WIDTH : GREY_OF_UNKNOWN + GREY_WIDTH + 1]
+    if unknown.sum() > GREY_SHARE and unknown.max() > 0.6 * unknown.sum():
+        return False
+    border = np.concatenate([levels[0], levels[-1], levels[:, 0], levels[:, -1]])
+    return bool((border > BRIGHT * 255).mean() >= BRIGHT_SHARE)
+
+
+def parse_drawing(picture: Array, resolution: float | None = None, network: Run | None = None) -> ParsedDrawing:
+    """Find walls and floor of a drawing.
+
+    Args:
+        picture: (h, w, 3) uint8.
+        resolution: m a pixel; None: not known.
+        network: the one that ships, if None.
+    """
+    zoom = choose_zoom(picture.shape[:2], resolution)
+    seen = resize_picture(picture, zoom)
+    probability = np.asarray(compute_drawing_probabilities(seen, network), np.float32)
+    scale = None if resolution is None else zoom / resolution
+    return find_structure(probability, zoom, scale)
+
+
+def choose_zoom(shape: tuple[int, ...], resolution: float | None) -> float:
+    """Choose how many pixels the network sees for each of the picture."""
+    if resolution is None:
+        return min(1.0, LONGEST_SIDE / max(shape))
+    return float(np.clip(1.0, resolution / COARSEST, resolution / FINEST))
+
+
+def resize_picture(picture: Array, zoom: float) -> Array:
+    """Resize (h, w, 3) uint8, so that thin lines stay."""
+    from PIL import Image
+
+    if zoom == 1.0:
+        return picture
+    size = max(round(picture.shape[1] * zoom), 1), max(round(picture.shape[0] * zoom), 1)
+    how = Image.Resampling.BOX if zoom < 1 else Image.Resampling.BILINEAR
+    return np.asarray(Image.fromarray(picture).resize(size, how))
+
+
+def find_structure(probability: Array, zoom: float, scale: float | None) -> ParsedDrawing:
+    """Find walls and floor by probabilities (h, w, 8).
+
+    The page is what can be reached from the border without a wall, a window, a door or floor in between, and what is page by
+    itself, such as a courtyard.
+
+    Args:
+        scale: px/m of the probabilities, or None.
+    """
+    kind = probability.argmax(axis=-1)
+    occupied, door, window = np.isin(kind, (WALL, WINDOW)), kind == DOOR, kind == WINDOW
+    bridged = ndimage.binary_closing(np.pad(occupied | door, GAP), np.ones((2, 2)), GAP)[GAP:-GAP, GAP:-GAP]
+    around, _ = ndimage.label(np.pad(~(bridged | (kind == FLOOR)), 1, constant_values=True))
+    outside = around[1:-1, 1:-1] == around[0, 0]
+    label, count = ndimage.label(~(occupied | outside | door))
+    numbers = np.arange(1, count + 1)
+    page = ndimage.mean(probability[..., PAGE], label, numbers) if count else np.zeros(0)
+    floor = ndimage.mean(probability[..., FLOOR], label, numbers) if count else np.zeros(0)
+    size = ndimage.sum(label > 0, label, numbers) if count else np.zeros(0)
+    least = FEWEST_PIXELS if scale is None else SMALLEST_ROOM * scale**2
+    rooms = np.append(False, (page < floor) & (size >= least))[label]
+    doors, _ = ndimage.label(door)
+    door &= np.isin(doors, np.unique(doors[ndimage.binary_dilation(rooms, np.ones((3, 3)), 2)]))
+    near = ndimage.distance_transform_edt(~(rooms | door)) <= (WALL_NEAR * scale if scale else 12)
+    return ParsedDrawing(occupied & near, rooms | door, door, window & near, zoom)
+
+
+def parse_lengths(text: str) -> tuple[float | None, tuple[float, float] | None]:
+    """Parse an area, m2, and sides, m, that a text states: "13.4 m²", "4.2 x 5.8 m", "10'1\\" x 11'1\\"", "145 sq ft"."""
+    sides = None
+    if found := FEET.search(text):
+        feet = [float(v or 0) for v in found.groups()]
+        sides = feet[0] * FOOT + feet[1] * INCH, feet[2] * FOOT + feet[3] * INCH
+    elif found := SIDES.search(text):
+        values = [float(found[k].replace(",", ".")) for k in (1, 3)]
+        unit = found[4] or found[2] or ("cm" if min(values) > 60 else "m")
+        factor = {"m": 1.0, "cm": 0.01, "mm": 0.001}[unit.lower()]
+        sides = values[0] * factor, values[1] * factor
+    area = None
+    if found := AREA.search(text):
+        area = float(found[1].replace(",", ".")) * (FOOT**2 if "f" in found[2].lower() else 1.0)
+    if area is not None and not PLAUSIBLE_AREA[0] <= area <= PLAUSIBLE_AREA[1]:
+        area = None
+    if sides is not None and not all(PLAUSIBLE_SIDE[0] <= side <= PLAUSIBLE_SIDE[1] for side in sides):
+        sides = None
+    return area, sides
+
+
+def find_name(text: str) -> str:
+    """Find the name or number of a room in a text: what is left without areas and sides; "" where that is no name."""
+    left = FEET.sub(" ", SIDES.sub(" ", AREA.sub(" ", text)))
+    left = " ".join(left.split()).strip(" -:;,/|()")
+    return left if WORD.search(left) or NUMBERED.fullmatch(left) else ""
+
+
+def find_names(texts: Sequence[PictureText], source: str, resolution: float, height: int) -> Landmarks:
+    """Find names and numbers of rooms among texts; numbers are what signs at doors show.
+
+    Args:
+        source: the picture; resolution: m a pixel of it; height: px.
+    """
+    parts = []
+    for kind in ("name", "text"):
+        found = [(name, t) for t in texts if (name := find_name(t.text)) and (kind == "text") == bool(NUMBERED.fullmatch(name))]
+        places = np.array([t.place for _, t in found]).reshape(-1, 2)
+        position = np.column_stack([places[:, 0], height - places[:, 1], np.zeros(len(places))]) * resolution
+        confidence = np.array([t.confidence for _, t in found])
+        parts.append(build_landmarks(kind, [n for n, _ in found], source, position, sigma=NAME_SIGMA, confidence=confidence))
+    return join_landmarks(parts)
+
+
+def estimate_scale(drawing: ParsedDrawing, texts: Sequence[PictureText]) -> DrawingScale | None:
+    """Estimate the size of a pixel by the areas and sides that are written in rooms; else by the width of doors.
+
+    Each text that lies in a room says how long a pixel is: by the room's area, or by its box. The median decides; texts that
+    differ from it by more than `AGREEING` are left out.
+
+    Returns:
+        None where neither texts nor doors say anything.
+    """
+    rooms, _ = ndimage.label(drawing.free & ~drawing.door)
+    boxes = ndimage.find_objects(rooms)
+    found: list[tuple[float, str]] = []
+    for text in texts:
+        area, sides = parse_lengths(text.text)
+        number = _find_room(rooms, text, drawing.zoom)
+        if number == 0 or (area is None and sides is None):
+            continue
+        inside = rooms[boxes[number - 1]] == number
+        pixels = float(ndimage.binary_fill_holes(inside).sum())
+        if pixels < FEWEST_PIXELS:
+            continue
+        if area is not None:
+            found.append((np.sqrt(area / pixels), text.text))
+        if sides is not None:
+            box = sorted(float(v) for v in inside.shape)
+            small, large = sorted(sides)
+            found.append((np.sqrt(small * large / (box[0] * box[1])), text.text))
+    if found:
+        logs = np.log([value for value, _ in found])
+        middle = np.median(logs)
+        agree = np.abs(logs - middle) <= AGREEING
+        if agree.sum() * 2 > len(logs) or len(logs) == 1:
+            middle = float(np.median(logs[agree]))
+            spread = 0.05 / np.sqrt(agree.sum()) if agree.sum() > 1 else 0.1
+            reasons = tuple(dict.fromkeys(text for (_, text), good in zip(found, agree, strict=True) if good))
+            return DrawingScale(float(np.exp(middle)) * drawing.zoom, float(spread), reasons)
+    return _estimate_scale_by_doors(drawing)
+
+
+def _find_room(rooms: Array, text: PictureText, zoom: float) -> int:
+    """The room that a text lies in: its own pixels may be holes."""
+    column, row = (int(v * zoom) for v in text.place)
+    reach = max(int(text.height * zoom), 2)
+    part = rooms[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
+    counts = np.bincount(part.ravel())
+    return int(counts[1:].argmax()) + 1 if len(counts) > 1 else 0
+
+
+def _estimate_scale_by_doors(drawing: ParsedDrawing) -> DrawingScale | None:
+    label, count = ndimage.label(drawing.door)
+    widths = []
+    for number, box in enumerate(ndimage.find_objects(label), 1):
+        points = np.argwhere(label[box] == number).astype(float)
+        if len(points) < 6:
+            continue
+        values = np.linalg.eigvalsh(np.cov(points.T) + np.eye(2) / 12)
+        widths.append(float(np.sqrt(12 * values[1])))
+    if not widths:
+        return None
+    width = float(np.median(widths))
+    spread = float(np.hypot(DOOR_SPREAD, 0.3 / np.sqrt(len(widths))))
+    return DrawingScale(DOOR_WIDTH / width * drawing.zoom, spread, (f"{count} doors of usual width",), written=False)
+
+
+def read_texts(picture: Array) -> tuple[PictureText, ...] | None:
+    """Read the texts of a picture (h, w, 3); None where the extra `text` is not installed."""
+    reader = load_text_reader()
+    if reader is None:
+        return None
+    out = []
+    for corners, text, confidence in reader(picture):
+        middle = corners.mean(axis=0)
+        height = float(np.hypot(*(corners[3] - corners[0])))
+        out.append(PictureText(clean_text(text), (float(middle[0]), float(middle[1])), height, confidence))
+    return tuple(out)

@@ -1,0 +1,199 @@
+"""Task `drawing_segmentation`: the network that says what each pixel of a drawn floor plan shows."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections import deque
+from collections.abc import Generator, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+from topomerge.datasets.drawings.hands import sample_drawing
+from topomerge.datasets.drawings.shapes import DrawingShapes, build_drawing_shapes
+from topomerge.errors import InputError
+from topomerge.models.convolutional import DrawingProbabilities, DrawingUNet
+from topomerge.networks.drawing import DRAWING_CLASSES, DRAWING_FILE, DRAWING_SIGNATURE
+from topomerge.networks.network import Run, load_network
+from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, prefetch_batches, run_network
+from topomerge.training.scan_settings import DrawingSegmentation
+from topomerge.training.tasks import Task
+from topomerge.types import Array, LogFn
+
+TRAINED, WATCHED, JUDGED = 1, 2, 3  # streams of random numbers: no page is in two
+DARKER = 0.3  # by how much pages differ in brightness beyond what they are drawn with
+Page = tuple[Array, Array]  # (h, w, 3) picture and (h, w) classes, uint8
+_shapes: list[DrawingShapes] = []  # of a process that draws
+
+
+def _keep_shapes(shapes: list[DrawingShapes]) -> None:
+    _shapes[:] = shapes
+
+
+def _draw_page(seed: tuple[int, int, int], side: int) -> Page:
+    drawing = sample_drawing(_shapes, np.random.default_rng(seed), side)
+    return drawing.picture, drawing.classes
+
+
+class PageStream:
+    """Pages drawn one after the other, each from a seed of its own: by processes beside this one, or here.
+
+    Args:
+        seed, stream: of the random numbers; the n-th page follows from them and n alone.
+        jobs: processes; 1: drawn here.
+    """
+
+    def __init__(self, shapes: Sequence[DrawingShapes], seed: int, stream: int, side: int, jobs: int) -> None:
+        self.shapes, self.seed, self.side, self.jobs = list(shapes), (seed, stream), side, jobs
+        spawn = multiprocessing.get_context("spawn")
+        self.pool = ProcessPoolExecutor(jobs, spawn, _keep_shapes, (self.shapes,)) if jobs > 1 else None
+
+    def iter_pages(self, start: int, stop: int | None = None) -> Iterator[Page]:
+        """Yield the pages from number `start` on."""
+        if self.pool is None:
+            _keep_shapes(self.shapes)
+        coming: deque[Future[Page]] = deque()
+        number = start
+        while stop is None or number < stop or coming:
+            while self.pool is not None and len(coming) < 4 * self.jobs and (stop is None or number < stop):
+                coming.append(self.pool.submit(_draw_page, (*self.seed, number), self.side))
+                number += 1
+            if coming:
+                yield coming.popleft().result()
+            else:
+                yield _draw_page((*self.seed, number), self.side)
+                number += 1
+
+    def close(self) -> None:
+        """Stop the processes."""
+        if self.pool is not None:
+            self.pool.shutdown(cancel_futures=True)
+
+
+def fit(settings: DrawingSegmentation, log_line: LogFn) -> dict[str, float]:
+    """Train; the scores of the best epoch.
+
+    Raises:
+        InputError: no plan to draw.
+    """
+    shapes = build_drawing_shapes(settings.data, settings.cache, log_line)
+    watched = draw_pages(build_drawing_shapes(settings.watched, settings.cache, log_line), settings, WATCHED)
+    torch.manual_seed(derive_seed(settings.seed))
+    stream = PageStream(shapes, settings.seed, TRAINED, settings.crop, settings.jobs)
+    try:
+        job = DrawingJob(settings, stream, watched)
+        log_line(f"{len(shapes)} plans, {sum(p.numel() for p in job.network.parameters())} weights")
+        return run_network(job, settings, settings.steps, log_line)
+    finally:
+        stream.close()
+
+
+def draw_pages(shapes: Sequence[DrawingShapes], settings: DrawingSegmentation, stream: int) -> list[Page]:
+    """Draw the pages that are watched, or judged."""
+    pages = PageStream(shapes, settings.seed, stream, settings.crop, settings.jobs)
+    try:
+        return list(pages.iter_pages(0, settings.watched_pages))
+    finally:
+        pages.close()
+
+
+class DrawingJob(ExportedJob):
+    """Batches of the latest pages; in each step some are drawn anew and as many of the oldest go."""
+
+    def __init__(self, settings: DrawingSegmentation, stream: PageStream, watched: Sequence[Page]) -> None:
+        origin = {"set": settings.data.name, "split": settings.data.split, "plans": len(stream.shapes), "watched": len(watched)}
+        network = DrawingUNet(settings.widths).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        super().__init__(settings, network, origin)
+        self.options, self.stream, self.watched = settings, stream, watched
+        side = settings.crop
+        self.pictures = torch.zeros((settings.pages, side, side, 3), dtype=torch.uint8, device=self.device)
+        self.truths = torch.zeros((settings.pages, side, side), dtype=torch.uint8, device=self.device)
+        self.weight = torch.tensor(settings.classes, device=self.device)
+        self.drawn = 0  # pages so far
+        self.pages: Iterator[Page] | None = None
+
+    def iter_batches(self, state: State) -> Generator[tuple[Any, ...], None, None]:
+        """Yield pages."""
+        self.network.train()
+        yield from prefetch_batches(self.iter_fresh(state))
+
+    def iter_fresh(self, state: State) -> Iterator[tuple[list[Page], Array, int, Array]]:
+        """Yield new pages and rows, turn and brightness of each step from the state's on, from a generator of each step."""
+        options = self.options
+        for step in range(state.step, options.steps):
+            target = (state.epoch * options.steps + step) * options.fresh + options.pages
+            start = max(self.drawn, target - options.pages)
+            if self.pages is None or self.drawn < start:
+                self.pages = self.stream.iter_pages(start)
+                self.drawn = start
+            fresh = [next(self.pages) for _ in range(target - self.drawn)]
+            self.drawn = target
+            rng = np.random.default_rng([options.seed, 4, state.epoch, step])
+            rows = rng.choice(options.pages, options.batch, replace=options.batch > options.pages)
+            yield fresh, rows, int(rng.integers(4)), rng.uniform(1 - DARKER, 1, options.batch).astype(np.float32)
+
+    def train_step(self, batch: tuple[Any, ...], state: State) -> dict[str, float]:
+        """Take one step of the optimizer."""
+        options, (fresh, rows, turn, bright) = self.options, batch
+        target = (state.epoch * options.steps + state.step) * options.fresh + options.pages
+        for number, (picture, classes) in enumerate(fresh, target - len(fresh)):
+            self.pictures[number % options.pages] = torch.tensor(picture, device=self.device)
+            self.truths[number % options.pages] = torch.tensor(classes, device=self.device)
+        chosen = torch.as_tensor(rows, device=self.device)
+        x = (
+            self.pictures[chosen].permute(0, 3, 1, 2).float()
+            / 255
+            * torch.as_tensor(bright, device=self.device)[:, None, None, None]
+        )
+        x, truth = torch.rot90(x, turn, (2, 3)), torch.rot90(self.truths[chosen].long(), turn, (1, 2))
+        with torch.autocast(self.device.type, torch.bfloat16):  # half the time, on processors too
+            scores = self.network(x.contiguous(memory_format=torch.channels_last))
+        loss = functional.cross_entropy(scores.float(), truth, self.weight)
+        return self.optimize(loss, options, state)
+
+    def count_items(self, batch: tuple[Any, ...]) -> int:
+        """Count the pages of a batch."""
+        return len(batch[1])
+
+    def exported(self) -> Exported:
+        """The network with probabilities for scores."""
+        assert isinstance(self.network, DrawingUNet)
+        return Exported(DrawingProbabilities(self.network), DRAWING_SIGNATURE, [torch.rand(2, 3, 96, 64)])
+
+    def compute_scores(self) -> dict[str, float]:
+        """Compute the scores of the watched pages."""
+        return score_pages(self.watched, self.run())
+
+
+def score_pages(pages: Sequence[Page], network: Run) -> dict[str, float]:
+    """Score pages: IoU of each class, their mean over the classes that there are, and the share of pixels that are right."""
+    count = len(DRAWING_CLASSES)
+    table = np.zeros((count, count), np.int64)
+    for picture, truth in pages:
+        x = np.ascontiguousarray(picture.transpose(2, 0, 1)[None], np.float32) / np.float32(255)
+        (probability,) = network(picture=x)
+        prediction = np.asarray(probability[0]).argmax(axis=0)
+        table += np.bincount(truth.ravel().astype(np.int64) * count + prediction.ravel(), minlength=count**2).reshape(
+            count, count
+        )
+    right, true, predicted = np.diag(table), table.sum(axis=1), table.sum(axis=0)
+    iou = right / np.maximum(true + predicted - right, 1)
+    scores = {f"iou_{name}": float(value) for name, value in zip(DRAWING_CLASSES, iou, strict=True)}
+    there = true > 0
+    return {**scores, "mean_iou": float(iou[there].mean()), "accuracy": float(right.sum() / max(table.sum(), 1))}
+
+
+def judge(settings: DrawingSegmentation, file: Path, log_line: LogFn) -> dict[str, Any]:
+    """Return scores of weights on pages of plans that trained nothing."""
+    pages = draw_pages(build_drawing_shapes(settings.heldout, settings.cache, log_line), settings, JUDGED)
+    if not pages:
+        raise InputError("heldout: no page to judge")
+    return {**score_pages(pages, load_network(file, DRAWING_SIGNATURE)), "pages": len(pages)}
+
+
+SCORES = ("mean_iou", "accuracy", *(f"iou_{name}" for name in DRAWING_CLASSES))
+TASK = Task(DrawingSegmentation, fit, SCORES, judge, "topomerge.networks", DRAWING_FILE, hours=0.8)
