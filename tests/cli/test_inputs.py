@@ -19,6 +19,8 @@ import pytest
 
 import topomerge
 from tests.cli.processes import Run
+from tests.io.signs import walk_poses
+from tests.io.test_read_signs import write_corridor
 from tests.scenes import two_rooms
 from topomerge.cli import inputs
 from topomerge.cli.inputs import COMPRESSION, MEMORY_GROWTH, MEMORY_START, count_processes, iter_input_maps, measure_input
@@ -163,3 +165,17 @@ def test_size_of_an_input(tmp_path: Path) -> None:
     assert measure_input(str(tmp_path / "a.ply")) == 100
     assert measure_input(str(tmp_path)) == 100 + 100 * COMPRESSION[".laz"]
     assert measure_input(str(tmp_path / "missing")) == 0
+
+
+def test_signs_may_be_left_out_or_demanded(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`--text` fails without the package, before anything is read; `--no-text` reaches the reader, of `merge`, too."""
+    from topomerge.cli.inputs import collect_reading_options
+    from topomerge.io import pictures
+
+    monkeypatch.setattr(pictures, "load_text_reader", lambda: None)
+    folder = write_corridor(tmp_path / "walk", walk_poses(2))
+    status, _, said = run("extract", str(folder), "-o", str(tmp_path / "a.tmap"), "--text", "-q")
+    assert status == 1 and "pip install topomerge[text]" in said and not (tmp_path / "a.tmap").exists()
+    assert collect_reading_options(str(folder), argparse.Namespace(text=False, up="z")) == {"text": False, "up": "z"}
+    assert "text" in inputs.WORKER_OPTIONS
+    assert collect_reading_options(str(folder), argparse.Namespace()) == {}

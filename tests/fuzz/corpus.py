@@ -8,6 +8,7 @@ import shutil
 import tarfile
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -203,7 +204,13 @@ def write_walks(folder: Path) -> dict[str, Path]:
     found["cloud.copc.laz"] = write_copc(folder / "cloud.copc.laz", room_tree())
     found["room.sens"] = write_sens(folder / "room.sens", camera_poses())
     found["scans.db"] = write_rtabmap(folder / "scans.db", scan_nodes(room_walk()))
-    found["depth.db"] = write_rtabmap(folder / "depth.db", depth_nodes(camera_poses()[:1]))
+    found["depth.db"] = write_rtabmap(
+        folder / "depth.db",
+        [
+            replace(node, label="Lab", sensors=[(3, 1013.0, 1.0)], tags=[(3, np.eye(4))])
+            for node in depth_nodes(camera_poses()[:1])
+        ],
+    )
     for kind in ("bag", "db3", "mcap") if find_spec("rosbags") else ():
         found[f"walk.{kind}"] = write_bag(folder / kind, kind, walk_messages(room_walk())).rename(folder / f"walk.{kind}")
     return found
