@@ -163,7 +163,7 @@ TASKS = Registry(
             name: f"topomerge.training.{name}:TASK"
             for name in (
                 "door_classification", "wall_segmentation", "passages", "wall_doors", "room_odds", "feature_scale", "match_odds",
-                "place_evidence", "match_belief", "merge_belief", "embedding", "room_matcher",
+                "place_evidence", "match_belief", "merge_belief", "embedding", "room_matcher", "radio_law",
             )
         },
     },
