@@ -84,7 +84,7 @@ class RadioPlan:
         """Count the walls between (n, 2) places and (m, 2) others: (n, m); a run of cells of wall is one."""
         out = np.zeros((len(start), len(end)), np.int64)
         for j, to in enumerate(end):
-            steps = int(np.ceil(np.hypot(*(start - to).T).max(initial=0.0) / (RADIO_CELL / 2))) + 1
+            steps = int(np.ceil(np.hypot(*(start - to).T).max(initial=0.0) / RADIO_CELL)) + 1
             share = np.linspace(0.0, 1.0, steps)[None, :, None]
             points = start[:, None] + (to - start)[:, None] * share
             cell = np.floor((points - self.origin) / RADIO_CELL).astype(np.int64)

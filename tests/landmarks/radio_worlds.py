@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import cache
+
 import numpy as np
 from topomerge.datasets.real.wifi_malls import build_walk_map
 from topomerge.datasets.simulation.radio import (
@@ -15,7 +18,7 @@ from topomerge.datasets.simulation.radio import (
 
 from topomerge.types import Array, Landmarks, Sim3, TopometricMap, build_landmarks, move_landmarks
 
-SIZE = (70.0, 42.0)  # m
+SIZE = (70.0, 28.0)  # m
 ROOM = 7.0  # m
 SETTINGS = RadioSettings(density=1.5, moved=0.0)
 
@@ -41,12 +44,18 @@ def walk(low: float, high: float, seed: int = 0) -> Array:
     return at + np.random.default_rng(seed).uniform(-0.8, 0.8, at.shape)
 
 
+@cache
+def _simulate(low: float, high: float, session: int, level: int, seed: int, settings: RadioSettings) -> Landmarks:
+    points = place_access_points(PLANS, settings, seed)
+    return simulate_readings(PLANS, points, walk(low, high, session), level, settings, session)
+
+
 def hear(
     low: float = 2.0, high: float = 68.0, session: int = 0, level: int = 0, seed: int = 3, settings: RadioSettings = SETTINGS
 ) -> Landmarks:
     """What a phone hears on a walk; heights are those of its own storey."""
-    points = place_access_points(PLANS, settings, seed)
-    heard = simulate_readings(PLANS, points, walk(low, high, session), level, settings, session)
+    heard = _simulate(low, high, session, level, seed, settings)
+    heard = replace(heard, table=heard.table.copy())
     heard.table["position"][:, 2] = HELD
     return heard
 

@@ -82,7 +82,7 @@ def test_likeness_falls_with_distance_in_free_space():
     v = power * weight / (1 + spread / 400)
     want = v @ v.T / np.outer(np.linalg.norm(v, axis=1), np.linalg.norm(v, axis=1))
     assert np.allclose(likeness, want, atol=1e-5)
-    assert (np.diff(likeness[0]) < 1e-6).all() and likeness[0, -1] < 0.1
+    assert (np.diff(likeness[0]) < 1e-6).all() and likeness[0, -1] < 0.25
 
 
 def test_gain_of_a_phone_changes_little():
@@ -209,7 +209,8 @@ def test_storeys_of_one_map_are_told_apart_by_an_index():
         heard.table["storey"] = level
     storeys[1].table["position"][:, 2] += 3.5
     storeys[1].table["group"] += 1000
-    index = build_radio_index([build(join_landmarks(storeys))])
+    map = build(Landmarks())
+    index = build_radio_index([replace(map, storeys=np.repeat(map.storeys, 2), landmarks=join_landmarks(storeys))])
     for level in (0, 1):
         best = rank_maps(index, hear(15, 30, session=1, level=level))[0]
         assert (best.map, best.storey) == (0, level)

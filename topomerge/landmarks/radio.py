@@ -37,6 +37,7 @@ FINE = 0.5  # m, to which distances are told apart
 NEAR = 20.0  # m: pairs of scans that a pose puts nearer than this testify
 WING, OUTSIDE = (15.0, 60.0), (20.0, 100.0)  # m from where b's scans seem to be to where they are, by these alternatives
 SHIFTS, DIRECTIONS = (12.0, 25.0, 45.0), 8  # m, by which a pose may be off, and to how many sides
+STRETCHES = (0.6, 1.0, 1.7)  # metres of the mall that a metre of another building may be worth: walls stand closer, or further
 LEAKY, LEAKY_DISTANCE = 0.1, 10.0  # probability that a floor of another building is as light as so many m of one storey
 REPLACED = 0.02  # probability that all access points were replaced between two maps
 FOREIGN = 0.02  # probability that two scans of two buildings are alike at all
@@ -357,8 +358,9 @@ def _compare_alternatives(
         return law.discount * places * float(np.average(log_density, weights=w))
 
     def at(distance: Array, table: Array = law.fine[0]) -> float:
-        """Log likelihood if pairs are that far apart."""
-        return add(table[np.minimum((distance / FINE).astype(int), last), k])
+        """Log likelihood if pairs are that far apart, whatever a metre of this building is worth."""
+        steps = [np.minimum((distance * stretch / FINE).astype(int), last) for stretch in STRETCHES]
+        return float(np.logaddexp.reduce([add(table[step, k]) for step in steps]) - np.log(len(STRETCHES)))
 
     foreign = np.full(len(LIKENESS_EDGES) + 1, np.log(FOREIGN / len(LIKENESS_EDGES)))
     foreign[0] = np.log1p(-FOREIGN)

@@ -18,6 +18,7 @@ from topomerge.landmarks.radio import (
     FINE,
     LIKENESS_EDGES,
     PLACE,
+    STRETCHES,
     RadioLaw,
     RadioScans,
     classify_likeness,
@@ -86,17 +87,25 @@ def propose_scan_poses(a: RadioScans, b: RadioScans, n: int, law: RadioLaw) -> l
     middle = b.position.mean(axis=0)
     height = _find_height(likeness, a.position[:, 2], b.position[:, 2])
     search = _Search(likeness, a, b, middle, law)
-    refined = [search.refine(start) for start in search.vote(2 * n)]
-    kept: list[tuple[Array, float]] = []
-    for at, score in sorted(refined, key=lambda r: -r[1]):
-        if all(not _is_same(at, other) for other, _ in kept):
-            kept.append((at, score))
+    starts = search.vote(2 * n)
+    search.choose_stretch(starts)
+    coarse = _keep_best([search.refine_coarsely(start) for start in starts])
+    kept = _keep_best([search.refine(at) for at, _ in coarse[: max(n, 2)]])
     chances = np.exp(law.pose_discount * np.array([score for _, score in kept] + [0.0]) - law.pose_discount * max(kept[0][1], 0))
     chances /= chances.sum()
     return [
         RadioPose(_build_pose(at, middle, height), score, float(p), search.measure_covariance(at))
         for (at, score), p in zip(kept[:n], chances, strict=False)
     ]
+
+
+def _keep_best(found: Sequence[tuple[Array, float]]) -> list[tuple[Array, float]]:
+    """Poses by falling score, each but once."""
+    kept: list[tuple[Array, float]] = []
+    for at, score in sorted(found, key=lambda r: -r[1]):
+        if all(not _is_same(at, other) for other, _ in kept):
+            kept.append((at, score))
+    return kept
 
 
 def _is_same(a: Array, b: Array) -> bool:
@@ -136,8 +145,19 @@ class _Search:
         self.places = a.share, b.share
         self.shares = np.sqrt(np.outer(*self.places))
         self.reach = max(float(np.sqrt((self.b**2).sum(axis=1).mean())), 1.0)
-        self.tables = {reach: _build_table(law, reach) for reach in (COARSE, EXACT)}
+        self.tables = self._build_tables(1.0)
         self.few = tuple(np.unique(np.linspace(0, n - 1, min(n, REFINED)).round().astype(int)) for n in likeness.shape)
+
+    def _build_tables(self, stretch: float) -> dict[float, Array]:
+        return {reach: _build_table(self.law, reach, stretch) for reach in (COARSE, EXACT)}
+
+    def choose_stretch(self, starts: Sequence[Array]) -> None:
+        """Choose how many metres of the law's building a metre of this one is worth: as the best of some poses has it."""
+        rated = []
+        for stretch in STRETCHES:
+            self.tables = self._build_tables(stretch)
+            rated.append((max(self._build_score(at, COARSE, self.few, 0.0)(at) for at in starts), stretch))
+        self.tables = self._build_tables(max(rated)[1])
 
     def vote(self, most: int) -> list[Array]:
         """Find the poses that most partners vote for."""
@@ -166,11 +186,15 @@ class _Search:
                 kept.append(at)
         return kept
 
-    def refine(self, start: Array) -> tuple[Array, float]:
-        """Refine a pose; the pose, and its score over pairs up to `COARSE`."""
+    def refine_coarsely(self, start: Array) -> tuple[Array, float]:
+        """Refine a pose by some scans; the pose, and its score by these."""
         at = self._climb(start, COARSE, self.few, 8.0)
+        return at, self._build_score(at, COARSE, self.few, 0.0)(at)
+
+    def refine(self, start: Array) -> tuple[Array, float]:
+        """Refine a pose by all scans; the pose, and its score over pairs up to `COARSE`."""
         rows = tuple(np.arange(n) for n in self.likeness.shape)
-        at = self._climb(at, EXACT, rows, 2.0)
+        at = self._climb(start, EXACT, rows, 2.0)
         return at, self._build_score(at, COARSE, rows, 0.0)(at)
 
     def _climb(self, at: Array, reach: float, rows: tuple[Array, ...], step: float) -> Array:
@@ -219,11 +243,11 @@ class _Search:
 FINE_STEP = 0.25  # m, to which distances of a pose are told apart
 
 
-def _build_table(law: RadioLaw, reach: float) -> Array:
+def _build_table(law: RadioLaw, reach: float, stretch: float) -> Array:
     """(K, F) log likelihood ratio of a class of likeness at each `FINE_STEP` against pairs just beyond a reach, m."""
-    beyond = law.mix_between(reach, reach + 4.0)
+    beyond = law.mix_between(reach * stretch, (reach + 4.0) * stretch)
     table = law.fine[0] - beyond
-    at = np.arange(0.0, reach + FINE_STEP, FINE_STEP)
+    at = np.arange(0.0, reach + FINE_STEP, FINE_STEP) * stretch
     whole = np.arange(law.fine.shape[1]) * FINE
     out = np.array([np.interp(at, whole, table[:, k]) for k in range(table.shape[1])])
     out = ndimage.gaussian_filter1d(out, 1.5 / FINE_STEP, axis=1, mode="nearest")
