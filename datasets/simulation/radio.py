@@ -172,7 +172,7 @@ def _compute_shadows(track: Array, points: AccessPoints, level: int) -> Array:
     out = np.zeros((len(track), len(points.level)))
     waves = 24
     for j in range(len(points.level)):
-        rng = np.random.default_rng([points.seed, RADIO_STREAM, 7, level, j])
+        rng = np.random.default_rng([points.seed, RADIO_STREAM, 7, level + 100, j])
         wave, phase = rng.normal(0, 1 / SHADOW_REACH, (waves, 2)), rng.uniform(0, 2 * np.pi, waves)
         out[:, j] = np.sqrt(2 / waves) * np.cos(track @ wave.T + phase).sum(axis=1)
     return out
