@@ -164,7 +164,7 @@ TASKS = Registry(
             for name in (
                 "drawing_segmentation", "door_classification", "wall_segmentation",
                 "passages", "wall_doors", "room_odds", "feature_scale", "match_odds",
-                "place_evidence", "match_belief", "merge_belief", "embedding", "room_matcher",
+                "place_evidence", "match_belief", "merge_belief", "embedding", "room_matcher", "radio_law",
             )
         },
     },

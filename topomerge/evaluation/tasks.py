@@ -46,6 +46,7 @@ MODULES = {
     "bending": "bending",
     "atlases": "atlases",
     "retrieval": "retrieval",
+    "radio": "radio",
 }
 
 

@@ -16,11 +16,12 @@ from topomerge.networks.drawing import DOOR, FLOOR, PAGE, WALL, WINDOW, compute_
 from topomerge.networks.network import Run
 from topomerge.types import Array, Landmarks, build_landmarks, join_landmarks
 
-FINEST, COARSEST = 0.03, 0.12  # m a pixel: what the network was trained on lies between 0.02 and 0.125
-LONGEST_SIDE = 900  # px at which a picture of unknown scale is looked at
+FINEST, COARSEST = 0.04, 0.12  # m a pixel: what the network was trained on lies between 0.02 and 0.125
+LONGEST_SIDE = 640  # px at which a picture of unknown scale is looked at
 BRIGHT, BRIGHT_SHARE = 0.6, 0.8  # of the brightness, and of the pixels along the border of a page
 GREY_OF_UNKNOWN, GREY_WIDTH, GREY_SHARE = 205, 6, 0.03  # levels of 255: a robot's grid has so much of it
-SMALLEST_ROOM = 0.7  # m2
+SMALLEST_ROOM, SMALLEST_WALL, SMALLEST_DOOR = 0.7, 0.35, 0.04  # m2: less is a letter or a mark
+USUAL_SCALE = 25.0  # px/m, where none is known
 WALL_NEAR = 0.5  # m from a room: what lies farther off is no wall of the building
 GAP = 3  # px of walls that the network missed
 FOOT, INCH = 0.3048, 0.0254  # m
@@ -146,8 +147,11 @@ def find_structure(probability: Array, zoom: float, scale: float | None) -> Pars
     Args:
         scale: px/m of the probabilities, or None.
     """
+    known = USUAL_SCALE if scale is None else scale
     kind = probability.argmax(axis=-1)
-    occupied, door, window = np.isin(kind, (WALL, WINDOW)), kind == DOOR, kind == WINDOW
+    window = kind == WINDOW
+    occupied = drop_small(np.isin(kind, (WALL, WINDOW)), SMALLEST_WALL * known**2)
+    door = drop_small(kind == DOOR, SMALLEST_DOOR * known**2)
     bridged = ndimage.binary_closing(np.pad(occupied | door, GAP), np.ones((2, 2)), GAP)[GAP:-GAP, GAP:-GAP]
     around, _ = ndimage.label(np.pad(~(bridged | (kind == FLOOR)), 1, constant_values=True))
     outside = around[1:-1, 1:-1] == around[0, 0]
@@ -156,12 +160,19 @@ def find_structure(probability: Array, zoom: float, scale: float | None) -> Pars
     page = ndimage.mean(probability[..., PAGE], label, numbers) if count else np.zeros(0)
     floor = ndimage.mean(probability[..., FLOOR], label, numbers) if count else np.zeros(0)
     size = ndimage.sum(label > 0, label, numbers) if count else np.zeros(0)
-    least = FEWEST_PIXELS if scale is None else SMALLEST_ROOM * scale**2
-    rooms = np.append(False, (page < floor) & (size >= least))[label]
+    rooms = np.append(False, (page < floor) & (size >= SMALLEST_ROOM * known**2))[label]
     doors, _ = ndimage.label(door)
     door &= np.isin(doors, np.unique(doors[ndimage.binary_dilation(rooms, np.ones((3, 3)), 2)]))
-    near = ndimage.distance_transform_edt(~(rooms | door)) <= (WALL_NEAR * scale if scale else 12)
+    near = ndimage.distance_transform_edt(~(rooms | door)) <= WALL_NEAR * known
     return ParsedDrawing(occupied & near, rooms | door, door, window & near, zoom)
+
+
+def drop_small(mask: Array, least: float) -> Array:
+    """Return a mask (h, w) without its parts of fewer than so many pixels."""
+    label, _ = ndimage.label(mask, np.ones((3, 3)))
+    size = np.bincount(label.ravel())
+    size[0] = 0
+    return np.asarray(size[label] >= max(least, 1))
 
 
 def parse_lengths(text: str) -> tuple[float | None, tuple[float, float] | None]:

@@ -206,3 +206,12 @@ class FeatureScale(TaskSettings):
     heldout: Recipe = field(default_factory=Recipe)
     shrink: float = 0.1
     watch: str = "recall@1"
+
+
+@dataclass
+class RadioLawFit(TaskSettings):
+    """It has no settings of its own: its data is a folder of real readings, which TOPOMERGE_DATA names."""
+
+    task: str = "radio_law"
+    name: str = "radio_law"
+    watch: str = "log_loss"
