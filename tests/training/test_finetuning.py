@@ -50,7 +50,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def settings(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Training:
     """Runs that are not exported: `best/` keeps the weights of torch."""
     monkeypatch.setattr(EmbeddingJob, "export_best", lambda self, folder: None)
-    common = {"runs": str(tmp_path), "cache": str(cache), "data": "some", "validation": "other", "tensorboard": False}
+    common = {"runs": str(tmp_path), "cache": str(cache), "data": "some", "validation": "other", "logger": []}
     return Training(**common, epochs=1, batch=4, rate=1e-3, network=SMALL)
 
 
@@ -229,7 +229,7 @@ def test_a_run_on_own_pairs_goes_on_and_other_pairs_are_refused(folder: Path, tm
         "cache": str(tmp_path / "cache"),
         "data": "folder",
         "path": str(folder),
-        "tensorboard": False,
+        "logger": [],
     }
     run = Training(**common, epochs=1, batch=1, network=SMALL)
     fit(run, quiet)

@@ -49,9 +49,9 @@ from topomerge.training import (
     wall_segmentation,
 )
 from topomerge.training.door_classification import score_doors
-from topomerge.training.loop import State, prefetch_batches, select_device
+from topomerge.training.loop import State, prefetch_batches
 from topomerge.training.plan_segmentation import score_classes
-from topomerge.training.tasks import compose_settings, evaluate_task, find_weights, train
+from topomerge.training.tasks import check_accelerator, compose_settings, evaluate_task, find_weights, train
 from topomerge.types import EDGE_DTYPE, Array
 
 ROOT = Path(__file__).parent.parent.parent
@@ -97,7 +97,7 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         return [
             f"task={task}",
             f"runs={tmp_path / 'runs'}",
-            "tensorboard=false",
+            "logger=none",
             *NETWORKS.get(task, []),
             *WITHOUT_MORE.get(task, []),
             *more,
@@ -247,8 +247,8 @@ def test_a_wrong_word_is_one_line_with_its_key(given: list[str], key: str) -> No
 def test_a_device_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     with pytest.raises(InputError, match="accelerator=cuda"):
-        select_device(compose_settings(["task=plan_segmentation", "accelerator=cuda"]))
-    assert select_device(compose_settings(["task=door_classification"])).type == "cpu"
+        check_accelerator(compose_settings(["task=plan_segmentation", "accelerator=cuda"]))
+    check_accelerator(compose_settings(["task=door_classification"]))  # which has the processor only
 
 
 @pytest.mark.parametrize("task", list(TASKS))

@@ -87,7 +87,7 @@ def finetune(
         InputError: whatever is wrong with the folder or the settings; nothing was trained.
     """
     output = Path(output)
-    settings = replace(settings, data=OWN_DATA, name=RUN, runs=str(output), tensorboard=False, overwrite=True)
+    settings = replace(settings, data=OWN_DATA, name=RUN, runs=str(output), logger=[], overwrite=True)
     check(settings)
     settings = adopt_network(settings)
     check_exporter()
