@@ -122,6 +122,26 @@ class NetworkSettings(RunSettings):
 
 
 @dataclass
+class Search:
+    """A search for settings (`training.search`), ``search=optuna``.
+
+    Args:
+        kind: of what asks.
+        space: key of the settings -> [low, high], [low, high, log], or choices.
+        trials: in all; jobs: processes that run them.
+        startup: trials at random, before which nothing is pruned.
+        prune: end a trial whose watched score is below the median of the others.
+    """
+
+    kind: str = "optuna"
+    space: dict[str, Any] = field(default_factory=dict)
+    trials: int = 20
+    jobs: int = 1
+    startup: int = 5
+    prune: bool = True
+
+
+@dataclass
 class TaskSettings(RunSettings):
     """What every task but `embedding` has.
 
@@ -329,7 +349,9 @@ def convert_composed(given: Any) -> Training:
 
     check_own_path(given.data.name, given.path)
     values = {f.name: getattr(given, f.name) for f in fields(Training)}
-    return Training(**{**values, "data": given.data.name})
+    settings = Training(**{**values, "data": given.data.name})
+    check(settings)
+    return settings
 
 
 def load_settings(path: str | Path) -> Training:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, make_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -96,11 +96,14 @@ def prepare_words(words: Sequence[str]) -> list[str]:
     Raises:
         InputError: a plugin cannot be imported, or there is no such task.
     """
-    from topomerge.config import find_plugins, register
+    from topomerge.config import SEARCH, find_plugins, register
+    from topomerge.training.settings import Search
 
+    register("optuna", Search, group=SEARCH, package=SEARCH)
     ready = bracket_lists(find_plugins(words))
     for task in get_word(words, "task", DEFAULT_TASK).split(","):
-        register(task, TASKS[task].get_schema(), group="task")
+        schema = make_dataclass("Composed", [(SEARCH, Any, None)], bases=(TASKS[task].get_schema(),))
+        register(task, schema, group="task")
     return ready
 
 
