@@ -140,5 +140,5 @@ def find_anomaly() -> Iterator[None]:
                 raise
             text = "\n".join(str(one.message) for one in told)
             own = [where for where in re.findall(r'File "([^"]+)", line (\d+)', text) if "site-packages" not in where[0]]
-            where = f", computed in {Path(own[-1][0]).name}:{own[-1][1]}" if own else ""
+            where = f", computed in {Path(own[-1][0]).name}:{own[-1][1]}," if own else ""
             raise InputError(f"anomaly: the gradient of {found[1].removesuffix('0')}{where} is no number") from error

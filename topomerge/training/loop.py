@@ -55,7 +55,7 @@ class State:
     """Where a training is.
 
     Args:
-        epoch, step: that come next.
+        epoch, step: that come next; rate: of the last step.
         best, best_epoch: score of the best epoch so far; stale: epochs since.
         top: of the best epochs, [score, epoch].
         sums: of the losses of the epoch so far.
@@ -64,6 +64,7 @@ class State:
 
     epoch: int = 0
     step: int = 0
+    rate: float = 0.0
     best: float = -1.0
     best_epoch: int = -1
     stale: int = 0
@@ -198,7 +199,7 @@ class Loop:
         better = score > state.best or (state.best_epoch < 0 and math.isfinite(score))
         best = (score, state.epoch, 0) if better else (state.best, state.best_epoch, state.stale + 1)
         top = rank_epochs(state.top, score, state.epoch, self.settings.top) if self.settings.top > 1 else []
-        self.state = State(state.epoch + 1, 0, *best, top)
+        self.state = State(state.epoch + 1, 0, state.rate, *best, top)
         if self.log is not None:
             folder = self.settings.folder
             self.log.append_row(row)
@@ -245,7 +246,7 @@ class Loop:
             "seconds": took,
             "rooms_per_second": self.job.sum_over_processes(sizes) / took,
             "waiting": waited / took,
-            "train/rate": float(self.job.get_optimizer().param_groups[0]["lr"]),
+            "train/rate": state.rate,
         }
         return row | {f"train/{name}": value / self.schedule.steps for name, value in state.sums.items()}
 
@@ -258,7 +259,7 @@ class Loop:
             state.sums[name] = state.sums.get(name, 0.0) + value
         if self.average is not None:
             self.average.update(state.epoch * self.schedule.steps + state.step)
-        state.step += 1
+        state.step, state.rate = state.step + 1, float(self.job.get_optimizer().param_groups[0]["lr"])
         if state.step % STEPS_BETWEEN_CHECKS == 0 or self.stop:
             self._read_losses()
 

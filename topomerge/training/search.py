@@ -76,7 +76,8 @@ def compose_search(words: Sequence[str]) -> Search | None:
     """
     if not any(word.lstrip("+").startswith(("search", "experiment=")) for word in words):
         return None
-    given = compose_config("train", prepare_words(words)).get("search")
+    composed = compose_config("train", prepare_words([word for word in words if not word.startswith("-")]))
+    given = None if {"-c", "--cfg"} & set(words) else composed.get("search")
     if given is None:
         return None
     if {"-m", "--multirun"} & set(words):
@@ -271,15 +272,16 @@ def run_trial(plan: Plan, number: int | None, log_line: LogFn) -> None:
         found = [_format_word(key, value) for key, value in trial.params.items()]
         goes_on = "resume=true" if (plan.folder / name / "last").exists() else "overwrite=true"
 
+        settings = compose_settings([*plan.words, *found, f"runs={plan.folder}", f"name={name}", goes_on])
+
         def report(row: dict[str, Any]) -> None:
             trial.report(row[f"val/{plan.watch}"], row["epoch"])
-            if trial.should_prune():
+            if row["epoch"] + 1 < settings.epochs and trial.should_prune():
                 raise optuna.TrialPruned
 
         token, began = REPORT.set(report), time.monotonic()
         log_line(f"{name}: {' '.join(found)}")
         try:
-            settings = compose_settings([*plan.words, *found, f"runs={plan.folder}", f"name={name}", goes_on])
             value = train(settings, lambda text: log_line(f"{name}: {text}"))[f"val/{plan.watch}"]
             study.tell(trial, value)
             log_line(f"{name}: {plan.watch} {value:.3f} in {time.monotonic() - began:.0f} s")
