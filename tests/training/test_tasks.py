@@ -76,7 +76,8 @@ from topomerge.training.tasks import compose_settings, train
 task, folder, words = sys.argv[1], Path(sys.argv[2]), json.loads(sys.argv[3])
 module = importlib.import_module("topomerge.training." + {"grid_segmentation": "plan_segmentation"}.get(task, task))
 for name, made in (
-    ("build_plans", lambda: (sorted((folder / "plans").glob("*.npz")), None)), ("build_door_examples", lambda: tiny.door_tables(320)),
+    ("build_plans", lambda: (sorted((folder / "plans").glob("*.npz")), None)),
+    ("build_door_examples", lambda: tiny.door_tables(320)),
     ("build_walls", lambda: (sorted((folder / "walls").glob("*.npz")), None)), ("read_examples", lambda: tiny.room_examples(4)),
     ("build_hypothesis_files", lambda: sorted((folder / "places").glob("*.npz"))),
 ):
