@@ -44,7 +44,7 @@ def write_table(folder: str | Path) -> Path:
         InputError: no runs in it.
     """
     folder = Path(folder)
-    rows = [row for path in sorted(folder.rglob("metrics.jsonl")) if (row := _read_best_epoch(path.parent)) is not None]
+    rows = [row for path in sorted(folder.rglob("metrics.jsonl")) if (row := read_best_epoch(path.parent)) is not None]
     if not rows:
         raise InputError(f"{folder}: no runs in it")
     rows.sort(key=lambda row: -row["best"])
@@ -92,7 +92,7 @@ def _format_cell(value: Any) -> str:
     return f"{value:.3f}" if isinstance(value, float) else str(value)
 
 
-def _read_best_epoch(run: Path) -> dict[str, Any] | None:
+def read_best_epoch(run: Path) -> dict[str, Any] | None:
     """The best epoch of a run; None where there is none yet."""
     config = json.loads((run / "config.json").read_text(encoding="utf-8"))
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
