@@ -50,9 +50,8 @@ def write_model_page(runs: str | Path, page: str | Path) -> Path:
         if found and row is not None:
             rows.setdefault(found[1], []).append(row)
             data = read_run(metrics.parent).get("data", {})
-            sets.setdefault(
-                tuple((key, str(data.get(key, {}).get("sha256", ""))) for key in ("data", "validation")), metrics.parent
-            )
+            digests = tuple(str(data.get(key, {}).get("sha256", "")) for key in ("data", "validation"))
+            sets.setdefault(digests, metrics.parent)
     if not rows:
         raise InputError(
             f"{runs}: holds no run called experiment=NAME,seed=N; train with python train.py -m experiment=... seed=0,1"
