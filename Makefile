@@ -27,7 +27,7 @@ demo: setup
 	$(BIN)/topomerge extract demo/a.ply -o demo/a.tmap --json demo/a.json --ply demo/a_rooms.ply --figure demo/a.png --report demo/a.html
 	$(BIN)/topomerge merge demo/a.tmap demo/b.ply -o demo/merged
 	$(BIN)/python -m topomerge.datasets.pairs.build data=procedural data.name=demo data.pairs=16 'data.rooms=[5,8]' cache=demo/cache jobs=2
-	$(BIN)/python train.py data=procedural data.name=demo experiment=gat_scalars cache=demo/cache runs=demo/runs name=small validation= epochs=15 batch=4 tensorboard=false
+	$(BIN)/python train.py data=procedural data.name=demo experiment=gat_scalars cache=demo/cache runs=demo/runs name=small validation= epochs=15 batch=4 logger=none
 	$(BIN)/python evaluate.py data=heldout_small data.pairs=6 'data.rooms=[5,8]' 'run=[pretrained,demo/runs/small]' 'only=[engineered,shapedna surface]' 'k=[0,1]' 'context=[mean]' 'methods=[full,assignment]' merge=false cache=demo/cache/evaluation folder=demo/eval jobs=2
 	$(BIN)/topomerge export-embedder demo/runs/small -o demo/embedder
 	$(BIN)/topomerge merge demo/a.tmap demo/b.ply --descriptor demo/embedder -o demo/merged_learned

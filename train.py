@@ -2,6 +2,7 @@
 
 python train.py experiment=sage_pointnet data=train_small           the task is embedding where none is named
 python train.py -m geometry=engineered,pointnet node=none,gat       a sweep
+python train.py search=optuna search.space.rate=[1e-4,1e-2,log]     a search
 torchrun --nproc-per-node 2 train.py ...                            several processes, for embedding
 python -m topomerge.training run.json                               without Hydra, for embedding
 """
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import NoReturn
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -19,6 +21,7 @@ from omegaconf import DictConfig
 from topomerge.code_digest import find_other_clone
 from topomerge.config import name_by_sweep
 from topomerge.errors import InputError
+from topomerge.training.search import compose_search, search_settings
 from topomerge.training.tasks import compose_settings, convert_settings, prepare_words, train
 
 FLAGS = {f"--{word}": f"{word}=true" for word in ("overfit", "resume", "overwrite")}
@@ -27,6 +30,12 @@ FLAGS = {f"--{word}": f"{word}=true" for word in ("overfit", "resume", "overwrit
 def print_progress(text: str) -> None:
     """Report the progress."""
     print(text, file=sys.stderr, flush=True)
+
+
+def stop() -> NoReturn:
+    """End after Ctrl-C."""
+    print("train: interrupted; go on with resume=true", file=sys.stderr)
+    sys.exit(130)
 
 
 @hydra.main(version_base="1.3", config_path="pkg://topomerge.configs", config_name="train")
@@ -43,8 +52,7 @@ def main(config: DictConfig) -> float:
     except InputError as error:
         sys.exit(f"train: {error}")
     except KeyboardInterrupt:
-        print("train: interrupted; go on with resume=true", file=sys.stderr)
-        sys.exit(130)
+        stop()
 
 
 if __name__ == "__main__":
@@ -53,9 +61,15 @@ if __name__ == "__main__":
     words = [FLAGS.get(word, word) for word in sys.argv[1:]]
     try:
         ready = prepare_words(words)
+        if search := compose_search(words):
+            result = search_settings(search, words, print_progress)
+            print(f"{result.table.read_text(encoding='utf-8')}\n{result.describe()}")
+            sys.exit()
         if not any(word.startswith("-") or word.startswith("hydra") for word in words):
             compose_settings(words)  # a wrong key is one line, where Hydra says ten
         sys.argv[1:] = name_by_sweep(ready)
     except InputError as error:
         sys.exit(f"train: {error}")
+    except KeyboardInterrupt:
+        stop()
     main()

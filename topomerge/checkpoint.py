@@ -28,13 +28,18 @@ NETWORK_FILE, OPTIMIZER_FILE, STATE_FILE = "network.safetensors", "optimizer.saf
 
 
 def save_state(
-    folder: str | Path, write: Callable[[Path], None], optimizer: torch.optim.Optimizer, progress: Mapping[str, Any]
+    folder: str | Path,
+    write: Callable[[Path], None],
+    optimizer: torch.optim.Optimizer,
+    progress: Mapping[str, Any],
+    tensors: Mapping[str, Mapping[str, Tensor]] | None = None,
 ) -> None:
     """Replace a folder by the state as it is; a kill in between leaves the old one, or the new one beside it.
 
     Args:
         write: writes the files of the network into a folder.
         progress: what else is needed to go on, as JSON has it.
+        tensors: name of a file -> what it holds, likewise.
     """
     folder = Path(folder)
     new, old = folder.with_name(f"{folder.name}.new"), folder.with_name(f"{folder.name}.old")
@@ -43,6 +48,8 @@ def save_state(
     new.mkdir(parents=True)
     write(new)
     (new / OPTIMIZER_FILE).write_bytes(save(_flatten_state(optimizer)))
+    for name, values in (tensors or {}).items():
+        (new / name).write_bytes(save({key: value.detach().cpu().contiguous() for key, value in values.items()}))
     digests = {path.name: _compute_digest(path) for path in sorted(new.iterdir())}
     state = {"format": STATE_FORMAT, "class": STATE_CLASS, "sha256": digests, "progress": dict(progress)}
     (new / STATE_FILE).write_text(json.dumps(state, indent=1) + "\n", encoding="utf-8")
@@ -71,6 +78,13 @@ def read_network(network: torch.nn.Module, folder: Path) -> None:
         raise InputError(f"{folder / NETWORK_FILE}: is not of the network configured ({reason}); train again") from error
 
 
+def find_state_folder(folder: str | Path) -> Path:
+    """Return the folder of a state, which is beside the one that is named after a kill between two renames."""
+    folder = Path(folder)
+    newer = folder.with_name(f"{folder.name}.new")
+    return newer if not folder.exists() and (newer / STATE_FILE).exists() else folder
+
+
 def load_state(
     folder: str | Path, network: torch.nn.Module, optimizer: torch.optim.Optimizer, weights: str = EMBEDDER_STATE
 ) -> dict[str, Any]:
@@ -82,9 +96,7 @@ def load_state(
     Raises:
         InputError: no such folder, damaged, of another format, class or network.
     """
-    folder = Path(folder)
-    if not folder.exists() and (newer := folder.with_name(f"{folder.name}.new")).joinpath(STATE_FILE).exists():
-        folder = newer  # killed between two renames
+    folder = find_state_folder(folder)
     try:
         state = json.loads((folder / STATE_FILE).read_text(encoding="utf-8"))
     except OSError as error:

@@ -12,12 +12,23 @@ from topomerge.registry import load_plugins
 
 Schema = TypeVar("Schema")
 SEARCH_PATH = "hydra.searchpath="
+SEARCH = "search"  # key of what is no setting of a run (`training.search`)
 
 
 def compose(name: str, schema: type[Schema], words: Sequence[str] = ()) -> Schema:
     """Return the settings of `configs/<name>.yaml`, overridden by words like ``data=train_small jobs=2 data.pairs=10``.
 
     Every key must be a field of the dataclass `schema` and every value of its type; a field with a default may be absent.
+
+    Raises:
+        InputError: one line with the key's name.
+    """
+    register(name, schema)
+    return convert_to_dataclass(compose_config(name, words), schema)
+
+
+def compose_config(name: str, words: Sequence[str] = ()) -> Any:
+    """Return what Hydra composes of `configs/<name>.yaml` and words, whose schemas are registered.
 
     Raises:
         InputError: one line with the key's name.
@@ -29,14 +40,11 @@ def compose(name: str, schema: type[Schema], words: Sequence[str] = ()) -> Schem
         from omegaconf.errors import OmegaConfBaseException
     except ImportError as error:
         raise InputError("settings need Hydra: pip install topomerge[learn]") from error
-    register(name, schema)
-    words = find_plugins(words)
     try:
         with initialize_config_module("topomerge.configs", version_base="1.3"):
-            given = hydra_compose(name, overrides=words)
+            return hydra_compose(name, overrides=find_plugins(words))
     except (HydraException, OmegaConfBaseException) as error:
         raise InputError(_shorten_error(error)) from error
-    return convert_to_dataclass(given, schema)
 
 
 def find_plugins(words: Sequence[str]) -> list[str]:
@@ -54,19 +62,19 @@ def find_plugins(words: Sequence[str]) -> list[str]:
     return [*(w for w in words if not w.startswith(SEARCH_PATH)), f"{SEARCH_PATH}[{paths}]"] if folders else list(words)
 
 
-def register(name: str, schema: type[Any], group: str | None = None) -> None:
+def register(name: str, schema: type[Any], group: str | None = None, package: str = "_global_") -> None:
     """Let `configs/<name>.yaml` begin with `<name>_schema`: then every field of the dataclass is a key with its default, so that
     each can be overridden, and new entries of tables (weights by name) can be set.
 
     Args:
-        group: folder of the file below `configs/`; its keys stand at the top all the same.
+        group: folder of the file below `configs/`; its keys stand at the top all the same, or in `package`.
     """
     from hydra.core.config_store import ConfigStore
     from omegaconf import OmegaConf
 
     node = OmegaConf.structured(schema)
     _open_tables(node)
-    ConfigStore.instance().store(f"{name}_schema", node, group=group, package="_global_" if group else None)
+    ConfigStore.instance().store(f"{name}_schema", node, group=group, package=package if group else None)
 
 
 def _open_tables(node: Any) -> None:
@@ -92,7 +100,8 @@ def convert_to_dataclass(given: Any, schema: type[Schema]) -> Schema:
     from omegaconf.errors import OmegaConfBaseException
 
     try:
-        plain = OmegaConf.to_container(given, resolve=True)  # without types: another process has its own copy of the schema
+        plain: Any = OmegaConf.to_container(given, resolve=True)  # without types: another process has its own copy of the schema
+        plain = {key: value for key, value in plain.items() if key != SEARCH}
         merged: Any = OmegaConf.merge(OmegaConf.structured(schema), plain)
         settings: Schema = OmegaConf.to_object(merged)  # type: ignore[assignment]
     except OmegaConfBaseException as error:

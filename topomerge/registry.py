@@ -1,4 +1,5 @@
-"""What can be swapped by name, and added from outside of the package: encoders, losses, optimizers, schedules, sets, tasks.
+"""What can be swapped by name, and added from outside of the package: encoders, losses, optimizers, schedules,
+loggers, sets, tasks.
 
 A registry knows what ships, what packages that are installed announce (entry points of its group, such as ``topomerge.losses``),
 and what a module registered that was imported, such as one that ``plugins=[my_package.my_module]`` names:
@@ -149,8 +150,17 @@ OPTIMIZERS = Registry("optimizer", "optimizers", adamw="torch.optim:AdamW", sgd=
 SCHEDULES = Registry(
     "schedule",
     "schedules",
-    cosine="topomerge.training.loop:warmup_cosine",
-    constant="topomerge.training.loop:warmup_constant",
+    cosine="topomerge.training.descent:warmup_cosine",
+    constant="topomerge.training.descent:warmup_constant",
+)
+NO_LOGGER = "none"
+LOGGERS = Registry(
+    "logger",
+    "loggers",
+    tensorboard="topomerge.training.loggers:build_board_logger",
+    csv="topomerge.training.loggers:CsvLogger",
+    wandb="topomerge.training.loggers:WandbLogger",
+    mlflow="topomerge.training.loggers:MlflowLogger",
 )
 DATASETS = Registry("data", "datasets", folder="topomerge.datasets.pairs.pairs_file:read_pairs_table")
 TASKS = Registry(

@@ -142,7 +142,7 @@ def test_a_node_encoder_of_somebody_else_trains_is_exported_and_loads(torch, tmp
     with monkeypatch.context() as registered:
         registered.setitem(NODES._registered, "transformer", build)
         network = Network(Geometry(["scalars"], width=16), Node("transformer", 2, width=8), size=8)
-        common = {"runs": str(tmp_path), "cache": str(tmp_path), "data": "some", "validation": "", "tensorboard": False}
+        common = {"runs": str(tmp_path), "cache": str(tmp_path), "data": "some", "validation": "", "logger": []}
         settings = Training(**common, epochs=2, batch=2, network=network)
         assert np.isfinite(fit(settings, lambda text: None)["train/loss"])
         made, _ = read_embedder(tmp_path / "run")

@@ -165,9 +165,9 @@ def test_grids_of_robots_are_no_drawings():
 
 def test_pictures_are_looked_at_in_pixels_that_the_network_knows():
     assert choose_zoom((800, 600), 0.05) == 1.0
-    assert choose_zoom((800, 600), 0.01) == pytest.approx(1 / 3)
+    assert choose_zoom((800, 600), 0.01) == pytest.approx(1 / 4)
     assert choose_zoom((800, 600), 0.24) == pytest.approx(2.0)
-    assert choose_zoom((1800, 600), None) == pytest.approx(0.5) and choose_zoom((500, 600), None) == 1.0
+    assert choose_zoom((1280, 600), None) == pytest.approx(0.5) and choose_zoom((500, 600), None) == 1.0
 
 
 def test_tiles_give_what_the_whole_gives():

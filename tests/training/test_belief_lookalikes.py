@@ -44,7 +44,7 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return [{**row, "judged_only": taken == "judged" or not is_training_row(row)} for row in made]
 
     monkeypatch.setattr(merge_belief, "build_lookalike_rows", rows)
-    return ["task=merge_belief", f"runs={tmp_path}", "tensorboard=false", "floor=0"]
+    return ["task=merge_belief", f"runs={tmp_path}", "logger=none", "floor=0"]
 
 
 def test_pairs_that_nobody_can_tell_teach_only_where_a_map_shows_the_repetition() -> None:

@@ -159,7 +159,7 @@ def cache(tmp_path_factory):
 
 def test_what_the_device_cannot_make_is_refused(cache, tmp_path):
     network = Network(Geometry(["scalars"], width=8), Node("none"), size=8)
-    common = {"runs": str(tmp_path), "cache": str(cache), "data": "some", "validation": "", "tensorboard": False}
+    common = {"runs": str(tmp_path), "cache": str(cache), "data": "some", "validation": "", "logger": []}
     settings = Training(**common, batches="device", network=network)
     with pytest.raises(InputError, match="batches=host"):
         fit(settings, lambda text: None)
@@ -170,7 +170,7 @@ def test_a_training_with_batches_of_the_device_learns_and_repeats(cache, tmp_pat
     network = Network(
         Geometry(["scalars", "surroundings"], width=8), Node("gat", 1, heads=2, around=10.0, ways=True, width=8), size=8
     )
-    common = {"cache": str(cache), "data": "some", "validation": "", "tensorboard": False, "epochs": 2, "batch": 2}
+    common = {"cache": str(cache), "data": "some", "validation": "", "logger": [], "epochs": 2, "batch": 2}
     settings = [Training(**common, runs=str(tmp_path / name), batches="device", network=network) for name in "ab"]
     rows = [fit(one, lambda text: None) for one in settings]
     assert np.isfinite(rows[0]["train/loss"]) and rows[0]["train/loss"] == rows[1]["train/loss"]

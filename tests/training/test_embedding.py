@@ -27,8 +27,9 @@ from topomerge.errors import InputError
 from topomerge.training import embedding
 from topomerge.training.__main__ import main
 from topomerge.training.batches import augment_graph, make_batch
+from topomerge.training.descent import group_parameters, warmup_cosine
 from topomerge.training.embedding import EmbeddingJob, fit, start_fabric
-from topomerge.training.loop import State, group_parameters, warmup_cosine
+from topomerge.training.loop import State
 from topomerge.training.packed_pairs import hold_out, load_pairs, mark_watched, read_scan_building
 from topomerge.training.settings import Augment, Training, convert_to_dict, load_settings, parse_settings
 from topomerge.training.table import write_table
@@ -54,7 +55,7 @@ def cache(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def settings(cache, tmp_path) -> Training:
-    common = {"runs": str(tmp_path), "cache": str(cache), "data": "some", "validation": "other", "tensorboard": False}
+    common = {"runs": str(tmp_path), "cache": str(cache), "data": "some", "validation": "other", "logger": []}
     return Training(**common, epochs=3, batch=4, rate=0.01, network=SMALL)
 
 
@@ -162,13 +163,13 @@ def test_half_precision_trains(settings):
 
 @pytest.mark.longer
 def test_a_run_is_a_folder(settings, tmp_path):
-    best = fit(replace(settings, name="a", tensorboard=True), quiet)
+    best = fit(replace(settings, name="a", logger=["tensorboard"]), quiet)
     rows = [json.loads(line) for line in (tmp_path / "a" / "metrics.jsonl").read_text().splitlines()]
     assert [row["epoch"] for row in rows] == [0, 1, 2] and best["val/recall@1"] == max(r["val/recall@1"] for r in rows)
     assert (
         load_settings(tmp_path / "a" / "config.json")
         == load_settings(tmp_path / "a" / "config.yaml")
-        == replace(settings, name="a", tensorboard=True)
+        == replace(settings, name="a", logger=["tensorboard"])
     )
     assert any((tmp_path / "a" / "tb").rglob("events*")) and list((tmp_path / "a" / "tb").rglob("tensors.tsv"))
     assert load_embedder(tmp_path / "a").about["data"] == "some" and read_embedder(tmp_path / "a" / "last")
@@ -467,7 +468,7 @@ def test_without_hydra(settings, tmp_path, capsys):
 def short(settings):
     """Words of a training of one epoch."""
     where = [f"runs={settings.runs}", f"cache={settings.cache}"]
-    return [*where, "validation=other", "data.name=some", "epochs=1", "batch=4", "tensorboard=false"]
+    return [*where, "validation=other", "data.name=some", "epochs=1", "batch=4", "logger=none"]
 
 
 @pytest.mark.slow

@@ -50,7 +50,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def settings(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Training:
     """Runs that are not exported: `best/` keeps the weights of torch."""
     monkeypatch.setattr(EmbeddingJob, "export_best", lambda self, folder: None)
-    common = {"runs": str(tmp_path), "cache": str(cache), "data": "some", "validation": "other", "tensorboard": False}
+    common = {"runs": str(tmp_path), "cache": str(cache), "data": "some", "validation": "other", "logger": []}
     return Training(**common, epochs=1, batch=4, rate=1e-3, network=SMALL)
 
 
@@ -164,7 +164,12 @@ def test_a_verdict_needs_pairs_and_a_gain_in_most_of_them() -> None:
     assert not mixed.helped and mixed.overall[0] > 0 > mixed.overall[1]
     assert "it did not help" in mixed.format_lines()[-1]
     few = judge(old[:3], [scores(10, found=10)] * 3, about(3), set())
-    assert not few.helped and "too little was left out to tell" in few.format_lines()[-1] and few.unit == "pairs"
+    assert not few.helped and few.unit == "captures left out"
+    assert few.format_lines()[-1].startswith("too few captures to tell whether it helped: 3 left out, at least 8 are needed; ")
+    assert "[" not in "".join(few.format_lines())  # an interval over three would say nothing
+    many = [{"captures": [f"t{k}", f"n{k % 3}"], "building": "x"} for k in range(12)]  # twelve pairs of three captures
+    sure = judge(old, [scores(8, found=9) for _ in old], many, {f"t{k}" for k in range(12)})
+    assert not sure.helped and sure.units == 3 and "too few captures to tell" in sure.format_lines()[-1]
     assert judge(old, old, about(12), set()).overall == (0.0, 0.0, 0.0)
     one = [{"captures": ["t", f"n{k % 2}"], "building": f"b{k % 9}"} for k in range(12)]
     assert judge(old, old, one, set()).unit == "buildings"
@@ -195,7 +200,7 @@ def test_finetune_keeps_what_helped(folder: Path, tmp_path: Path, monkeypatch, c
     words += ["--cache", str(tmp_path / "cache")]
     assert cli(words) == 2  # one pair is left out
     said = capsys.readouterr()
-    assert said.err == "" and "too little was left out to tell" in said.out and not (out / "embedder.onnx").exists()
+    assert said.err == "" and "too few captures to tell" in said.out and not (out / "embedder.onnx").exists()
     assert cli([*words, "--keep"]) == 0
     told = load_embedder(out)
     assert told.about["finetuned"]["helped"] is False and set(told.about["finetuned"]["old"]) == {"recall@1", "recall@5", "F1"}
@@ -229,7 +234,7 @@ def test_a_run_on_own_pairs_goes_on_and_other_pairs_are_refused(folder: Path, tm
         "cache": str(tmp_path / "cache"),
         "data": "folder",
         "path": str(folder),
-        "tensorboard": False,
+        "logger": [],
     }
     run = Training(**common, epochs=1, batch=1, network=SMALL)
     fit(run, quiet)

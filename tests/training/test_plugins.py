@@ -134,7 +134,7 @@ def test_encoder_loss_optimizer_and_schedule_train_export_load_and_merge(tmp_pat
     words = ["plugins=[mine]", "loss=alignment", "network.node.kind=transformer", "optimizer=sign", "schedule=steps"]
     words += ["optimizer_options.momentum=0.5", "rate=0.001", "data=procedural", "validation=", "epochs=2", "batch=2"]
     shutil.copy(tmp_path / "cache" / "some.jsonl", tmp_path / "cache" / "procedural.jsonl")
-    done = run(tmp_path, "train.py", *words, "tensorboard=false", "name=x")
+    done = run(tmp_path, "train.py", *words, "logger=none", "name=x")
     assert done.returncode == 0, done.stderr
     rows = [json.loads(line) for line in (tmp_path / "runs" / "x" / "metrics.jsonl").read_text().splitlines()]
     assert len(rows) == 2 and rows[1]["train/alignment"] < rows[0]["train/alignment"]
@@ -145,9 +145,9 @@ def test_encoder_loss_optimizer_and_schedule_train_export_load_and_merge(tmp_pat
     maps = [building(2, origin=(x, -3.0, 0.5)) for x in (2.0, 4.0)]
     result = tm.merge(maps, embedder=ours)
     assert len(result.maps) == 2 and len(ours(maps[0])) == len(maps[0].rooms)
-    again = run(tmp_path, "train.py", *words, "tensorboard=false", "name=x", "resume=true", "epochs=3")
+    again = run(tmp_path, "train.py", *words, "logger=none", "name=x", "resume=true", "epochs=3")
     assert again.returncode == 0, again.stderr
-    table = run(tmp_path, "train.py", "-m", *words, "tensorboard=false", "network.node.layers=1,2", "runs=swept")
+    table = run(tmp_path, "train.py", "-m", *words, "logger=none", "network.node.layers=1,2", "runs=swept")
     assert table.returncode == 0, table.stderr
     assert (tmp_path / "swept" / "sweep" / "table.md").read_text().count("| transformer ") == 2
 
@@ -157,7 +157,7 @@ def test_a_task_of_somebody_else_trains_and_is_judged(tmp_path: Path) -> None:
     (tmp_path / "configs" / "task").mkdir(parents=True)
     (tmp_path / "configs" / "task" / "area.yaml").write_text(TASK_YAML)
     words = ["plugins=[mine]", "task=area", "rate=0.1"]
-    done = run(tmp_path, "train.py", *words, "tensorboard=false")
+    done = run(tmp_path, "train.py", *words, "logger=none")
     assert done.returncode == 0, done.stderr
     rows = [json.loads(line) for line in (tmp_path / "runs" / "area" / "metrics.jsonl").read_text().splitlines()]
     best = min(row["val/error"] for row in rows)  # less is better

@@ -48,7 +48,7 @@ def cache(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def settings(cache, tmp_path) -> Training:
-    common = {"runs": str(tmp_path), "cache": str(cache), "data": "some", "validation": "other", "tensorboard": False}
+    common = {"runs": str(tmp_path), "cache": str(cache), "data": "some", "validation": "other", "logger": []}
     return Training(**common, epochs=1, batch=4, network=SMALL)
 
 
@@ -104,7 +104,7 @@ def test_tasks_keep_their_runs_too(tmp_path, monkeypatch):
     from topomerge.training import match_odds
 
     monkeypatch.setattr(match_odds, "build_pair_evidence", tiny.evidence)
-    words = ["task=match_odds", f"runs={tmp_path}", "tensorboard=false"]
+    words = ["task=match_odds", f"runs={tmp_path}", "logger=none"]
     train(compose_settings(words), quiet)
     monkeypatch.setattr(match_odds, "build_pair_evidence", lambda *_: pytest.fail("data was made"))
     with pytest.raises(InputError, match="holds a run"):

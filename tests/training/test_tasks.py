@@ -51,9 +51,9 @@ from topomerge.training import (
     wall_segmentation,
 )
 from topomerge.training.door_classification import score_doors
-from topomerge.training.loop import State, prefetch_batches, select_device
+from topomerge.training.loop import State, prefetch_batches
 from topomerge.training.plan_segmentation import score_classes
-from topomerge.training.tasks import compose_settings, evaluate_task, find_weights, train
+from topomerge.training.tasks import check_accelerator, compose_settings, evaluate_task, find_weights, train
 from topomerge.types import EDGE_DTYPE, Array
 
 PAGE = np.random.default_rng(0).integers(0, 255, (64, 96, 3), dtype=np.uint8)
@@ -70,6 +70,45 @@ NETWORKS = {
     "place_evidence": ["epochs=2", "steps=2", "batch=8", "widths=[4,4,4]", "hold_out=2", "lookalikes=false"],
     "room_matcher": ["epochs=2", "steps=2", "batch=2", "width=8", "layers=1"],
 }
+# A process of two, on tiny data: it leaves hashes of its weights and batches, and its scores.
+BOTH = """
+import hashlib, importlib, json, os, sys
+from pathlib import Path
+import torch
+from tests.training import tiny
+from topomerge.registry import TASKS
+from topomerge.training import loop
+from topomerge.training.tasks import compose_settings, train
+
+task, folder, words = sys.argv[1], Path(sys.argv[2]), json.loads(sys.argv[3])
+module = importlib.import_module("topomerge.training." + {"grid_segmentation": "plan_segmentation"}.get(task, task))
+for name, made in (
+    ("build_plans", lambda: (sorted((folder / "plans").glob("*.npz")), None)),
+    ("build_door_examples", lambda: tiny.door_tables(320)),
+    ("build_walls", lambda: (sorted((folder / "walls").glob("*.npz")), None)), ("read_examples", lambda: tiny.room_examples(4)),
+    ("build_hypothesis_files", lambda: sorted((folder / "places").glob("*.npz"))),
+):
+    if hasattr(module, name):
+        setattr(module, name, lambda *_, made=made: made())
+told = {"batches": [], "scores": []}
+take, judge = loop.Loop._take_step, loop.Loop._judge_epoch
+
+def keep(self, batch):
+    told["batches"].append(hashlib.sha256(repr(batch).encode()).hexdigest())
+    take(self, batch)
+    state = self.job.network.state_dict()
+    told["weights"] = {name: hashlib.sha256(value.numpy().tobytes()).hexdigest() for name, value in state.items()
+                       if "running" not in name}
+
+def note(self, row):
+    better = judge(self, row)
+    told["scores"].append({key: value for key, value in row.items() if key.startswith("val/")})
+    return better
+
+loop.Loop._take_step, loop.Loop._judge_epoch = keep, note
+train(compose_settings(words), lambda text: None)
+(folder / f"rank{os.environ['RANK']}.json").write_text(json.dumps(told))
+"""
 WITHOUT_MORE = {"merge_belief": ["lookalikes=none", "floor=0"]}  # data that takes minutes to make
 FITS = ("merge_belief", "room_odds", "match_odds", "match_belief", "feature_scale", "passages", "wall_doors")
 
@@ -105,7 +144,7 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             f"task={task}",
             f"runs={tmp_path / 'runs'}",
             f"cache={tmp_path / 'cache'}",
-            "tensorboard=false",
+            "logger=none",
             *NETWORKS.get(task, []),
             *WITHOUT_MORE.get(task, []),
             *more,
@@ -201,6 +240,27 @@ def test_resumed_equals_uninterrupted(task, words, tmp_path, monkeypatch) -> Non
 
 
 @pytest.mark.longer
+@pytest.mark.parametrize("task", list(NETWORKS))
+def test_two_processes_keep_the_same_weights(task, words, tmp_path) -> None:
+    """torchrun with gloo: both processes make other batches and end with the same weights; the run is written once."""
+    script = tmp_path / "both.py"
+    script.write_text(BOTH)
+    given = json.dumps(words(task, "name=two"))
+    launch = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script), task, str(tmp_path), given]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, *launch], capture_output=True, text=True, timeout=300, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
+    told = [json.loads((tmp_path / f"rank{k}.json").read_text()) for k in range(2)]
+    assert told[0]["weights"] == told[1]["weights"] and told[0]["batches"] != told[1]["batches"]
+    assert told[0]["scores"] == told[1]["scores"]
+    rows = (tmp_path / "runs" / "two" / "metrics.jsonl").read_text().splitlines()
+    assert len(rows) == 2 and (tmp_path / "runs" / "two" / "best" / TASKS[task].file).is_file()
+    train(compose_settings(words(task, "name=one")), quiet)
+    one = (tmp_path / "runs" / "one" / "last" / "network.safetensors").read_bytes()
+    assert one != (tmp_path / "runs" / "two" / "last" / "network.safetensors").read_bytes()
+
+
+@pytest.mark.longer
 @pytest.mark.parametrize("task", FITS)
 def test_a_fit_that_ended_is_left_as_it_is(task, words, tmp_path) -> None:
     first = train(compose_settings(words(task)), quiet)
@@ -256,8 +316,8 @@ def test_a_wrong_word_is_one_line_with_its_key(given: list[str], key: str) -> No
 def test_a_device_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     with pytest.raises(InputError, match="accelerator=cuda"):
-        select_device(compose_settings(["task=plan_segmentation", "accelerator=cuda"]))
-    assert select_device(compose_settings(["task=door_classification"])).type == "cpu"
+        check_accelerator(compose_settings(["task=plan_segmentation", "accelerator=cuda"]))
+    check_accelerator(compose_settings(["task=door_classification"]))  # which has the processor only
 
 
 @pytest.mark.parametrize("task", list(TASKS))

@@ -80,10 +80,6 @@ class DrawingScale:
     reasons: tuple[str, ...]
     written: bool = True
 
-    def is_coarse(self, zoom: float) -> bool:
-        """Were the pixels that the network saw, `zoom` for each of the picture, of another size than it knows?"""
-        return not FINEST / 1.5 <= self.resolution / zoom <= COARSEST
-
 
 LEAST_PIXELS = 100  # of a side of a page
 

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError
-from topomerge.io.drawing import ParsedDrawing, estimate_scale, find_names, is_drawing, parse_drawing, read_texts
+from topomerge.io.drawing import ParsedDrawing, choose_zoom, estimate_scale, find_names, is_drawing, parse_drawing, read_texts
 from topomerge.io.piece import BLOCK_POINTS, MOST_POINTS, PIXELS, Piece, ReadOptions, build_count_error, build_damage_error
 from topomerge.types import Array, Landmarks
 
@@ -249,7 +249,7 @@ def read_drawing(path: Path, resolution: float | None, text: bool | None = None)
         resolution = scale.resolution
         why = ", ".join(repr(reason) if scale.written else reason for reason in scale.reasons[:3])
         said += (f"{path.name}: {resolution:.4g} m a pixel, give or take {scale.spread:.0%}, by {why}; --resolution sets it",)
-        if scale.is_coarse(drawing.zoom):
+        if not np.isclose(choose_zoom(picture.shape[:2], resolution), drawing.zoom, rtol=0.1):
             drawing = parse_drawing(picture, resolution)
     plan = Plan(path, resolution / drawing.zoom, warnings=said)
     return plan, drawing, find_names(found or (), path.name, resolution, picture.shape[0])

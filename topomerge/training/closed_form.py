@@ -45,7 +45,7 @@ def run_fit(settings: Settings, make: Callable[[Settings, LogFn], FitResult], lo
         began = time.perf_counter()
         fitted = make(settings, log_line)
         begin_run(replace(settings, resume=False), threads=settings.jobs)
-        log = MetricsLog(settings.folder, settings.tensorboard)
+        log = MetricsLog(settings)
         scores = {f"val/{name}": float(value) for name, value in fitted.metrics.items()}
         row = {"epoch": 0, "seconds": time.perf_counter() - began, **scores}
         log.append_row(row)

@@ -41,6 +41,7 @@ from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.numpy_nn import apply_mlp, sigmoid
 from topomerge.training.loop import NetworkJob, State, derive_seed, descend_gradient, run_network
 from topomerge.training.packed_pairs import number_buildings, read_scan_building
+from topomerge.training.processes import let_chief_first
 from topomerge.training.scan_settings import DoorClassification
 from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
@@ -57,7 +58,8 @@ def fit(settings: DoorClassification, log_line: LogFn) -> dict[str, float]:
     Raises:
         InputError: no scan to train on or to watch.
     """
-    x, y, building = build_door_examples(settings.data, settings, log_line)
+    with let_chief_first(settings):
+        x, y, building = build_door_examples(settings.data, settings, log_line)
     watched = building % settings.hold_out == 0
     if len(np.unique(y[~watched])) < 2 or len(np.unique(y[watched])) < 2:
         raise InputError(f"data.scans={settings.data.scans}: too few scans to learn doors from some and watch others")
@@ -178,18 +180,21 @@ class DoorJob(NetworkJob):
         weight = 1 / np.sqrt(np.unique(building, return_counts=True)[1][np.unique(building, return_inverse=True)[1]])
         inputs = (clipped - self.scaling["mean"]) / self.scaling["scale"]
         self.tensors = [torch.tensor(v, dtype=torch.float32) for v in (inputs, y, weight / weight.mean())]
-        self.steps = math.ceil(len(y) / settings.batch)
+        self.steps = math.ceil(len(y) / (settings.batch * self.fabric.world_size))
 
     def iter_batches(self, state: State) -> Generator[list[tuple[Tensor, ...]], None, None]:
         """Yield batches of the rows of each network: jittered inputs, answers, weights."""
         options, count = self.options, len(self.tensors[0])
         of_epoch = [torch.Generator().manual_seed(derive_seed(options.seed, k, state.epoch)) for k in range(options.networks)]
         orders = [torch.randperm(count, generator=generator) for generator in of_epoch]
+        rank, world = self.fabric.global_rank, self.fabric.world_size
+        if world > 1:  # each process gets as many
+            orders = [order.repeat(self.steps * world)[: self.steps * world * options.batch][rank::world] for order in orders]
         for step in range(state.step, self.steps):
             batch: list[tuple[Tensor, ...]] = []
             for k, order in enumerate(orders):
                 rows = order[step * options.batch :][: options.batch]
-                generator = torch.Generator().manual_seed(derive_seed(options.seed, k, state.epoch, step, 1))
+                generator = torch.Generator().manual_seed(derive_seed(options.seed, k, state.epoch, step, 1 + rank))
                 inputs, answers, weight = (tensor[rows] for tensor in self.tensors)
                 noise = torch.randn(inputs.shape, generator=generator)
                 batch.append((inputs + options.noise * noise, answers, weight))
@@ -268,9 +273,10 @@ def judge(settings: DoorClassification, file: Path, log_line: LogFn) -> dict[str
 TASK = Task(
     DoorClassification,
     fit,
-    ("auc", "precision", "recall", "accuracy"),
+    ("auc", "precision", "recall", "accuracy", "log_loss"),
     judge,
     "topomerge.extraction.plans",
     "door_classifier.json",
     hours=0.7,
+    lower=("log_loss",),
 )

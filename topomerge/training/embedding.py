@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import os
 import shutil
 import sys
 from collections.abc import Generator, Mapping, Sequence
@@ -27,17 +25,18 @@ from topomerge.models.weights import read_embedder, read_state, save_state
 from topomerge.networks.network import WEIGHTS_PACKAGE
 from topomerge.registry import SCHEDULES
 from topomerge.training.batches import AugmentedPairs, MapPair
+from topomerge.training.descent import build_optimizer
 from topomerge.training.device_batches import DevicePairs, supports_device_batches
 from topomerge.training.loop import (
     Loop,
     Schedule,
     State,
     build_diverged,
-    build_optimizer,
     derive_seed,
     prefetch_by_threads,
 )
 from topomerge.training.packed_pairs import EXTRAS, GraphPair, hold_out, load_pairs
+from topomerge.training.processes import FabricProcesses, find_precision, start_fabric
 from topomerge.training.provenance import compare_settings, describe_provenance
 from topomerge.training.run_folder import MetricsLog, begin_run, export_files
 from topomerge.training.settings import (
@@ -133,9 +132,9 @@ def fit(settings: Training, log_line: LogFn = lambda text: print(text, file=sys.
         begin_run(settings, f"{fabric.world_size} x {name}, {find_precision(settings)}", torch.get_num_threads())
     fabric.barrier()
     job = EmbeddingJob(settings, fabric, network, optimizer, (train, watched, replayed))
-    log = MetricsLog(settings.folder, settings.tensorboard, state.epoch) if chief else None
+    log = MetricsLog(settings, state.epoch) if chief else None
     perfect = 1.0 if settings.overfit else float("inf")
-    schedule = Schedule(settings.folder, settings.epochs, job.steps, settings.watch, settings.patience, perfect)
+    schedule = Schedule(settings, job.steps, perfect, settings.watch in TASK.lower)
     best = Loop(job, schedule, state, log, log_line).run()
     if settings.export and chief:
         export_files(settings.folder / "best", settings.export, WEIGHTS_PACKAGE)
@@ -226,7 +225,7 @@ class EmbeddingJob:
         norm = self.fabric.clip_gradients(self.objective, self.optimizer, max_norm=settings.clip, error_if_nonfinite=False)
         lost = ~norm.isfinite()
         out = {name: value.detach() for name, value in losses.items()}
-        if getattr(self.fabric.strategy.precision, "scaler", None) is not None:
+        if self.get_scaler() is not None:
             out |= {"norm": norm.masked_fill(lost, 0.0), "skipped": lost.float()}
         elif self.get_optimizer().defaults.get("fused"):
             self.get_optimizer().found_inf, out["norm"] = lost.float(), norm  # type: ignore[attr-defined]
@@ -246,13 +245,29 @@ class EmbeddingJob:
         return float(self.fabric.all_reduce(torch.tensor(float(sizes)), reduce_op="sum"))
 
     def compute_scores(self) -> dict[str, float]:
-        """Compute the scores of the validation pairs (`validate`)."""
-        return validate(self.network, self.watched, self.fabric.device)
+        """Compute the scores of the validation pairs (`validate`), and their loss."""
+        return validate(self.network, self.watched, self.fabric.device) | {"loss": self._compute_validation_loss()}
+
+    @torch.no_grad()
+    def _compute_validation_loss(self) -> float:
+        """Mean loss of the validation pairs, as they are, in batches as of the training; each process computes all of it."""
+        objective = Objective(self.network, self.settings.loss).eval()
+        pairs = AugmentedPairs(self.watched, self.network.tensors, None, lambda pair: pair)
+        total, size, count = 0.0, self.settings.batch, len(self.watched)
+        for numbers in (list(range(k, min(k + size, count))) for k in range(0, count, size)):
+            batch = pairs.build_batch(numbers).to(self.fabric.device)
+            with self.fabric.autocast():
+                total += float(objective(batch.tensors, batch.truth)["loss"]) * len(numbers)
+        return total / max(count, 1)
 
     def get_optimizer(self) -> torch.optim.Optimizer:
         """Return the optimizer within fabric's."""
         optimizer: torch.optim.Optimizer = self.optimizer.optimizer
         return optimizer
+
+    def get_scaler(self) -> Any:
+        """Return the scaler of half precision; None where there is none."""
+        return getattr(self.fabric.strategy.precision, "scaler", None)
 
     def write_network(self, folder: Path) -> None:
         """The embedder's state."""
@@ -266,10 +281,13 @@ class EmbeddingJob:
             for name in (STATE_FILE, STATE_SETTINGS):
                 (folder / name).unlink()
 
-    def write_best(self, folder: Path, row: Mapping[str, Any], log: MetricsLog) -> None:
-        """The embedder's state, and pictures of what it does; what was exported of an earlier one goes."""
+    def write_checkpoint(self, folder: Path, row: Mapping[str, Any]) -> None:
+        """The embedder's state; what was exported of an earlier one goes."""
         shutil.rmtree(folder, ignore_errors=True)
         save_state(self.network, folder, describe_training(self.settings, row))
+
+    def show_best(self, row: Mapping[str, Any], log: MetricsLog) -> None:
+        """Show pictures of what the embedder does."""
         show_embedder(log.board, self.network, self.watched, row["epoch"], row["val/least"], self.fabric.device)
 
     def format_scores(self, row: Mapping[str, Any]) -> str:
@@ -278,50 +296,11 @@ class EmbeddingJob:
         return "recall@1 {:.3f} @5 {:.3f} F1 {:.3f} merged {:.2f}".format(*scores)
 
 
-class FabricProcesses:
-    """The processes of a Fabric, as `models.losses.Processes`."""
-
-    def __init__(self, fabric: Any) -> None:
-        self.fabric = fabric
-
-    def gather_others(self, rows: torch.Tensor) -> torch.Tensor:
-        """Return the rows (M, ...) of all other processes; gradients flow back to where they come from."""
-        counts = self.fabric.all_gather(torch.tensor(len(rows), device=rows.device)).tolist()
-        padded = torch.cat([rows, rows.new_zeros((max(counts) - len(rows), *rows.shape[1:]))])
-        every = self.fabric.all_gather(padded, sync_grads=rows.requires_grad)
-        return torch.cat([every[k, :count] for k, count in enumerate(counts) if k != self.fabric.global_rank])
-
-    def average(self, value: torch.Tensor) -> torch.Tensor:
-        """Return the mean of a value over the processes, without a gradient."""
-        mean: torch.Tensor = self.fabric.all_reduce(value.detach().clone(), reduce_op="mean")
-        return mean
-
-
 def describe_training(settings: Training, row: Mapping[str, Any]) -> dict[str, Any]:
     """Describe the training as in an embedder's file."""
     origin = {"data": settings.data, "validation": settings.validation, "seed": settings.seed, "loss": settings.loss.kind}
     origin |= {"settings": convert_to_dict(settings), "provenance": describe_provenance(settings.folder)}
     return {"run": settings.name, **origin, **{k: round(v, 5) if isinstance(v, float) else v for k, v in row.items()}}
-
-
-def start_fabric(settings: Training) -> Any:
-    """Return the Fabric of a training: its device, its precision and its processes."""
-    from lightning_fabric import Fabric
-
-    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
-    devices = int(os.environ.get("LOCAL_WORLD_SIZE", settings.devices))
-    fabric = Fabric(
-        accelerator=settings.accelerator, devices=devices, precision=find_precision(settings),  # type: ignore[arg-type]
-        strategy="ddp" if devices > 1 else "auto",
-    )  # fmt: skip
-    fabric.launch()
-    return fabric
-
-
-def find_precision(settings: Training) -> str:
-    """Return the precision of a training: what is asked for, or what suits the accelerator."""
-    on_cuda = settings.accelerator in ("cuda", "gpu", "auto") and torch.cuda.is_available()
-    return ("bf16-mixed" if on_cuda else "32-true") if settings.precision == "auto" else settings.precision
 
 
 def with_own_pairs(settings: Training, log_line: LogFn, fabric: Any) -> Training:
@@ -427,7 +406,8 @@ def describe_network(config: Mapping[str, Any]) -> dict[str, Any]:
 TASK = Task(
     Training,
     fit,
-    (*RANKINGS, "recall@1_clear", "recall@5_clear", "mrr", "precision", "recall", "f1", "merged"),
+    (*RANKINGS, "recall@1_clear", "recall@5_clear", "mrr", "precision", "recall", "f1", "merged", "loss"),
+    lower=("loss",),
     package=WEIGHTS_PACKAGE,
     file="embedder.onnx",
     hours=0.6,

@@ -38,7 +38,7 @@ class Verdict:
         overall: gain of the mean of recall@1 and F1, by which it is judged, and the ends of its interval.
         unit, units: what is drawn anew, and how many there are of it.
         pairs, rooms: that were left out.
-        helped: the whole interval of `overall` is above zero.
+        helped: there are enough units, and the whole interval of `overall` is above zero.
     """
 
     old: dict[str, tuple[float, float, float]]
@@ -53,16 +53,21 @@ class Verdict:
 
     def format_lines(self) -> list[str]:
         """Format a table, and in one line whether it helped."""
+        few = self.units < FEWEST_GROUPS  # of which an interval would say nothing
+
+        def write(value: tuple[float, float, float], sign: str = "") -> str:
+            return f"{value[0]:{sign}.3f}" if few else _format(value, sign)
+
         rows = [f"{'':10}{'old':22}{'new':22}gain"]
         for name in SCORES:
-            rows.append(f"{name:10}{_format(self.old[name]):22}{_format(self.new[name]):22}{_format(self.gain[name], '+')}")
-        of = f"{self.pairs} pairs left out, {self.rooms} rooms; intervals over {self.units} {self.unit}"
-        change = f"the mean of recall@1 and F1 changed by {_format(self.overall, '+')}"
+            rows.append(f"{name:10}{write(self.old[name]):22}{write(self.new[name]):22}{write(self.gain[name], '+')}")
+        over = f"{self.units} {self.unit}" if few else f"intervals over {self.units} {self.unit}"
+        of = f"{self.pairs} pairs left out, {self.rooms} rooms; {over}"
+        change = f"the mean of recall@1 and F1 changed by {write(self.overall, '+')}"
         if self.helped:
             said = "it helped"
-        elif self.units < FEWEST_GROUPS:
-            needed = f"{self.units} {self.unit}, at least {FEWEST_GROUPS} are needed"
-            said = f"too little was left out to tell whether it helped: {needed}"
+        elif few:
+            said = f"too few captures to tell whether it helped: {self.units} left out, at least {FEWEST_GROUPS} are needed"
         else:
             said = "it did not help: the interval is not above zero"
         return [*rows, of, f"{said}; {change}"]
@@ -87,7 +92,7 @@ def finetune(
         InputError: whatever is wrong with the folder or the settings; nothing was trained.
     """
     output = Path(output)
-    settings = replace(settings, data=OWN_DATA, name=RUN, runs=str(output), tensorboard=False, overwrite=True)
+    settings = replace(settings, data=OWN_DATA, name=RUN, runs=str(output), logger=[], overwrite=True)
     check(settings)
     settings = adopt_network(settings)
     check_exporter()
@@ -121,9 +126,10 @@ def describe(verdict: Verdict, settings: Training) -> dict[str, Any]:
 
 
 def judge(old: Sequence[PairScores], new: Sequence[PairScores], about: Sequence[dict[str, Any]], trained: set[str]) -> Verdict:
-    """Compare two embedders on the same pairs by a paired bootstrap over buildings, captures that were left out, or pairs.
+    """Compare two embedders on the same pairs by a paired bootstrap over buildings or captures that were left out.
 
-    Drawn anew are the largest of these units of which there are eight. Each embedder matches at the certainty that suits it best.
+    Drawn anew are buildings where eight were left out, else captures: pairs of one capture are not independent. Of fewer than
+    eight captures it cannot be told whether it helped. Each embedder matches at the certainty that suits it best.
 
     Args:
         about: what is known of each pair.
@@ -132,13 +138,11 @@ def judge(old: Sequence[PairScores], new: Sequence[PairScores], about: Sequence[
     Raises:
         InputError: no rooms match in any pair.
     """
-    choices = {
-        "buildings": [str(of["building"]) for of in about],
-        "captures left out": [next((n for n in of["captures"] if n not in trained), of["captures"][0]) for of in about],
-        "pairs": ["-".join(of["captures"]) for of in about],
-    }
-    unit = next((u for u, names in choices.items() if len(set(names)) >= FEWEST_GROUPS), "pairs")
-    _, group = np.unique(choices[unit], return_inverse=True)
+    buildings = [str(of["building"]) for of in about]
+    captures = [next((n for n in of["captures"] if n not in trained), of["captures"][0]) for of in about]
+    many = len(set(buildings)) >= FEWEST_GROUPS
+    unit, names = ("buildings", buildings) if many else ("captures left out", captures)
+    _, group = np.unique(names, return_inverse=True)
     tables = [np.array([_count(one) for one in of], float) for of in (old, new)]
     if not tables[0][:, 0].sum():
         raise InputError("no rooms match in the pairs left out; see topomerge dataset check, or change split")

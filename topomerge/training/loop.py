@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
 import json
 import math
 import shutil
@@ -14,20 +13,35 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
 
+import numpy as np
 import torch
 
-from topomerge.checkpoint import NETWORK_FILE, load_state, read_network, save_state, write_network
+from topomerge.checkpoint import NETWORK_FILE, find_state_folder, load_state, read_network, save_state, write_network
 from topomerge.errors import InputError
 from topomerge.models.export import check_exporter, export_network, run_with_torch
 from topomerge.networks.network import Run, Signature
-from topomerge.registry import OPTIMIZERS, SCHEDULES, TASKS
+from topomerge.registry import SCHEDULES, TASKS
+from topomerge.training.descent import build_optimizer
+from topomerge.training.instruments import (
+    AVERAGE_FILE,
+    REPORT,
+    TOP,
+    TRACE_FILE,
+    StepTracer,
+    WeightAverage,
+    find_anomaly,
+    name_top,
+    rank_epochs,
+    tidy_top,
+)
+from topomerge.training.processes import average_buffers, average_gradients, get_rank, start_fabric
 from topomerge.training.run_folder import EtaClock, MetricsLog, begin_run, export_files, write_card
-from topomerge.training.settings import NetworkTask
+from topomerge.training.settings import NetworkSettings, NetworkTask
 from topomerge.training.tasks import check_accelerator
 from topomerge.types import LogFn
 
@@ -38,31 +52,38 @@ K = TypeVar("K")
 
 @dataclass
 class State:
-    """Where a training is: `epoch` and `step` of it come next; `sums` are those of the losses of the epoch so far."""
+    """Where a training is.
+
+    Args:
+        epoch, step: that come next; rate: of the last step.
+        best, best_epoch: score of the best epoch so far; stale: epochs since.
+        top: of the best epochs, [score, epoch].
+        sums: of the losses of the epoch so far.
+        scaler: state of the scaler of half precision, where there is one.
+    """
 
     epoch: int = 0
     step: int = 0
+    rate: float = 0.0
     best: float = -1.0
     best_epoch: int = -1
     stale: int = 0
+    top: list[list[float]] = field(default_factory=list)
     sums: dict[str, float] = field(default_factory=dict)
+    scaler: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Schedule:
     """Args:
-    folder: of the run.
-    epochs: at most; steps: of each.
-    watch: score of validation by which an epoch is best; lower: less of it is better.
-    patience: epochs without a better one after which it ends; 0: never.
+    settings: of the run.
+    steps: of each epoch.
     perfect: value of the score at which nothing is left to learn.
+    lower: less of the score is better.
     """
 
-    folder: Path
-    epochs: int
+    settings: NetworkSettings
     steps: int
-    watch: str
-    patience: int = 0
     perfect: float = math.inf
     lower: bool = False
 
@@ -95,11 +116,17 @@ class Job(Protocol):
     def write_network(self, folder: Path) -> None:
         """Write the network's files of `last/`."""
 
-    def write_best(self, folder: Path, row: Mapping[str, Any], log: MetricsLog) -> None:
-        """Write the best network so far into `best/`."""
+    def get_scaler(self) -> Any:
+        """Return the scaler of half precision; None where there is none."""
+
+    def write_checkpoint(self, folder: Path, row: Mapping[str, Any]) -> None:
+        """Write the network as it is, with its scores, into a folder, in the place of what stands there."""
+
+    def show_best(self, row: Mapping[str, Any], log: MetricsLog) -> None:
+        """Show what the best network so far does."""
 
     def export_best(self, folder: Path) -> None:
-        """Make of `best/` what the package reads, once at the end of a run."""
+        """Make of a checkpoint what the package reads, once at the end of a run."""
 
     def format_scores(self, row: Mapping[str, Any]) -> str:
         """Format the scores for an epoch's line."""
@@ -114,7 +141,13 @@ class Loop:
 
     def __init__(self, job: Job, schedule: Schedule, state: State, log: MetricsLog | None, log_line: LogFn) -> None:
         self.job, self.schedule, self.state, self.log, self.log_line = job, schedule, state, log, log_line
-        self.stop = False
+        self.settings, self.stop = schedule.settings, False
+        self.average = WeightAverage(job.network, self.settings.ema) if self.settings.ema else None
+        if self.average is not None and self.settings.resume:
+            self.average.load(find_state_folder(self.settings.folder / "last") / AVERAGE_FILE)
+        if state.scaler:
+            job.get_scaler().load_state_dict(state.scaler)
+        self.traces = self.settings.profile and log is not None
 
     def run(self) -> dict[str, float]:
         """Epochs until the last one, or until nothing has become better for long; the row of the best epoch.
@@ -122,69 +155,113 @@ class Loop:
         Raises:
             KeyboardInterrupt: after Ctrl-C or SIGTERM; the state is saved.
         """
-        with self._handle_interrupts():
-            return self._run_epochs()
+        ended = "aborted"
+        try:
+            with self._handle_interrupts():
+                best = self._run_epochs()
+            ended = "success"
+        finally:
+            if self.log is not None:
+                self.log.close(ended)
+        return best
 
     def _run_epochs(self) -> dict[str, float]:
-        schedule, clock = self.schedule, EtaClock(self.state.epoch, self.schedule.epochs)
+        settings, clock = self.settings, EtaClock(self.state.epoch, self.settings.epochs)
         best: dict[str, Any] = {}
         if self.log is not None and self.state.best_epoch >= 0:
             best = next((row for row in self.log.rows if row["epoch"] == self.state.best_epoch), {})
-        while self.state.epoch < schedule.epochs and not self._is_converged():
+        while self.state.epoch < settings.epochs and not self._is_converged():
             row = self._run_epoch()
-            scores = self.job.compute_scores()
-            row |= {f"val/{name}": value for name, value in scores.items()}
-            state, score = self.state, -scores[schedule.watch] if schedule.lower else scores[schedule.watch]
-            better = score > state.best or (state.best_epoch < 0 and math.isfinite(score))
-            self.state = State(state.epoch + 1, 0, state.best, state.best_epoch, state.stale + 1)
+            average_buffers(self.job.network)
+            with nullcontext() if self.average is None else self.average.apply():
+                better = self._judge_epoch(row)
+            self._save()
             if better:
                 best = row
-                self.state.best, self.state.best_epoch, self.state.stale = score, state.epoch, 0
-            self._keep(row, better)
-            left = clock.format_time_left(state.epoch + 1)
+            left = clock.format_time_left(self.state.epoch)
             self.log_line(
-                f"epoch {state.epoch + 1}/{schedule.epochs} loss {row['train/loss']:.3f} {self.job.format_scores(row)}"
+                f"epoch {self.state.epoch}/{settings.epochs} loss {row['train/loss']:.3f} {self.job.format_scores(row)}"
                 f"{' *' if better else ''} {row['rooms_per_second']:.0f} rooms/s, {left} left"
             )
+            if self.log is not None and (report := REPORT.get()) is not None:
+                report(row)
         if self.log is not None:
-            self.log.close()
-            self.job.export_best(schedule.folder / "best")
+            for folder in (settings.folder / "best", *sorted((settings.folder / TOP).glob("epoch_*"))):
+                self.job.export_best(folder)
         return {name: value for name, value in best.items() if isinstance(value, float)}
+
+    def _judge_epoch(self, row: dict[str, Any]) -> bool:
+        """Add the scores of validation to an epoch's row, keep it and the network; whether it is the best epoch so far."""
+        scores = self.job.compute_scores()
+        row |= {f"val/{name}": value for name, value in scores.items()}
+        state, watched = self.state, scores[self.settings.watch]
+        score = -watched if self.schedule.lower else watched
+        better = score > state.best or (state.best_epoch < 0 and math.isfinite(score))
+        best = (score, state.epoch, 0) if better else (state.best, state.best_epoch, state.stale + 1)
+        top = rank_epochs(state.top, score, state.epoch, self.settings.top) if self.settings.top > 1 else []
+        self.state = State(state.epoch + 1, 0, state.rate, *best, top)
+        if self.log is not None:
+            folder = self.settings.folder
+            self.log.append_row(row)
+            if better:
+                self.job.write_checkpoint(folder / "best", row)
+                self.job.show_best(row, self.log)
+            if any(epoch == state.epoch for _, epoch in top):
+                self.job.write_checkpoint(name_top(folder, state.epoch), row)
+            tidy_top(folder, top)
+        return better
 
     def _is_converged(self) -> bool:
         """Has nothing become better for long, or is nothing left to learn?"""
-        schedule, state = self.schedule, self.state
-        return bool(schedule.patience and state.stale >= schedule.patience) or state.best >= schedule.perfect
+        patience, state = self.settings.patience, self.state
+        return bool(patience and state.stale >= patience) or state.best >= self.schedule.perfect
 
     def _run_epoch(self) -> dict[str, Any]:
         """The steps of an epoch that are left."""
         began, waited, sizes, state = time.perf_counter(), 0.0, 0, self.state
         batches = self.job.iter_batches(state)
+        tracer = StepTracer(self.settings.folder / TRACE_FILE, self.schedule.steps - state.step) if self.traces else None
+        self.traces = False  # of the first epoch only
         while True:
             before = time.perf_counter()
             batch = next(batches, None)
             waited += time.perf_counter() - before
             if batch is None:
                 break
-            for name, value in self.job.train_step(batch, state).items():
-                state.sums[name] = state.sums.get(name, 0.0) + value
+            if tracer is not None:
+                tracer.begin_step()
+            self._take_step(batch)
             sizes += self.job.count_items(batch)
-            state.step += 1
-            if state.step % STEPS_BETWEEN_CHECKS == 0 or self.stop:
-                self._read_losses()
             if self.stop:
                 batches.close()
                 self._save()
                 raise KeyboardInterrupt
         self._read_losses()
+        if tracer is not None:
+            tracer.close()
+            self.log_line(f"{tracer.path}: a trace of some steps; open it in ui.perfetto.dev")
         took = max(time.perf_counter() - began, 1e-9)
         row = {
             "epoch": state.epoch,
             "seconds": took,
             "rooms_per_second": self.job.sum_over_processes(sizes) / took,
             "waiting": waited / took,
+            "train/rate": state.rate,
         }
         return row | {f"train/{name}": value / self.schedule.steps for name, value in state.sums.items()}
+
+    def _take_step(self, batch: Any) -> None:
+        """Train on a batch, and count it."""
+        state = self.state
+        with find_anomaly() if self.settings.anomaly else nullcontext():
+            losses = self.job.train_step(batch, state)
+        for name, value in losses.items():
+            state.sums[name] = state.sums.get(name, 0.0) + value
+        if self.average is not None:
+            self.average.update(state.epoch * self.schedule.steps + state.step)
+        state.step, state.rate = state.step + 1, float(self.job.get_optimizer().param_groups[0]["lr"])
+        if state.step % STEPS_BETWEEN_CHECKS == 0 or self.stop:
+            self._read_losses()
 
     def _read_losses(self) -> None:
         """Turn sums of losses that are on a device into numbers.
@@ -197,20 +274,15 @@ class Loop:
         if not all(math.isfinite(state.sums.get(name, 0.0)) for name in ("loss", "norm")):
             raise build_diverged(state)
 
-    def _keep(self, row: dict[str, Any], better: bool) -> None:
-        """Write metrics, the best network and the state after an epoch."""
-        if self.log is None:
-            return
-        self.log.append_row(row)
-        if better:
-            self.job.write_best(self.schedule.folder / "best", row, self.log)
-        self._save()
-
     def _save(self) -> None:
         """Write the state as it is."""
-        if self.log is not None:
-            optimizer = self.job.get_optimizer()
-            save_state(self.schedule.folder / "last", self.job.write_network, optimizer, vars(self.state))
+        if self.log is None:
+            return
+        scaler = self.job.get_scaler()
+        self.state.scaler = {} if scaler is None else scaler.state_dict()
+        tensors = {} if self.average is None else {AVERAGE_FILE: self.average.kept}
+        job = self.job
+        save_state(self.settings.folder / "last", job.write_network, job.get_optimizer(), vars(self.state), tensors)
 
     @contextmanager
     def _handle_interrupts(self) -> Iterator[None]:
@@ -239,46 +311,18 @@ def build_diverged(state: State) -> InputError:
     return InputError(f"training diverged by {where}: a loss or gradient is no finite number; train anew with a lower rate")
 
 
-def group_parameters(network: torch.nn.Module, decay: float) -> list[dict[str, Any]]:
-    """Weights that are trained, for an optimizer: those of layers decay; biases, gains of norms and lone numbers, such as a
-    temperature, do not."""
-    trained = [p for p in network.parameters() if p.requires_grad]
-    layers, others = [p for p in trained if p.ndim > 1], [p for p in trained if p.ndim < 2]
-    return [{"params": of, "weight_decay": by} for of, by in ((layers, decay), (others, 0.0)) if of]
-
-
-def build_optimizer(settings: Any, network: torch.nn.Module, **options: Any) -> torch.optim.Optimizer:
-    """Build the optimizer that settings name.
-
-    Args:
-        options: that it gets if it takes them.
-
-    Raises:
-        InputError: it does not take the settings' `optimizer_options`.
-    """
-    kind = OPTIMIZERS[settings.optimizer]
-    taken = inspect.signature(kind).parameters
-    options = {name: value for name, value in options.items() if name in taken}
-    try:
-        optimizer: torch.optim.Optimizer = kind(
-            group_parameters(network, settings.decay), lr=settings.rate, **options, **settings.optimizer_options
-        )
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"optimizer={settings.optimizer}: {' '.join(str(error).split())[:160]}; see optimizer_options"
-        ) from error
-    return optimizer
-
-
 def descend_gradient(optimizer: torch.optim.Optimizer, loss: torch.Tensor, state: State) -> dict[str, float]:
-    """Take one step of an optimizer down the gradient of a loss; return the loss and the gradient's length.
+    """Take one step of an optimizer down the gradient of a loss, its mean over all processes; return the loss and the gradient's
+    length.
 
     Raises:
         InputError: one of them is no finite number; the weights are as they were.
     """
     optimizer.zero_grad()
     loss.backward()  # type: ignore[no-untyped-call]
-    gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
+    weights = [p for group in optimizer.param_groups for p in group["params"]]
+    average_gradients(weights)
+    gradients = [p.grad for p in weights if p.grad is not None]
     values = {"loss": float(loss.detach()), "norm": float(torch.nn.utils.get_total_norm(gradients))}
     if not all(map(math.isfinite, values.values())):
         raise build_diverged(state)
@@ -307,18 +351,6 @@ def prefetch_by_threads(make: Callable[[K], T], keys: Iterable[K], threads: int)
             yield coming.popleft().result()
 
 
-def warmup_cosine(done: float, warmup: float) -> float:
-    """Compute the factor of the learning rate after this share of all steps: a rise, then half a cosine down to 0."""
-    if done < warmup:
-        return (done + 1e-3) / (warmup + 1e-3)
-    return 0.5 * (1 + math.cos(math.pi * (done - warmup) / (1 - warmup)))
-
-
-def warmup_constant(done: float, warmup: float) -> float:
-    """Compute the factor of the learning rate after this share of all steps: a rise, then 1."""
-    return min((done + 1e-3) / (warmup + 1e-3), 1.0)
-
-
 def derive_seed(*numbers: int) -> int:
     """Derive a seed from several numbers."""
     return int.from_bytes(hashlib.sha256(json.dumps(numbers).encode()).digest()[:7])
@@ -340,20 +372,34 @@ class Exported(NamedTuple):
 
 
 class NetworkJob(ABC):
-    """A job without processes beside it; a task adds batches, steps, scores and what is exported."""
+    """A job of a task; the task adds batches, steps, scores and what is exported. Processes beside it make other batches."""
 
     def __init__(self, settings: NetworkTask, network: torch.nn.Module, origin: Mapping[str, Any]) -> None:
-        self.device = select_device(settings)
+        check_accelerator(settings)
+        self.fabric = start_fabric(settings)
+        self.device: torch.device = self.fabric.device
         self.settings, self.network, self.origin = settings, network.to(self.device), origin
         self.optimizer = build_optimizer(settings, network)
 
     def sum_over_processes(self, sizes: int) -> float:
-        """Return the size of the one process."""
-        return float(sizes)
+        """Sum the sizes of all processes."""
+        return float(self.fabric.all_reduce(torch.tensor(float(sizes), device=self.device), reduce_op="sum"))
+
+    def start_generator(self, *numbers: int) -> np.random.Generator:
+        """Return random numbers by the run's seed and some numbers, others in each process."""
+        rank = [self.fabric.global_rank] if self.fabric.global_rank else []
+        return np.random.default_rng([self.settings.seed, *numbers, *rank])
 
     def get_optimizer(self) -> torch.optim.Optimizer:
         """Return the optimizer."""
         return self.optimizer
+
+    def get_scaler(self) -> Any:
+        """Return none: tasks train in 32 bits."""
+        return None
+
+    def show_best(self, row: Mapping[str, Any], log: MetricsLog) -> None:  # noqa: B027
+        """Show nothing, unless a task does."""
 
     def write_network(self, folder: Path) -> None:
         """Write the weights as torch has them."""
@@ -379,7 +425,7 @@ class NetworkJob(ABC):
         """What a card says of inputs and outputs; nothing of weights that are no network of `topomerge.networks`."""
         return {}
 
-    def write_best(self, folder: Path, row: Mapping[str, Any], log: MetricsLog) -> None:
+    def write_checkpoint(self, folder: Path, row: Mapping[str, Any]) -> None:
         """The weights as torch has them, and their scores; what was exported of earlier ones goes."""
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
@@ -426,16 +472,6 @@ class ExportedJob(NetworkJob):
         return self.exported().signature.describe()
 
 
-def select_device(settings: NetworkTask) -> torch.device:
-    """Select the device of a task's network.
-
-    Raises:
-        InputError: torch finds no such device here.
-    """
-    check_accelerator(settings)
-    return torch.device(getattr(settings, "accelerator", "cpu"))
-
-
 def run_network(job: Job, settings: NetworkTask, steps: int, log_line: LogFn) -> dict[str, float]:
     """Train a job of a task, and leave a run's folder.
 
@@ -443,16 +479,16 @@ def run_network(job: Job, settings: NetworkTask, steps: int, log_line: LogFn) ->
         The row of the best epoch.
     """
     check_exporter()
-    state = State()
+    state, chief = State(), get_rank() == 0
     if settings.resume:
         state = State(**load_state(settings.folder / "last", job.network, job.get_optimizer(), NETWORK_FILE))
-    device = str(next(job.network.parameters()).device)
-    begin_run(settings, torch.cuda.get_device_name() if device.startswith("cuda") else device, torch.get_num_threads())
-    log = MetricsLog(settings.folder, settings.tensorboard, state.epoch)
+    if chief:
+        device = str(next(job.network.parameters()).device)
+        begin_run(settings, torch.cuda.get_device_name() if device.startswith("cuda") else device, torch.get_num_threads())
+    log = MetricsLog(settings, state.epoch) if chief else None
     task = TASKS[settings.task]
-    lower = settings.watch in task.lower
-    schedule = Schedule(settings.folder, settings.epochs, steps, settings.watch, settings.patience, lower=lower)
+    schedule = Schedule(settings, steps, lower=settings.watch in task.lower)
     best = Loop(job, schedule, state, log, log_line).run()
-    if settings.export:
+    if settings.export and chief:
         export_files(settings.folder / "best", settings.export, task.package)
     return best

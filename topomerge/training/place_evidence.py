@@ -32,6 +32,7 @@ from topomerge.registration.evidence.places import (
 from topomerge.training.belief_hypotheses import assign_half, build_hypothesis_files, derive_hypothesis_files, is_distinguishable
 from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, run_network
 from topomerge.training.packed_pairs import name_building
+from topomerge.training.processes import let_chief_first
 from topomerge.training.task_settings import PlaceAugment, PlaceEvidence
 from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
@@ -125,7 +126,7 @@ class PlaceJob(ExportedJob):
         self.network.train()
         options, learned = self.options, self.learned
         for step in range(state.step, options.steps):
-            rng = np.random.default_rng([options.seed, 1, state.epoch, step])
+            rng = self.start_generator(1, state.epoch, step)
             rows = rng.choice(len(self.chance), options.batch, p=self.chance)
             x = augment_planes(learned.planes[rows].astype(np.float32), options.augment, rng)
             right = torch.from_numpy(learned.right[rows].astype(np.float32))
@@ -179,10 +180,11 @@ def fit(settings: PlaceEvidence, log_line: LogFn) -> dict[str, float]:
     Raises:
         InputError: too few buildings to train on some and watch others.
     """
-    paths = build_hypothesis_files(settings.data, settings, log_line)
-    if settings.lookalikes:
-        alike, _ = build_lookalikes(settings.alike, settings, log_line)
-        paths += derive_hypothesis_files(settings.alike.name, [[path] for path in alike], settings, log_line)
+    with let_chief_first(settings):
+        paths = build_hypothesis_files(settings.data, settings, log_line)
+        if settings.lookalikes:
+            alike, _ = build_lookalikes(settings.alike, settings, log_line)
+            paths += derive_hypothesis_files(settings.alike.name, [[path] for path in alike], settings, log_line)
     return train(settings, collect_places(paths, settings.half), log_line)
 
 
@@ -210,4 +212,13 @@ def judge(settings: PlaceEvidence, file: Path, log_line: LogFn) -> dict[str, Any
     return {**scores, "places": len(places.right)}
 
 
-TASK = Task(PlaceEvidence, fit, ("auc",), judge, "topomerge.networks", "place_network.onnx", hours=4.0)
+TASK = Task(
+    PlaceEvidence,
+    fit,
+    ("auc", "log_loss"),
+    judge,
+    "topomerge.networks",
+    "place_network.onnx",
+    hours=4.0,
+    lower=("log_loss",),
+)

@@ -27,6 +27,7 @@ from topomerge.models.convolutional import PlanProbabilities, PlanUNet
 from topomerge.networks.network import Run
 from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, prefetch_batches, run_network
 from topomerge.training.packed_pairs import mark_watched, read_scan_building
+from topomerge.training.processes import let_chief_first
 from topomerge.training.scan_settings import GridSegmentation, PlanAugment, PlanLoss, PlanSegmentation
 from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
@@ -123,6 +124,7 @@ def _draw_seat_rows(floor: Array, rng: np.random.Generator) -> Array:
     return np.asarray(rows)
 
 
+LEAST_PROBABILITY = 1e-6  # of which a logarithm is taken
 LEAST_COLUMNS = 100  # inside of a plan that trains
 BARE_EVERY = 4  # plans that are shown as grids: one without furniture
 LASER_HEIGHTS, RAISED_HEIGHTS, FLOOR_HEIGHTS = (0.2, 0.5), (0.0, 2.4), (-0.1, 0.1)  # m: robots look there; walls of grids; floors
@@ -137,7 +139,8 @@ def fit(settings: PlanSegmentation, log_line: LogFn) -> dict[str, float]:
     Raises:
         InputError: no scan to train on or to watch.
     """
-    paths, _ = build_plans(settings.data, settings, log_line)
+    with let_chief_first(settings):
+        paths, _ = build_plans(settings.data, settings, log_line)
     scans = [load_examples(path) for path in paths]
     watches = mark_watched([read_scan_building(path) for path in paths], settings.hold_out)
     learned, watched = ([e for s, w in zip(scans, watches, strict=True) if w == which for e in s] for which in (False, True))
@@ -172,7 +175,7 @@ class PlanJob(ExportedJob):
         """Yield the crops of the state's epoch from its step on, from a generator of each step."""
         options = self.options
         for step in range(state.step, options.steps):
-            rng = np.random.default_rng([options.seed, 1, state.epoch, step])
+            rng = self.start_generator(1, state.epoch, step)
             rows = rng.choice(len(self.plans), options.batch, p=self.chance)
             crops = [crop(self.plans[row], options.crop, options.augment, rng) for row in rows]
             x, truth, weight = (np.stack(arrays) for arrays in zip(*crops, strict=True))
@@ -197,7 +200,7 @@ class PlanJob(ExportedJob):
 
     def compute_scores(self) -> dict[str, float]:
         """Compute the scores of the validation scans."""
-        return score_classes(count_confusion(self.watched, self.run()))
+        return score_plans(self.watched, self.run())
 
 
 def convert_to_grid(example: PlanExample, furnished: bool) -> PlanExample:
@@ -246,14 +249,21 @@ def crop(plan: PlanTensors, side: int, augment: PlanAugment, rng: np.random.Gene
     return x, truth, weight
 
 
-def count_confusion(examples: Sequence[PlanExample], network: Run) -> Array:
-    """Count (5, 5) columns by true and by said class, of those of which something is known."""
-    table = np.zeros((len(COLUMN_CLASSES), len(COLUMN_CLASSES)), np.int64)
+def score_plans(examples: Sequence[PlanExample], network: Run) -> dict[str, float]:
+    """Compute the scores of the columns of which something is known (`score_classes`), and their log loss."""
+    table, loss = np.zeros((len(COLUMN_CLASSES), len(COLUMN_CLASSES)), np.int64), 0.0
     for example in examples:
         seen = example.plan.inside | example.plan.wall
-        said = compute_column_probabilities(example.plan, network).argmax(axis=-1)
-        np.add.at(table, (example.truth[seen], said[seen]), 1)
-    return table
+        probability, truth = compute_column_probabilities(example.plan, network)[seen], example.truth[seen]
+        np.add.at(table, (truth, probability.argmax(axis=-1)), 1)
+        loss += compute_log_loss(probability, truth)
+    return {**score_classes(table), "loss": loss / max(int(table.sum()), 1)}
+
+
+def compute_log_loss(probability: Array, truth: Array) -> float:
+    """Compute the sum of -log of the probabilities (n, k) of the true classes (n,)."""
+    right = np.take_along_axis(probability, truth.astype(np.int64)[:, None], axis=1)
+    return float(-np.log(np.maximum(right, LEAST_PROBABILITY)).sum())
 
 
 def score_classes(table: Array) -> dict[str, float]:
@@ -273,9 +283,9 @@ def judge(settings: PlanSegmentation, file: Path, log_line: LogFn) -> dict[str, 
     recipe: PlanRecipe = settings.heldout
     paths, _ = build_plans(recipe, settings, log_line)
     examples = [e for path in paths for e in load_examples(path)]
-    return {**score_classes(count_confusion(examples, read_weights(file))), "scans": len(paths), "plans": len(examples)}
+    return {**score_plans(examples, read_weights(file)), "scans": len(paths), "plans": len(examples)}
 
 
-PLAN_SCORES = ("mean_iou", "mean_f1", "accuracy", *(f"{of}_{name}" for of in ("iou", "f1") for name in COLUMN_CLASSES))
-PLAN_TASK = Task(PlanSegmentation, fit, PLAN_SCORES, judge, "topomerge.networks", "plan_network.onnx", hours=5.0)
-GRID_TASK = Task(GridSegmentation, fit, PLAN_SCORES, judge, "topomerge.networks", "grid_network.onnx", hours=1.2)
+PLAN_SCORES = ("mean_iou", "mean_f1", "accuracy", "loss", *(f"{of}_{name}" for of in ("iou", "f1") for name in COLUMN_CLASSES))
+PLAN_TASK = Task(PlanSegmentation, fit, PLAN_SCORES, judge, "topomerge.networks", "plan_network.onnx", hours=5.0, lower=("loss",))
+GRID_TASK = Task(GridSegmentation, fit, PLAN_SCORES, judge, "topomerge.networks", "grid_network.onnx", hours=1.2, lower=("loss",))

@@ -29,7 +29,7 @@ RUN_FILE, CONFIG_FILE, RUN_FORMAT = "run.json", "config.json", 1
 PACKAGES = ("torch", "torch-geometric", "numpy", "topomerge")
 # Keys that a run may go on with other values of: how long, where and by how many workers it trains, and what it tells.
 MAY_CHANGE = {"epochs", "patience", "accelerator", "precision", "batches", "threads", "jobs", "cluster", "cache"}
-MAY_CHANGE |= {"name", "runs", "tensorboard", "export", "resume", "overwrite"}
+MAY_CHANGE |= {"name", "runs", "logger", "export", "resume", "overwrite", "top", "profile", "anomaly"}
 # Keys that follow from the `path` of one's own captures; `record_start` compares what the sets hold.
 OWN_SETS = {"data", "data.name", "heldout.name", "validation"}
 UNTOLD = {"name", "runs", "resume", "overwrite"}  # of them
@@ -39,14 +39,15 @@ MISSING = object()
 def compare_settings(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, list[Any]]:
     """Return the keys that differ, such as ``loss.kind``, with both values. A key that one of both lacks counts for nothing: it
     is of another version."""
-    first, second = _flatten(before), _flatten(json.loads(json.dumps(convert_to_plain(dict(now)))))
+    first, second = flatten_table(before), flatten_table(json.loads(json.dumps(convert_to_plain(dict(now)))))
     return {key: [first[key], second[key]] for key in first if second.get(key, first[key]) != first[key]}
 
 
-def _flatten(table: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+def flatten_table(table: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    """Return the values of a table within tables by keys such as ``loss.kind``."""
     out: dict[str, Any] = {}
     for key, value in table.items():
-        out |= _flatten(value, f"{above}{key}.") if isinstance(value, Mapping) else {f"{above}{key}": value}
+        out |= flatten_table(value, f"{above}{key}.") if isinstance(value, Mapping) else {f"{above}{key}": value}
     return out
 
 

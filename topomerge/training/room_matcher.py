@@ -31,6 +31,7 @@ from topomerge.models.weights import read_embedder
 from topomerge.training.batches import add_views, augment_graph, augment_sheet, compute_quarter_turns, mirror_graph
 from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, run_network
 from topomerge.training.packed_pairs import Graph, GraphPair, load_pairs
+from topomerge.training.processes import let_chief_first
 from topomerge.training.settings import Augment
 from topomerge.training.task_settings import RoomMatching
 from topomerge.training.tasks import RANKINGS, Task
@@ -38,6 +39,7 @@ from topomerge.training.validate import LEAST_CERTAINTIES, SIZE_COLUMNS, score_m
 from topomerge.types import Array, LogFn
 
 WRONG_TURNS = (1, 2, 2, 3)  # quarter turns off the true one: half a turn is the one that is mistaken most
+LEAST_PROBABILITY = 1e-6  # of which a logarithm is taken
 MIRROR = np.array([1.0, -1.0])
 
 
@@ -143,10 +145,11 @@ class MatcherJob(ExportedJob):
         self.network.train()
         options = self.options
         order = np.random.default_rng([options.seed, 1, state.epoch]).permutation(len(self.learned))
-        order = np.resize(order, (options.steps, options.batch))
+        rank, world = self.fabric.global_rank, self.fabric.world_size
+        order = np.resize(order, (options.steps, options.batch * world))[:, rank::world]
         for step, rows in enumerate(order[state.step :], state.step):
-            torch.manual_seed(derive_seed(options.seed, state.epoch, step))  # of the dropout
-            draws = np.random.default_rng([options.seed, 2, state.epoch, step]).integers(0, 1 << 16, (len(rows), 4))
+            torch.manual_seed(derive_seed(options.seed, state.epoch, step, *([rank] if rank else [])))  # of the dropout
+            draws = self.start_generator(2, state.epoch, step).integers(0, 1 << 16, (len(rows), 4))
             yield [(self.learned[k], draw) for k, draw in zip(rows.tolist(), draws, strict=True)]
 
     def train_step(self, batch: list[tuple[MatcherExample, Array]], state: State) -> dict[str, float]:
@@ -203,7 +206,7 @@ def compute_confidence(partners: Partners) -> Tensor:
 
 def score_matcher(watched: Sequence[MatcherExample], matcher: Matcher) -> dict[str, float]:
     """Scores as of `training.validate`, and the share of pairs with rooms in common whose turn is right (`turn`)."""
-    ranks, twins, turns, counts = [], [], [], np.zeros((len(LEAST_CERTAINTIES), 4), int)
+    ranks, twins, turns, losses, counts = [], [], [], list[Array](), np.zeros((len(LEAST_CERTAINTIES), 4), int)
     for example in watched:
         a, b, matches = example.a[0], example.b[0], example.pair.matches.numpy()
         odds = max(match_turns(a.rows, b.rows, matcher), key=lambda turned: turned.probability)
@@ -211,12 +214,26 @@ def score_matcher(watched: Sequence[MatcherExample], matcher: Matcher) -> dict[s
         if len(matches) and example.quarters is not None:
             turns.append(odds.quarters == example.quarters)
         for chance, truth, other in ((odds.rows, matches, example.pair.b), (odds.columns, matches[:, ::-1], example.pair.a)):
+            losses.append(compute_room_losses(chance, truth))
             rooms, rank = rank_partners(chance[:, :-1], truth)
             ranks.append(rank)
             twins.append(has_twin(other["x"][:, SIZE_COLUMNS].numpy(), truth, rooms))
     every = np.concatenate(ranks)
     out = score_matches(every, np.concatenate(twins), np.ones(len(every), bool), counts)
-    return {k: v for k, v in out.items() if "clear" not in k} | {"turn": float(np.mean(turns)) if turns else 0.0}
+    shares = {"turn": float(np.mean(turns)) if turns else 0.0, "loss": float(np.concatenate(losses).mean())}
+    return {k: v for k, v in out.items() if "clear" not in k} | shares
+
+
+def compute_room_losses(chance: Array, matches: Array) -> Array:
+    """Compute (R,) -log(probability of a room's partners, or of having none).
+
+    Args:
+        chance: (R, S + 1) of each room of the other map, and of none; matches: (M, 2) rooms that are one.
+    """
+    right = np.zeros(chance.shape, bool)
+    right[matches[:, 0], matches[:, 1]] = True
+    right[:, -1] = ~right.any(axis=1)
+    return np.asarray(-np.log(np.maximum((chance * right).sum(axis=1), LEAST_PROBABILITY)))
 
 
 def fit(settings: RoomMatching, log_line: LogFn) -> dict[str, float]:
@@ -225,7 +242,8 @@ def fit(settings: RoomMatching, log_line: LogFn) -> dict[str, float]:
     Raises:
         InputError: no pairs, or the embedder that ships has no rows for turns.
     """
-    settings = with_own_sets(settings, log_line)
+    with let_chief_first(settings):
+        settings = with_own_sets(settings, log_line)
     network, embedder = load_shipped_embedder()
     learned = read_examples(settings, settings.data.name, network, settings.views, log_line)
     watched = read_examples(settings, settings.validation, network, 0, log_line)
@@ -287,9 +305,10 @@ def read_examples(settings: RoomMatching, name: str, network: Embedder, number: 
 TASK = Task(
     RoomMatching,
     fit,
-    (*RANKINGS, "mrr", "precision", "recall", "f1", "turn"),
+    (*RANKINGS, "mrr", "precision", "recall", "f1", "turn", "loss"),
     judge,
     "topomerge.networks",
     "room_matcher.onnx",
     hours=0.3,
+    lower=("loss",),
 )

@@ -17,7 +17,8 @@ import topomerge
 from topomerge.archive import replace_on_success
 from topomerge.errors import InputError
 from topomerge.networks import network as networks
-from topomerge.training.provenance import RUN_FILE, describe_data, describe_provenance, record_start
+from topomerge.registry import LOGGERS, NO_LOGGER
+from topomerge.training.provenance import RUN_FILE, describe_data, describe_provenance, flatten_table, record_start
 
 PACKAGE = "package"  # export: into the package itself
 
@@ -33,9 +34,9 @@ def begin_run(settings: Any, device: str = "cpu", threads: int = 1) -> None:
     """
     folder: Path = settings.folder
     if not settings.resume:
-        for name in ("best", "last", "last.new", "last.old", "tb"):
+        for name in ("best", "last", "last.new", "last.old", "top", "tb", "wandb"):
             shutil.rmtree(folder / name, ignore_errors=True)
-        for name in ("metrics.jsonl", RUN_FILE):
+        for name in ("metrics.jsonl", "metrics.csv", "trace.json", RUN_FILE):
             (folder / name).unlink(missing_ok=True)
     record_start(folder, asdict(settings), describe_data(settings), device, threads)
     write_settings(folder, {**asdict(settings), "resume": False, "overwrite": False})  # what another run may begin with
@@ -67,6 +68,7 @@ def write_card(
         metrics: on what was held out of the training.
         interface: what a network does, its inputs and outputs (`networks.signature`).
     """
+    run = next((folder for folder in file.parents[1:3] if (folder / RUN_FILE).is_file()), file.parent.parent)
     keys = (f"{k}={v}" for k, v in settings.items() if isinstance(v, int | float | str) and k in ("seed", "epochs"))
     command = f"python train.py task={settings['task']} {' '.join(keys)} export=package".replace("  ", " ")
     card = {
@@ -76,7 +78,7 @@ def write_card(
         "command": command,
         "settings": settings,
         "data": data,
-        "provenance": describe_provenance(file.parent.parent),
+        "provenance": describe_provenance(run),
         "metrics": {k: round(v, 5) if isinstance(v, float) else v for k, v in metrics.items()},
     }
     return networks.write_card(file, card)
@@ -107,44 +109,47 @@ def export_files(best: Path, target: str, package: str) -> list[Path]:
 
 
 class MetricsLog:
-    """Metrics of a run.
+    """Metrics of a run: metrics.jsonl, and its loggers (`topomerge.registry.LOGGERS`).
 
     Args:
-        folder: of the run.
-        tensorboard: write events, too.
+        settings: of the run.
         epoch: rows of this and later epochs, of a run that goes on, are dropped.
     """
 
-    def __init__(self, folder: Path, tensorboard: bool, epoch: int = 0) -> None:
+    def __init__(self, settings: Any, epoch: int = 0) -> None:
+        folder: Path = settings.folder
         self.path, self.rows = folder / "metrics.jsonl", list[dict[str, Any]]()
         if epoch and self.path.exists():
             rows = [json.loads(line) for line in self.path.read_text(encoding="utf-8").splitlines()]
             self.rows = [row for row in rows if row["epoch"] < epoch]
         self._write()
-        self.board: Any = None
-        if tensorboard:
-            from torch.utils.tensorboard import SummaryWriter
+        flat = flatten_table(asdict(settings))
+        self.loggers = [LOGGERS[name](folder, flat, epoch) for name in settings.logger if name != NO_LOGGER]
+        for logger in self.loggers:
+            logger.log_hyperparams(flat)
 
-            self.board = SummaryWriter(folder / "tb", purge_step=epoch)  # type: ignore[no-untyped-call]
+    @property
+    def board(self) -> Any:
+        """TensorBoard's writer, for pictures; None where nothing is logged there."""
+        return next((one.experiment for one in self.loggers if hasattr(getattr(one, "experiment", None), "add_figure")), None)
 
     def append_row(self, values: Mapping[str, Any]) -> None:
         """Keep the metrics of an epoch."""
         self.rows.append(dict(values))
         self._write()
-        if self.board is not None:
-            for name, value in values.items():
-                if isinstance(value, float) and np.isfinite(value):
-                    self.board.add_scalar(name, value, values["epoch"])
-            self.board.flush()
+        numbers = {name: value for name, value in values.items() if isinstance(value, float) and np.isfinite(value)}
+        for logger in self.loggers:
+            logger.log_metrics(numbers, step=values["epoch"])
+            logger.save()
 
     def _write(self) -> None:
         with replace_on_success(self.path) as beside:
             beside.write_text("".join(json.dumps(row) + "\n" for row in self.rows), encoding="utf-8")
 
-    def close(self) -> None:
-        """Write what is left."""
-        if self.board is not None:
-            self.board.close()
+    def close(self, status: str = "success") -> None:
+        """Tell the loggers how the run ended."""
+        for logger in self.loggers:
+            logger.finalize(status)
 
 
 class EtaClock:

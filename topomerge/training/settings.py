@@ -14,7 +14,7 @@ from topomerge.embedding.network import check as check_network
 from topomerge.errors import InputError
 from topomerge.models.losses import LossSettings
 from topomerge.models.losses import check as check_loss
-from topomerge.registry import DATASETS, OPTIMIZERS, SCHEDULES, load_plugins
+from topomerge.registry import DATASETS, LOGGERS, NO_LOGGER, OPTIMIZERS, SCHEDULES, load_plugins
 
 
 def check_numbers(settings: Mapping[str, Any], above: str = "") -> None:
@@ -30,31 +30,44 @@ def check_numbers(settings: Mapping[str, Any], above: str = "") -> None:
             raise InputError(f"{above}{key} must be a finite number, not {value}")
 
 
-def check_descent(settings: Any) -> None:
-    """Refuse optimizers and schedules that are not registered.
+def check_descent(settings: NetworkSettings) -> None:
+    """Refuse optimizers and schedules that are not registered, and numbers that train nothing.
 
     Raises:
-        InputError: lists the names.
+        InputError: names the key.
     """
     OPTIMIZERS.check(settings.optimizer)
     SCHEDULES.check(settings.schedule)
+    if not settings.rate > 0:
+        raise InputError(f"rate must be above 0, not {settings.rate}")
+    if settings.decay < 0:
+        raise InputError(f"decay must be 0 or more, not {settings.decay}")
+    if not 0 <= settings.ema < 1:
+        raise InputError(f"ema must be 0 or more and below 1, not {settings.ema}")
+    for key in ("epochs", "batch", "devices", "top"):
+        if getattr(settings, key) < 1:
+            raise InputError(f"{key} must be 1 or more, not {getattr(settings, key)}")
 
 
-def _check_run_name(settings: Any) -> None:
+def _check_run(settings: RunSettings) -> None:
+    """Refuse a name of no folder, and loggers that are not registered."""
     if not settings.name or Path(settings.name).is_absolute() or ".." in Path(settings.name).parts:
         raise InputError(f"name must name a folder inside {settings.runs}, not {settings.name!r}")
+    for name in settings.logger:
+        if name != NO_LOGGER:
+            LOGGERS.check(name)
 
 
 @dataclass
-class TaskSettings:
-    """What every task has.
+class RunSettings:
+    """What every run has.
 
     Args:
         task: which of the learned parts.
         name: of the run; its folder is `runs`/`name`.
-        cache: folder of the data, which is made where it is missing, by so many processes (`jobs`), or those of a Dask cluster.
-        part: [k, n]: make every n-th item of the data from the k-th on, for machines that share nothing.
+        cache: folder of the data.
         plugins: modules that are imported first, as they register something (`topomerge.registry`).
+        logger: of `topomerge.registry.LOGGERS`, beside metrics.jsonl; ``none``: no other.
         resume: go on where the run of this name stopped, with the same settings; overwrite: replace that run.
         export: where the best weights go at the end: `package`, or a folder; empty: they stay in the run's.
     """
@@ -64,13 +77,10 @@ class TaskSettings:
     runs: str = "runs"
     cache: str = "cache"
     seed: int = 0
-    jobs: int = 1
-    cluster: str | None = None
-    part: list[int] = field(default_factory=lambda: [1, 1])
     plugins: list[str] = field(default_factory=list)
+    logger: list[str] = field(default_factory=lambda: ["tensorboard"])
     resume: bool = False
     overwrite: bool = False
-    tensorboard: bool = True
     export: str = ""
 
     @property
@@ -78,34 +88,21 @@ class TaskSettings:
         """Where the run is written."""
         return Path(self.runs) / self.name
 
-    def check(self) -> None:
-        """Refuse what makes no sense; a task with keys of its own checks these, too.
-
-        Raises:
-            InputError: names the key.
-        """
-        check_numbers(asdict(self))
-        keys = ("epochs", "batch", "steps", "hidden", "networks", "hypotheses", "inspected")
-        at_least = {**dict.fromkeys(keys, 1), "jobs": 1, "patience": 0, "seed": 0, "warmup": 0, "folds": 2, "hold_out": 2}
-        for key, least in at_least.items():
-            if getattr(self, key, least) < least:
-                raise InputError(f"{key} must be {least} or more, not {getattr(self, key)}")
-        data = getattr(getattr(self, "data", None), "name", "")
-        if data in DATASETS and not hasattr(self, "path"):
-            raise InputError(f"data={data}: is for tasks that learn from pairs of maps, not for {self.task}")
-        _check_run_name(self)
-
 
 @dataclass
-class NetworkTask(TaskSettings):
-    """What tasks that train a network have besides.
+class NetworkSettings(RunSettings):
+    """What a run has that trains a network.
 
     Args:
-        epochs: at most; rate: of learning; decay: of weights; batch: examples a step.
+        epochs: at most; rate: of learning; decay: of weights; batch: examples a step, of each process.
         optimizer, schedule: of `topomerge.registry`; optimizer_options: of the optimizer, by name.
         patience: epochs without a better validation after which it ends; 0: never.
-        hold_out: the scans of every n-th physical building are watched and train nothing.
         watch: what is best: a score of validation.
+        devices: processes that train together.
+        ema: decay, a step, of the moving average of the weights that is validated, kept and exported; 0: the weights themselves.
+        top: so many of the best epochs are kept, in `top/`; 1: the best one only, in `best/`.
+        profile: write a trace of a few steps, `trace.json`.
+        anomaly: name the operation whose gradient is no number; slow.
     """
 
     epochs: int = 10
@@ -116,17 +113,79 @@ class NetworkTask(TaskSettings):
     optimizer_options: dict[str, float] = field(default_factory=dict)
     schedule: str = "cosine"
     patience: int = 0
-    hold_out: int = 8
     watch: str = ""
+    devices: int = 1
+    ema: float = 0.0
+    top: int = 1
+    profile: bool = False
+    anomaly: bool = False
+
+
+@dataclass
+class Search:
+    """A search for settings (`training.search`), ``search=optuna``.
+
+    Args:
+        kind: of what asks.
+        space: key of the settings -> [low, high], [low, high, log], or choices.
+        trials: in all; jobs: processes that run them.
+        startup: trials at random, before which nothing is pruned.
+        prune: end a trial whose watched score is below the median of the others.
+    """
+
+    kind: str = "optuna"
+    space: dict[str, Any] = field(default_factory=dict)
+    trials: int = 20
+    jobs: int = 1
+    startup: int = 5
+    prune: bool = True
+
+
+@dataclass
+class TaskSettings(RunSettings):
+    """What every task but `embedding` has.
+
+    Args:
+        jobs: processes that make data that is missing; cluster: scheduler of a Dask cluster that does so.
+        part: [k, n]: make every n-th item of the data from the k-th on, for machines that share nothing.
+    """
+
+    jobs: int = 1
+    cluster: str | None = None
+    part: list[int] = field(default_factory=lambda: [1, 1])
+
+    def check(self) -> None:
+        """Refuse what makes no sense; a task with keys of its own checks these, too.
+
+        Raises:
+            InputError: names the key.
+        """
+        check_numbers(asdict(self))
+        keys = ("steps", "hidden", "networks", "hypotheses", "inspected")
+        at_least = {**dict.fromkeys(keys, 1), "jobs": 1, "patience": 0, "seed": 0, "warmup": 0, "folds": 2, "hold_out": 2}
+        for key, least in at_least.items():
+            if getattr(self, key, least) < least:
+                raise InputError(f"{key} must be {least} or more, not {getattr(self, key)}")
+        data = getattr(getattr(self, "data", None), "name", "")
+        if data in DATASETS and not hasattr(self, "path"):
+            raise InputError(f"data={data}: is for tasks that learn from pairs of maps, not for {self.task}")
+        _check_run(self)
+
+
+@dataclass
+class NetworkTask(TaskSettings, NetworkSettings):
+    """What tasks that train a network have besides.
+
+    Args:
+        hold_out: the scans of every n-th physical building are watched and train nothing.
+    """
+
+    hold_out: int = 8
 
     def check(self) -> None:
         """Refuse what makes no sense."""
         super().check()
         check_descent(self)
-        if not self.rate > 0:
-            raise InputError(f"rate must be above 0, not {self.rate}")
-        if self.decay < 0:
-            raise InputError(f"decay must be 0 or more, not {self.decay}")
 
 
 @dataclass
@@ -187,55 +246,38 @@ class Augment:
 
 
 @dataclass
-class Training:
+class Training(NetworkSettings):
     """Args:
-    task: which of the learned parts; this is `embedding`.
-    name: of the run; its folder is `runs`/`name`.
     data: name of the set of pairs to train on: `cache`/`data`.jsonl, or the path of a manifest or packed file.
     validation: likewise of the set to watch; empty: a tenth of the training buildings is held out.
-    plugins: modules that are imported first, as they register something (`topomerge.registry`).
-    optimizer, schedule: of `topomerge.registry`; optimizer_options: of the optimizer, by name.
     path: of ``data=folder``: a folder of captures with a `pairs.yaml`; its own pairs are watched, where `validation` is not set.
     limit: of the first pairs only; 0: all.
-    epochs: at most; rate: of learning, rises over `warmup` of all steps and falls to nothing.
-    batch: pairs of maps a step, of each process.
-    patience: epochs without a better validation after which it ends; 0: never.
+    warmup: share of all steps in which the rate rises; then it falls to nothing.
+    clip: longest gradient.
     init_from: `pretrained`, a run or a file, whose weights the whole network starts from; its settings are the network's, too.
     geometry_from: run whose geometry encoder is the start.
     freeze: of `FREEZE`, what keeps the weights that it starts from: `geometry`, or `encoders`, all but the last layers.
     replay: share of the pairs of an epoch that are drawn from the set `replay_data`, so that what it taught is not forgotten.
     overfit: train on one batch, without augmentation, and validate on it.
-    resume: go on where the run of this name stopped, with the same settings; overwrite: replace that run.
     threads: that make batches, of each process; beside an accelerator as many as there are cores.
-    watch: what is best: a score of validation.
-    accelerator: of `ACCELERATORS`; devices: how many of them, or processes.
+    accelerator: of `ACCELERATORS`.
     precision: of `PRECISIONS`; `auto`: bf16 on CUDA, 32 bits elsewhere.
     batches: made on the `device` (`device_batches`), or by threads of the `host`; `auto`: on the device beside an accelerator.
-    export: where the best weights go at the end: `package`, or a folder; empty: they stay in the run's.
     """
 
     task: str = "embedding"
-    name: str = "run"
-    runs: str = "runs"
-    cache: str = "cache"
     data: str = "train_small"
     validation: str = VALIDATION
     path: str = ""
     limit: int = 0
-    seed: int = 0
     epochs: int = 40
     batch: int = 16
-    rate: float = 2e-3
     decay: float = 1e-4
     warmup: float = 0.05
     clip: float = 1.0
-    optimizer: str = "adamw"
-    optimizer_options: dict[str, float] = field(default_factory=dict)
-    schedule: str = "cosine"
     patience: int = 8
     watch: str = "recall@1"
     accelerator: str = "cpu"
-    devices: int = 1
     threads: int = 1
     precision: str = "auto"
     batches: str = "auto"
@@ -245,19 +287,9 @@ class Training:
     replay: float = 0.0
     replay_data: str = REPLAYED
     overfit: bool = False
-    resume: bool = False
-    overwrite: bool = False
-    tensorboard: bool = True
-    export: str = ""
-    plugins: list[str] = field(default_factory=list)
     network: Network = field(default_factory=Network)
     loss: LossSettings = field(default_factory=LossSettings)
     augment: Augment = field(default_factory=Augment)
-
-    @property
-    def folder(self) -> Path:
-        """Where the run is written."""
-        return Path(self.runs) / self.name
 
 
 def check(settings: Training) -> None:
@@ -273,12 +305,11 @@ def check(settings: Training) -> None:
     check_numbers(asdict(settings))
     check_network(settings.network)
     check_loss(settings.loss)
-    for key, least in (("epochs", 1), ("batch", 1), ("devices", 1), ("threads", 1), ("limit", 0), ("patience", 0), ("seed", 0)):
+    for key, least in (("threads", 1), ("limit", 0), ("patience", 0), ("seed", 0)):
         if getattr(settings, key) < least:
             raise InputError(f"{key} must be {least} or more, not {getattr(settings, key)}")
-    for key in ("rate", "clip"):
-        if not getattr(settings, key) > 0:
-            raise InputError(f"{key} must be above 0, not {getattr(settings, key)}")
+    if not settings.clip > 0:
+        raise InputError(f"clip must be above 0, not {settings.clip}")
     shares = {
         "warmup": settings.warmup,
         "replay": settings.replay,
@@ -289,8 +320,6 @@ def check(settings: Training) -> None:
     for key, value in shares.items():
         if not 0 <= value < 1:
             raise InputError(f"{key} must be 0 or more and below 1, not {value}")
-    if settings.decay < 0:
-        raise InputError(f"decay must be 0 or more, not {settings.decay}")
     for key, possible in (("batches", BATCHES), ("accelerator", ACCELERATORS), ("precision", PRECISIONS)):
         if getattr(settings, key) not in possible:
             raise InputError(f"{key}: unknown {getattr(settings, key)!r}; {', '.join(possible)} are possible")
@@ -304,7 +333,7 @@ def check(settings: Training) -> None:
         of = "init_from=<run> or geometry_from=<run>" if settings.freeze == "geometry" else "init_from=<run>"
         raise InputError(f"freeze={settings.freeze} needs {of}, or random weights would be frozen")
     check_descent(settings)
-    _check_run_name(settings)
+    _check_run(settings)
 
 
 def build_recipe_schema() -> type[Training]:
@@ -320,7 +349,9 @@ def convert_composed(given: Any) -> Training:
 
     check_own_path(given.data.name, given.path)
     values = {f.name: getattr(given, f.name) for f in fields(Training)}
-    return Training(**{**values, "data": given.data.name})
+    settings = Training(**{**values, "data": given.data.name})
+    check(settings)
+    return settings
 
 
 def load_settings(path: str | Path) -> Training:

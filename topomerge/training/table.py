@@ -44,18 +44,18 @@ def write_table(folder: str | Path) -> Path:
         InputError: no runs in it.
     """
     folder = Path(folder)
-    rows = [row for path in sorted(folder.rglob("metrics.jsonl")) if (row := _read_best_epoch(path.parent)) is not None]
+    rows = [row for path in sorted(folder.rglob("metrics.jsonl")) if (row := read_best_epoch(path.parent)) is not None]
     if not rows:
         raise InputError(f"{folder}: no runs in it")
     rows.sort(key=lambda row: -row["best"])
     columns = list(dict.fromkeys(name for row in rows for name in row if name not in ("best", "same")))
-    lines = _table(rows, columns)
+    lines = format_table(rows, columns)
     if gathered := gather_seeds(rows):
         lines += [
             "",
             "Mean over seeds, with its 95 % interval:",
             "",
-            *_table(gathered, ["seeds" if n == "seed" else n for n in columns]),
+            *format_table(gathered, ["seeds" if n == "seed" else n for n in columns]),
         ]
     with replace_on_success(folder / "table.md") as beside:
         beside.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -81,7 +81,8 @@ def gather_seeds(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return out
 
 
-def _table(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> list[str]:
+def format_table(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> list[str]:
+    """Format rows as the lines of a table in Markdown."""
     head = [name for name in columns if any(name in row for row in rows)]
     lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
     return lines + [f"| {' | '.join(_format_cell(row.get(name, '–')) for name in head)} |" for row in rows]
@@ -91,7 +92,7 @@ def _format_cell(value: Any) -> str:
     return f"{value:.3f}" if isinstance(value, float) else str(value)
 
 
-def _read_best_epoch(run: Path) -> dict[str, Any] | None:
+def read_best_epoch(run: Path) -> dict[str, Any] | None:
     """The best epoch of a run; None where there is none yet."""
     config = json.loads((run / "config.json").read_text(encoding="utf-8"))
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
@@ -102,13 +103,14 @@ def _read_best_epoch(run: Path) -> dict[str, Any] | None:
     sign = -1 if config["watch"] in task.lower else 1
     best = max(rows, key=lambda row: sign * float(row[f"val/{config['watch']}"]))
     same = json.dumps({key: value for key, value in config.items() if key not in MAY_CHANGE - {"epochs", "patience"} | {"seed"}})
+    about = task.describe(config)
     return {
         "run": run.name,
         "best": sign * float(best[f"val/{config['watch']}"]),
         "same": same,
-        **task.describe(config),
+        **about,
         "seed": config["seed"],
-        **{name: best.get(f"val/{name}", "–") for name in task.scores},
+        **{f"val {name}" if name in about else name: best.get(f"val/{name}", "–") for name in task.scores},
         "epoch": best["epoch"] + 1,
         "s an epoch": sum(float(row["seconds"]) for row in rows) / len(rows),
     }

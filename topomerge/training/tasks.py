@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, make_dataclass
 from pathlib import Path
 from typing import Any
 
 from topomerge.archive import find_weights_file, replace_on_success
 from topomerge.errors import InputError
-from topomerge.registry import TASKS, load_plugins
+from topomerge.registry import NO_LOGGER, TASKS, load_plugins
 from topomerge.types import LogFn
 
 DEFAULT_TASK = "embedding"  # of `train.py`
@@ -77,17 +77,33 @@ def get_word(words: Sequence[str], key: str, default: str = "") -> str:
     return next((word[len(key) + 1 :] for word in reversed(words) if word.startswith(f"{key}=")), default)
 
 
+LISTS = ("logger", "plugins")  # keys that take several values, or one without brackets
+
+
+def bracket_lists(words: Sequence[str]) -> list[str]:
+    """Return words of a command line in which ``logger=csv`` is ``logger=[csv]``, as Hydra has it."""
+    out = []
+    for word in words:
+        key, _, value = word.partition("=")
+        single = key.lstrip("+") in LISTS and value and not value.startswith(("[", "'", '"'))
+        out.append(f"{key}=[{value}]" if single else word)
+    return out
+
+
 def prepare_words(words: Sequence[str]) -> list[str]:
     """Import the plugins that words of a command line name, let Hydra know the keys of the tasks, and find YAML of plugins.
 
     Raises:
         InputError: a plugin cannot be imported, or there is no such task.
     """
-    from topomerge.config import find_plugins, register
+    from topomerge.config import SEARCH, find_plugins, register
+    from topomerge.training.settings import Search
 
-    ready = find_plugins(words)
+    register("optuna", Search, group=SEARCH, package=SEARCH)
+    ready = bracket_lists(find_plugins(words))
     for task in get_word(words, "task", DEFAULT_TASK).split(","):
-        register(task, TASKS[task].get_schema(), group="task")
+        schema = make_dataclass("Composed", [(SEARCH, Any, None)], bases=(TASKS[task].get_schema(),))
+        register(task, schema, group="task")
     return ready
 
 
@@ -143,6 +159,10 @@ def check_start(settings: Any) -> None:
     if settings.watch not in possible:
         raise InputError(f"watch: unknown {settings.watch!r}; {', '.join(possible)} are possible for task={settings.task}")
     check_accelerator(settings)
+    if names := [name for name in settings.logger if name != NO_LOGGER]:
+        from topomerge.training.loggers import check_installed
+
+        check_installed(names)
     check_folder(settings.folder, asdict(settings))
 
 

@@ -30,6 +30,8 @@ from topomerge.models.convolutional import WallNetwork, WallProbabilities
 from topomerge.networks.network import Run
 from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, run_network
 from topomerge.training.packed_pairs import mark_watched, read_scan_building
+from topomerge.training.plan_segmentation import compute_log_loss
+from topomerge.training.processes import let_chief_first
 from topomerge.training.scan_settings import WallAugment, WallSegmentation
 from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
@@ -47,7 +49,8 @@ def fit(settings: WallSegmentation, log_line: LogFn) -> dict[str, float]:
     Raises:
         InputError: no scan to train on or to watch.
     """
-    paths, _ = build_walls(settings.data, settings, log_line)
+    with let_chief_first(settings):
+        paths, _ = build_walls(settings.data, settings, log_line)
     scans = [load_walls(path) for path in paths]
     learned, watched = split_train_val(scans, [read_scan_building(path) for path in paths], settings)
     torch.manual_seed(derive_seed(settings.seed))
@@ -85,7 +88,7 @@ class WallJob(ExportedJob):
         self.network.train()
         options = self.options
         for step in range(state.step, options.steps):
-            rng = np.random.default_rng([options.seed, 1, state.epoch, step])
+            rng = self.start_generator(1, state.epoch, step)
             stretches = []
             for row in rng.integers(len(self.learned), size=options.batch).tolist():
                 scan, holes = self.learned[row], self.holes[row]
@@ -161,16 +164,20 @@ def _corrupt_strip(x: Array, augment: WallAugment, rng: np.random.Generator) -> 
 
 
 def score_walls(examples: Sequence[WallExample], network: Run) -> dict[str, float]:
-    """F1 of each class over the places where anything was seen, and the mean of those of doors, open or half open, and shut."""
-    table = np.zeros((len(WALL_CLASSES), len(WALL_CLASSES)), np.int64)
+    """F1 of each class over the places where anything was seen, the mean of those of doors, open or half open, and shut, and log
+    loss."""
+    loss, table = 0.0, np.zeros((len(WALL_CLASSES), len(WALL_CLASSES)), np.int64)
     for scan in examples:
         for low, high in zip(scan.first[:-1], scan.first[1:], strict=True):
             strip = scan.strips[low:high] / np.float32(255)
             right, there = downsample_truth(scan.truth[low:high], strip)
-            np.add.at(table, (right[there], compute_place_probabilities(strip, network).argmax(axis=1)[there]), 1)
+            probability = compute_place_probabilities(strip, network)[there]
+            np.add.at(table, (right[there], probability.argmax(axis=1)), 1)
+            loss += compute_log_loss(probability, right[there])
     coarse = np.zeros((len(COARSE_CLASSES), len(COARSE_CLASSES)), np.int64)
     np.add.at(coarse, np.ix_(COARSE_CLASS, COARSE_CLASS), table)
-    return {**compute_f1_scores(table, WALL_CLASSES), **score_colour_classes(coarse)}
+    scores = {**compute_f1_scores(table, WALL_CLASSES), **score_colour_classes(coarse)}
+    return {**scores, "loss": loss / max(int(table.sum()), 1)}
 
 
 def score_colour_classes(table: Array) -> dict[str, float]:
@@ -202,9 +209,10 @@ def judge(settings: WallSegmentation, file: Path, log_line: LogFn) -> dict[str, 
 TASK = Task(
     WallSegmentation,
     fit,
-    ("f1_doors", "f1_wall", "f1_open", "f1_shut", "f1_window", "f1_half", "f1_niche", "f1_cupboard"),
+    ("f1_doors", "f1_wall", "f1_open", "f1_shut", "f1_window", "f1_half", "f1_niche", "f1_cupboard", "loss"),
     judge,
     "topomerge.networks",
     "wall_network.onnx",
     hours=1.2,
+    lower=("loss",),
 )
