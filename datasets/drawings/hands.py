@@ -6,23 +6,17 @@ areas in several languages, dimension chains, a title; then paper, camera and co
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
-from io import BytesIO
-from pathlib import Path
-
 import numpy as np
-from PIL import Image, ImageDraw, ImageFilter, ImageFont
+from PIL import Image, ImageDraw
 from scipy import ndimage
-from topomerge.datasets.drawings.shapes import DrawingShapes, OpeningShape, mirror_shapes
+from topomerge.datasets.drawings.shapes import DrawingShapes, OpeningShape
+from topomerge.datasets.drawings.sheet import FINER, Drawing, Hand, Sheet
+from topomerge.datasets.drawings.symbols import draw_tiles, draw_treads, furnish_rooms
 
-from topomerge.networks.drawing import DOOR, FLOOR, PAGE, STAIRS, SYMBOL, TEXT, WALL, WINDOW
+from topomerge.networks.drawing import DOOR, FLOOR, SYMBOL, TEXT, WALL, WINDOW
 from topomerge.types import Array
 
-FINER = 2  # times as many pixels a side are drawn than are kept: lines have soft edges
 FEET = 0.3048  # m
-SCALES = 8.0, 50.0  # px/m, of the pages that are learned from
 WORDS = {
     "bedroom": (
         "BEDROOM",
@@ -54,158 +48,7 @@ TITLES = (
     "GROUND FLOOR", "First Floor Plan", "Erdgeschoss 1:100", "Plan d'évacuation", "Sketch plan for illustrative purposes only",
     "Approx. gross internal area 84 sq m / 904 sq ft", "Scale 1:50", "NOT TO SCALE", "Planritning", "You are here", "N",
 )  # fmt: skip
-WALL_STYLES = {"filled": 0.5, "grey": 0.12, "double": 0.14, "hatched": 0.08, "single": 0.16}
 WARM = ((253, 246, 227), (235, 245, 235), (230, 240, 250), (250, 235, 235), (240, 240, 240), (222, 205, 175), (255, 250, 205))
-
-
-@dataclass(frozen=True)
-class DrawnText:
-    """A text on a drawing: what it says, its middle (column, row), px, and its room, or -1."""
-
-    text: str
-    place: tuple[float, float]
-    room: int
-
-
-@dataclass(frozen=True, eq=False)
-class Drawing:
-    """A page.
-
-    Args:
-        picture: (h, w, 3) uint8.
-        classes: (h, w) uint8, of `networks.drawing.DRAWING_CLASSES`.
-        rooms: (h, w) int16, room of each pixel, -1 none.
-        texts: names, areas and dimensions that the hand wrote, before the page was spoilt.
-        scale: px/m.
-    """
-
-    picture: Array
-    classes: Array
-    rooms: Array
-    texts: tuple[DrawnText, ...]
-    scale: float
-
-
-@dataclass(frozen=True)
-class Hand:
-    """How somebody draws; drawn by `choose_hand`."""
-
-    walls: str
-    ink: tuple[int, int, int]
-    outer: float  # m
-    inner: float  # m
-    line: int  # px of thin lines, in finer pixels
-    colours: bool
-    doors: str
-    windows: str
-    furniture: float  # pieces for each 4 m2
-    tiles: float
-    names: float
-    areas: str
-    dimensions: bool
-    font: int
-    letter: float  # height of letters, m
-
-
-def choose_hand(rng: np.random.Generator) -> Hand:
-    """Choose a hand."""
-    dark = int(rng.integers(0, 70)) if rng.random() < 0.8 else int(rng.integers(70, 130))
-    ink = (dark, dark, dark) if rng.random() < 0.85 else tuple(int(v) for v in rng.integers(0, 140, 3))
-    style = str(rng.choice(list(WALL_STYLES), p=np.array(list(WALL_STYLES.values())) / sum(WALL_STYLES.values())))
-    return Hand(
-        walls=style,
-        ink=(ink[0], ink[1], ink[2]),
-        outer=float(rng.uniform(0.1, 0.4)),
-        inner=float(rng.uniform(0.04, 0.2)),
-        line=int(rng.integers(1, 5)),
-        colours=bool(rng.random() < 0.35),
-        doors=str(rng.choice(["arc", "gap", "leaf", "threshold", "box"], p=[0.6, 0.16, 0.08, 0.08, 0.08])),
-        windows=str(rng.choice(["lines", "one", "box", "blue", "plain"], p=[0.5, 0.15, 0.15, 0.1, 0.1])),
-        furniture=float(rng.choice([0, 0.25, 0.6, 1.2], p=[0.3, 0.2, 0.3, 0.2])),
-        tiles=float(rng.choice([0, 0.4], p=[0.7, 0.3])),
-        names=float(rng.choice([0, 0.8, 1.0], p=[0.2, 0.3, 0.5])),
-        areas=str(rng.choice(["", "m2", "size", "feet", "both"], p=[0.35, 0.25, 0.15, 0.15, 0.1])),
-        dimensions=bool(rng.random() < 0.3),
-        font=int(rng.integers(1 << 16)),
-        letter=float(rng.uniform(0.16, 0.42)),
-    )
-
-
-class Sheet:
-    """A page under way: picture and classes in finer pixels.
-
-    Args:
-        side: px of the picture that is kept.
-        scale: finer px/m; corner: (2,) m, of the lower left.
-    """
-
-    def __init__(self, side: tuple[int, int], scale: float, corner: Array, paper: tuple[int, int, int]) -> None:
-        self.shape = side[0] * FINER, side[1] * FINER
-        self.scale, self.corner = scale, corner
-        size = self.shape[::-1]
-        self.picture, self.classes = Image.new("RGB", size, paper), Image.new("L", size, PAGE)
-        self.rooms = Image.new("I", size, 0)
-        self.draw, self.mark, self.label = (ImageDraw.Draw(i) for i in (self.picture, self.classes, self.rooms))
-        self.mark.fontmode = "1"  # classes have no grades between them
-        self.texts: list[DrawnText] = []
-
-    def place(self, points: Array) -> list[tuple[float, float]]:
-        """Finer pixels (column, row) of points (n, 2), m."""
-        at = (np.asarray(points, np.float64).reshape(-1, 2) - self.corner) * self.scale
-        at[:, 1] = self.shape[0] - 1 - at[:, 1]
-        return [(float(x), float(y)) for x, y in at]
-
-    def fill(self, points: Array, colour: tuple[int, int, int] | None, kind: int | None = None) -> None:
-        """Fill a polygon."""
-        corners = self.place(points)
-        if colour is not None:
-            self.draw.polygon(corners, fill=colour)
-        if kind is not None:
-            self.mark.polygon(corners, fill=kind)
-
-    def line(self, points: Array, colour: tuple[int, int, int], width: int, kind: int | None = None) -> None:
-        """Draw a line through points."""
-        corners = self.place(points)
-        self.draw.line(corners, fill=colour, width=width, joint="curve")
-        if kind is not None:
-            self.mark.line(corners, fill=kind, width=max(width, 2), joint="curve")
-
-    def paint(self, mask: Array, colour: tuple[int, int, int], kind: int | None = None) -> None:
-        """Paint the pixels of a mask."""
-        image = Image.fromarray(mask.astype(np.uint8) * 255)
-        self.picture.paste(colour, mask=image)
-        if kind is not None:
-            self.classes.paste(kind, mask=image)
-
-    def write(
-        self, text: str, at: tuple[float, float], height: float, font: int, colour: tuple[int, int, int], room: int = -1
-    ) -> None:
-        """Write a text about a place, in finer pixels."""
-        letters = load_font(font, max(int(height), 7))
-        box = self.draw.textbbox(at, text, font=letters, anchor="mm")
-        if box[0] < 2 or box[1] < 2 or box[2] > self.shape[1] - 2 or box[3] > self.shape[0] - 2:
-            return
-        self.draw.text(at, text, fill=colour, font=letters, anchor="mm")
-        self.mark.text(at, text, fill=TEXT, font=letters, anchor="mm")
-        self.texts.append(DrawnText(text, (at[0] / FINER, at[1] / FINER), room))
-
-
-@cache
-def _list_fonts() -> tuple[str, ...]:
-    import matplotlib
-
-    folder = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
-    plain = [
-        p.name for p in sorted(folder.glob("*.ttf")) if p.name.startswith(("DejaVu", "STIXGeneral", "cmr10", "cmtt10", "cmss10"))
-    ]
-    return tuple(str(folder / name) for name in plain if "Display" not in name)
-
-
-@cache
-def load_font(number: int, size: int) -> ImageFont.FreeTypeFont:
-    """Load a font of matplotlib."""
-    fonts = _list_fonts()
-    return ImageFont.truetype(fonts[number % len(fonts)], size)
 
 
 def draw_plan(
@@ -226,8 +69,8 @@ def draw_plan(
     for opening in shapes.openings:
         _draw_opening(sheet, opening, hand, walls, rng)
     for rectangle in shapes.stairs:
-        _draw_treads(sheet, rectangle, hand, rng)
-    _furnish(sheet, shapes, hand, rng)
+        draw_treads(sheet, rectangle, hand, rng)
+    furnish_rooms(sheet, shapes, hand, rng)
     _write_rooms(sheet, shapes, hand, rng)
     if hand.dimensions:
         _draw_dimensions(sheet, shapes, hand, rng)
@@ -276,24 +119,7 @@ def _draw_rooms(sheet: Sheet, shapes: DrawingShapes, hand: Hand, rng: np.random.
         sheet.fill(room.polygon, tint, FLOOR)
         sheet.label.polygon(sheet.place(room.polygon), fill=number + 1)
         if rng.random() < (hand.tiles * (2 if room.kind in ("bath", "toilets", "kitchen") else 0.6)):
-            _draw_tiles(sheet, room.polygon, rng)
-
-
-def _draw_tiles(sheet: Sheet, polygon: Array, rng: np.random.Generator) -> None:
-    mask = Image.new("L", sheet.shape[::-1], 0)
-    draw, inside = ImageDraw.Draw(mask), Image.new("L", sheet.shape[::-1], 0)
-    ImageDraw.Draw(inside).polygon(sheet.place(polygon), fill=255)
-    corners = np.array(sheet.place(polygon))
-    (x0, y0), (x1, y1) = np.clip(corners.min(axis=0), 0, sheet.shape[::-1]), np.clip(corners.max(axis=0), 0, sheet.shape[::-1])
-    step = max(rng.uniform(0.12, 0.6) * sheet.scale, 6)
-    for x in np.arange(x0, x1, step):
-        draw.line([x, y0, x, y1], fill=255, width=1)
-    if rng.random() < 0.6:
-        for y in np.arange(y0, y1, step):
-            draw.line([x0, y, x1, y], fill=255, width=1)
-    both = np.minimum(np.asarray(mask), np.asarray(inside)) > 0
-    grey = int(rng.integers(120, 225))
-    sheet.paint(both, (grey, grey, grey))
+            draw_tiles(sheet, room.polygon, rng)
 
 
 def _draw_walls(sheet: Sheet, shapes: DrawingShapes, hand: Hand) -> Array:
@@ -395,106 +221,6 @@ def _draw_window(sheet: Sheet, quad: Array, hand: Hand) -> None:
         sheet.line(np.stack([a + (d - a) * share, b + (c - b) * share]), hand.ink, max(hand.line - 1, 1))
 
 
-def _draw_treads(sheet: Sheet, rectangle: Array, hand: Hand, rng: np.random.Generator) -> None:
-    a, b, c, d = rectangle
-    count = max(int(np.hypot(*(b - a)) / 0.28), 3)
-    for share in np.linspace(0, 1, count + 1):
-        sheet.line(np.stack([a + (b - a) * share, d + (c - d) * share]), hand.ink, hand.line, STAIRS)
-    sheet.line(np.stack([a, b, c, d, a]), hand.ink, hand.line, STAIRS)
-    middle = (a + d) / 2, (b + c) / 2
-    sheet.line(np.stack(middle), hand.ink, hand.line, STAIRS)
-
-
-def _furnish(sheet: Sheet, shapes: DrawingShapes, hand: Hand, rng: np.random.Generator) -> None:
-    label = np.asarray(sheet.rooms)
-    if rng.random() < 0.12:
-        _draw_routes(sheet, shapes, rng)
-    for number, room in enumerate(shapes.rooms):
-        if room.kind == "stairs" and rng.random() < 0.7:
-            _fill_with_treads(sheet, label == number + 1, hand, rng)
-            continue
-        x, y = room.polygon.T
-        area = 0.5 * abs(float(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))))
-        if hand.furniture == 0 or area < 1.0:
-            continue
-        pieces = min(int(rng.poisson(hand.furniture * area / 4)), 30)
-        if not pieces:
-            continue
-        corners = np.array(sheet.place(room.polygon))
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        for _ in range(pieces):
-            _draw_piece(sheet, label, number + 1, (low, high), hand, rng)
-
-
-def _draw_routes(sheet: Sheet, shapes: DrawingShapes, rng: np.random.Generator) -> None:
-    """Draw the ways out of an evacuation plan, through doors, and its signs."""
-    colour = ((0, 150, 60), (0, 90, 200), (220, 30, 30))[int(rng.integers(3))]
-    middles = [room.polygon.mean(axis=0) for room in shapes.rooms]
-    doors = [opening.line.mean(axis=0) for opening in shapes.openings if opening.kind != "window"]
-    for _ in range(int(rng.integers(1, 8))):
-        if doors:
-            ends = np.stack([middles[int(rng.integers(len(middles)))], doors[int(rng.integers(len(doors)))]])
-            if float(np.hypot(*np.ptp(ends, axis=0))) < 8:
-                sheet.line(ends, colour, max(int(0.08 * sheet.scale), 3), SYMBOL)
-        (x, y), r = sheet.place(middles[int(rng.integers(len(middles)))])[0], rng.uniform(0.15, 0.4) * sheet.scale
-        for image, ink in ((sheet.draw, colour), (sheet.mark, SYMBOL)):
-            image.rectangle([x - r, y - r, x + r, y + r], fill=ink)
-
-
-def _fill_with_treads(sheet: Sheet, mask: Array, hand: Hand, rng: np.random.Generator) -> None:
-    i, j = np.arange(mask.shape[0])[:, None], np.arange(mask.shape[1])[None]
-    step = max(int(0.28 * sheet.scale), 6)
-    lines = mask & ((i if rng.random() < 0.5 else j) % step < max(hand.line, 2))
-    sheet.paint(lines, hand.ink, STAIRS)
-
-
-def _draw_piece(sheet: Sheet, label: Array, room: int, box: tuple[Array, Array], hand: Hand, rng: np.random.Generator) -> None:
-    """Draw a piece of furniture or a fixture, if it finds a place in its room."""
-    size = np.exp(rng.uniform(np.log(0.35), np.log(2.2), 2)) * sheet.scale
-    at = rng.uniform(*box)
-    if rng.random() < 0.6:  # most stand at a wall
-        axis = int(rng.integers(2))
-        at[axis] = (box[0][axis] + size[axis] / 2 + 3) if rng.random() < 0.5 else (box[1][axis] - size[axis] / 2 - 3)
-    low, high = at - size / 2, at + size / 2
-    corners = np.array([[low[0], low[1]], [low[0], high[1]], [high[0], low[1]], [high[0], high[1]], at]).astype(int)
-    if (corners < 0).any() or (corners >= np.array(sheet.shape[::-1])).any():
-        return
-    if not (label[corners[:, 1], corners[:, 0]] == room).all():
-        return
-    ink = hand.ink if rng.random() < 0.6 else (150, 150, 150)
-    rectangle = [float(low[0]), float(low[1]), float(high[0]), float(high[1])]
-    fill = tuple(int(v) for v in rng.integers(150, 255, 3)) if rng.random() < 0.2 else None
-    kind, thin = int(rng.integers(9)), hand.line
-    inset = 0.12 * float(size.min())
-    inner = [rectangle[0] + inset, rectangle[1] + inset, rectangle[2] - inset, rectangle[3] - inset]
-    for image, colour in ((sheet.draw, ink), (sheet.mark, SYMBOL)):
-        filled = fill if image is sheet.draw else None
-        if kind == 0:
-            image.ellipse(rectangle, outline=colour, fill=filled, width=thin)
-            continue
-        if kind == 8:  # a solid thing
-            image.rectangle(rectangle, fill=colour)
-            continue
-        image.rounded_rectangle(rectangle, radius=inset if kind in (1, 2) else 0, outline=colour, fill=filled, width=thin)
-        if kind in (1, 3):
-            image.ellipse(inner, outline=colour, width=thin)
-        elif kind in (2, 4):
-            image.rectangle(inner, outline=colour, width=thin)
-        elif kind == 5:  # a bed: pillows and a folded sheet
-            y = rectangle[1] + 0.25 * float(size[1])
-            image.line([rectangle[0], y, rectangle[2], y], fill=colour, width=thin)
-            image.ellipse([inner[0], rectangle[1], inner[2], y], outline=colour, width=thin)
-        elif kind == 6:  # a cross: a cupboard, a shaft
-            image.line([rectangle[0], rectangle[1], rectangle[2], rectangle[3]], fill=colour, width=thin)
-            image.line([rectangle[0], rectangle[3], rectangle[2], rectangle[1]], fill=colour, width=thin)
-        else:  # a hob or chairs about a table
-            r = 0.16 * float(size.min())
-            for x in (rectangle[0], rectangle[2]):
-                for y in (rectangle[1], rectangle[3]):
-                    cx, cy = x + (2 * r if x == rectangle[0] else -2 * r), y + (2 * r if y == rectangle[1] else -2 * r)
-                    image.ellipse([cx - r, cy - r, cx + r, cy + r], outline=colour, width=thin)
-
-
 def format_area(area: float, width: float, depth: float, style: str) -> list[str]:
     """Format what a hand writes of the size of a room: lines of text."""
     metric, size = f"{area:.1f} m²", f"{width:.2f} x {depth:.2f} m"
@@ -547,103 +273,3 @@ def _draw_dimensions(sheet: Sheet, shapes: DrawingShapes, hand: Hand, rng: np.ra
                 column, row = sheet.place((stop + chain[k + 1]) / 2)[0]
                 at = column, row - 0.25 * sheet.scale
                 sheet.write(f"{stops[k + 1] - stops[k]:.2f}", at, 0.22 * sheet.scale, hand.font, hand.ink)
-
-
-def spoil_page(drawing: Drawing, rng: np.random.Generator) -> Drawing:
-    """Return the page as a scanner or camera saw it: turned, warped, in perspective, shaded, blurred, noisy, compressed."""
-    picture, classes, rooms = Image.fromarray(drawing.picture), Image.fromarray(drawing.classes), drawing.rooms
-    label = Image.fromarray((rooms + 1).astype(np.int32), "I")
-    h, w = classes.size[1], classes.size[0]
-    paper = tuple(int(v) for v in np.median(drawing.picture[::7, ::7].reshape(-1, 3), axis=0))
-    if rng.random() < 0.3:  # a table under the page
-        paper = tuple(int(v) for v in rng.integers(0, 220, 3))
-    if rng.random() < 0.35:
-        matrix = _sample_camera(h, w, rng)
-        picture = picture.transform((w, h), Image.Transform.PERSPECTIVE, matrix, Image.Resampling.BILINEAR, fillcolor=paper)
-        classes = classes.transform((w, h), Image.Transform.PERSPECTIVE, matrix, Image.Resampling.NEAREST, fillcolor=PAGE)
-        label = label.transform((w, h), Image.Transform.PERSPECTIVE, matrix, Image.Resampling.NEAREST, fillcolor=0)
-    pixels, truth, numbers = np.asarray(picture, np.float32), np.asarray(classes), np.asarray(label).astype(np.int16) - 1
-    if rng.random() < 0.25:  # a shaky hand, or paper that is not flat
-        pixels, truth, numbers = _warp(pixels, truth, numbers, rng)
-    turn = int(rng.integers(4))
-    pixels, truth, numbers = (np.rot90(a, turn) for a in (pixels, truth, numbers))
-    return Drawing(spoil_light(pixels, rng), np.ascontiguousarray(truth), np.ascontiguousarray(numbers), (), drawing.scale)
-
-
-def _sample_camera(h: int, w: int, rng: np.random.Generator) -> Sequence[float]:
-    """Coefficients of Pillow's perspective: corners moved a little, and turned."""
-    corners = np.array([[0, 0], [w, 0], [w, h], [0, h]], float)
-    angle = rng.normal(0, 0.06)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    moved = (corners - [w / 2, h / 2]) @ turn.T * rng.uniform(0.9, 1.1) + [w / 2, h / 2]
-    if rng.random() < 0.4:
-        moved += rng.normal(0, 0.04, (4, 2)) * [w, h]
-    rows = []
-    for (x, y), (u, v) in zip(corners, moved, strict=True):
-        rows += [[x, y, 1, 0, 0, 0, -u * x, -u * y], [0, 0, 0, x, y, 1, -v * x, -v * y]]
-    return [float(v) for v in np.linalg.lstsq(np.array(rows), moved.ravel(), rcond=None)[0]]
-
-
-def _warp(pixels: Array, truth: Array, numbers: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    coarse = max(int(rng.integers(6, 40)), 4)
-    by = [
-        ndimage.zoom(
-            rng.normal(0, rng.uniform(0.5, 2.0), (coarse, coarse)), (truth.shape[0] / coarse, truth.shape[1] / coarse), order=1
-        )
-        for _ in range(2)
-    ]
-    h, w = truth.shape
-    at = np.indices(truth.shape) + np.stack([b[:h, :w] for b in by])
-    i, j = (np.clip(np.rint(a), 0, n - 1).astype(int) for a, n in zip(at, truth.shape, strict=True))
-    return pixels[i, j], truth[i, j], numbers[i, j]
-
-
-def spoil_light(pixels: Array, rng: np.random.Generator) -> Array:
-    """Return (h, w, 3) uint8 pixels after light, lens, sensor and compression."""
-    h, w = pixels.shape[:2]
-    out: Array = np.array(pixels, np.float32)
-    if rng.random() < 0.3:
-        out = out.mean(axis=2, keepdims=True).repeat(3, axis=2)
-    if rng.random() < 0.25:  # shade and folds
-        field = ndimage.zoom(rng.uniform(0.55, 1.0, (4, 4)), (h / 4 + 0.01, w / 4 + 0.01), order=1)[:h, :w]
-        out *= field[:, :, None]
-        if rng.random() < 0.4:
-            out[:, int(rng.integers(w))] *= rng.uniform(0.6, 1.2)
-    if rng.random() < 0.3:
-        out = (out - 128) * rng.uniform(0.45, 1.0) + 128 + rng.uniform(-30, 30)
-    if rng.random() < 0.06:  # a blueprint
-        out = 255 - out
-        if rng.random() < 0.6:
-            out = 0.75 * out + 0.25 * rng.uniform(0, 255, 3)
-    image = Image.fromarray(out.clip(0, 255).astype(np.uint8))
-    if rng.random() < 0.4:
-        image = image.filter(ImageFilter.GaussianBlur(float(rng.uniform(0.3, 1.6))))
-    if rng.random() < 0.3:  # saved smaller and enlarged
-        share = rng.uniform(0.4, 0.9)
-        image = image.resize((int(w * share), int(h * share)), Image.Resampling.BILINEAR).resize(
-            (w, h), Image.Resampling.BILINEAR
-        )
-    if rng.random() < 0.4:
-        stream = BytesIO()
-        image.save(stream, "JPEG", quality=int(rng.integers(15, 90)))
-        image = Image.open(stream).convert("RGB")
-    out = np.asarray(image, np.float32)
-    if rng.random() < 0.3:
-        out = out + rng.normal(0, rng.uniform(2, 14), out.shape)
-    return out.clip(0, 255).astype(np.uint8)
-
-
-def sample_drawing(shapes: Sequence[DrawingShapes], rng: np.random.Generator, side: int = 256, spoilt: bool = True) -> Drawing:
-    """Draw a window of one of the plans in a hand at random: what the network of drawings learns from."""
-    one = shapes[int(rng.integers(len(shapes)))]
-    one = mirror_shapes(one) if rng.random() < 0.5 else one
-    points = np.concatenate([r.polygon for r in one.rooms])
-    low, high = points.min(axis=0), points.max(axis=0)
-    extent = float(np.ptp(points, axis=0).max())
-    fit = side / (extent + 4)
-    scale = float(np.clip(fit * np.exp(rng.uniform(-0.3, 1.4)), *SCALES))
-    window = side / scale
-    centre = rng.uniform(low - 1.0, high + 1.0) if rng.random() < 0.6 else (low + high) / 2
-    corner = centre - window / 2
-    drawing = draw_plan(one, choose_hand(rng), rng, (side, side), scale, corner)
-    return spoil_page(drawing, rng) if spoilt else drawing

@@ -12,6 +12,7 @@ import pytest
 
 from tests.cli.processes import Run
 from tests.io.scene_graphs import write_scene_graph
+from tests.scenes import two_rooms
 from tests.scenes_map import building, same
 from topomerge.cli.landmarks import match_values
 from topomerge.fusion.atlas.store import add
@@ -167,3 +168,13 @@ def test_merge_and_extract_read_the_table_beside_their_input(marked: Run) -> Non
     save_map(building(2, 1), "b.tmap")
     status, _, err = marked("merge", "a.tmap", "b.tmap", "-o", "out")
     assert status == 1 and "a.landmarks.csv, line 2: kind must be one of" in err
+
+
+def test_a_scan_and_the_table_beside_it_become_a_map(run: Run) -> None:
+    np.save("scan.npy", two_rooms().points())
+    Path("scan.landmarks.csv").write_text("kind,value,x,y,z\ntext,101,1,1,1.5\nobject,sofa,1,1,0.4\n")
+    assert run("extract", "scan.npy", "-o", "s.tmap", "-q") == (0, "", "")
+    (sign, sofa), out = table("s.tmap"), run("info", "s.tmap")[1]
+    assert (sign[:2], sofa[:2], sign[3], sofa[3]) == (("text", "101"), ("object", "sofa"), 0, 0) and sofa[2] >= 0
+    assert "2 landmarks (1 text, 1 object); " in out.splitlines()[0]
+    assert run("embed", "scan.npy", "--descriptor", "engineered", "-o", "a.npy", "-q")[0] == 0

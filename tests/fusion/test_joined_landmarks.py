@@ -11,12 +11,16 @@ import pytest
 
 from tests.fusion.atlas.atlas_scenes import office_map, truth
 from topomerge.extraction.landmarks import add_landmarks
+from topomerge.fusion.atlas.store import add, remove, select_tile
 from topomerge.fusion.fuse import find_joined_rooms, fuse
+from topomerge.fusion.pipeline import merge
 from topomerge.fusion.result import MergeResult, serialise_merge
 from topomerge.fusion.transfer import LANDMARK_PARAMETER, vote_rooms
 from topomerge.io.maps import load_map, save_map
-from topomerge.landmarks.fuse import CONTRADICTING
+from topomerge.landmarks.fuse import CONTRADICTING, describe_listed
 from topomerge.types import Landmarks, Sim3, TopometricMap, build_landmarks, join_landmarks
+from topomerge.viz.atlas_report import render_atlas_html
+from topomerge.viz.merge_report import render_merge_html
 
 Halves = tuple[TopometricMap, TopometricMap]
 
@@ -117,3 +121,47 @@ def test_most_floor_says_which_room_it_is() -> None:
     part, joined = np.array([0, 0, 0, 1, 1, 1, 2, 4]), np.array([5, 5, 3, 3, 7, -1, -1, 0])
     assert vote_rooms(part, joined, 5).tolist() == [5, 3, -1, -1, 0]  # of two with as much floor the first
     assert vote_rooms(part[:0], joined[:0], 2).tolist() == [-1, -1]
+
+
+@pytest.mark.longer
+def test_an_atlas_tells_contradictions_and_lists_what_became_of_landmarks(halves: Halves, tmp_path: Path) -> None:
+    west, east = halves
+    door = common_door(west, east)
+    west = add_landmarks(west, build_landmarks("tag", ["t:1"], "w", door[None]))
+    east = add_landmarks(east, build_landmarks("tag", ["t:1"], "e", in_east(door + (3, 0, 0))))
+    result = merge([west, east, office_map(1)])
+    assert [w for w in result.warnings if w.startswith(f"{CONTRADICTING}: tag t:1 is 3.0 m apart")]
+    assert "tag t:1 is 3.0 m apart" in render_merge_html(result)
+    folder = tmp_path / "site"
+    names = [("west", west), ("east", east), ("middle", office_map(1))]
+    atlas = add(folder, names, render_atlas_html)
+    assert any("tag t:1 is 3.0 m apart in west and east" in w for w in atlas.warnings)
+    listing = json.loads((folder / "atlas.json").read_text())
+    (component,) = listing["components"]
+    assert component["landmarks"]["contradicting"] == 1
+    component["landmarks"] = {"maps": "damaged"}  # a stranger's
+    (folder / "atlas.json").write_text(json.dumps(listing))
+    again = remove(folder, [], render_atlas_html)
+    assert not [w for w in again.warnings if CONTRADICTING in w]
+
+
+def test_a_tile_shows_its_own_landmarks(halves: Halves) -> None:
+    map = add_landmarks(halves[0], build_landmarks("name", ["a", "b", "c"], "w", room=[0, 1, -1]))
+    assert select_tile(map, [1]).landmarks.get_values().tolist() == ["b"]
+
+
+def test_a_damaged_summary_says_nothing() -> None:
+    good = {"maps": [1, 1], "joined": 2, "fused": 0, "contradicting": 1}
+    listed = good | {"contradictions": [{"what": "number", "values": ["1", "2"], "maps": [0, 1], "room": 3, "apart_m": None}]}
+    assert describe_listed(listed, "ab") == f"{CONTRADICTING}: room 3 is 1 in a and 2 in b"
+    for bad in (
+        3,
+        None,
+        [],
+        {},
+        good | {"contradictions": [{}]},
+        good | {"contradictions": [3]},
+        listed | {"contradicting": "x"},
+    ):
+        assert describe_listed(bad, "ab") == ""
+    assert describe_listed(listed, "a") == ""

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 from scipy import ndimage
-from topomerge.datasets.drawings.hands import Hand, draw_plan, spoil_page
+from topomerge.datasets.drawings.hands import draw_plan
+from topomerge.datasets.drawings.pages import spoil_page
 from topomerge.datasets.drawings.shapes import DrawingShapes, OpeningShape, RoomShape
+from topomerge.datasets.drawings.sheet import Hand
 
 from topomerge.io.drawing import (
     PictureText,

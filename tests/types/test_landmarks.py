@@ -3,7 +3,18 @@
 import numpy as np
 import pytest
 
-from topomerge.types import LANDMARK_DTYPE, LANDMARK_KINDS, Landmarks, Sim3, build_landmarks, join_landmarks, move_landmarks
+from topomerge.types import (
+    LANDMARK_DTYPE,
+    LANDMARK_KINDS,
+    Landmarks,
+    Sim3,
+    build_landmarks,
+    clean_landmarks,
+    find_room_names,
+    join_landmarks,
+    move_landmarks,
+    transform_landmarks,
+)
 
 
 def signs(*texts, source="a.csv", **columns):
@@ -49,3 +60,27 @@ def test_tables_that_do_not_hold_together_are_refused(column, value):
         Landmarks(np.zeros(1, [(n, LANDMARK_DTYPE[n]) for n in ("kind", "value")]))
     with pytest.raises(ValueError, match="smell"):
         build_landmarks("smell", ["x"], "nose")
+
+
+def test_rooms_are_called_by_their_surest_name_or_number():
+    names = build_landmarks("name", ["Lab", "Hall", "?"], "x", room=[0, 0, 5], confidence=[0.4, 0.9, 1.0])
+    texts = build_landmarks("text", ["2.1", "EXIT", "2.2", "2.3"], "x", room=[0, 1, 2, 2], confidence=[1.0, 1.0, 0.5, 0.6])
+    assert find_room_names(join_landmarks([texts, names]), 4) == ["Hall", "", "2.3", ""]
+    assert find_room_names(Landmarks(), 2) == ["", ""] and find_room_names(names, 0) == []
+
+
+def test_positions_that_are_not_known_are_not_carried():
+    at = np.array([[1.0, 2, 3], [np.nan] * 3])
+    moved = transform_landmarks(
+        build_landmarks("text", ["a", "b"], "x", at, number=[3.0, np.nan], sigma=0.5), lambda p: p + 1, 1.0, 2.0
+    )
+    assert moved.table["position"][0].tolist() == [2, 3, 4] and np.isnan(moved.table["position"][1]).all()
+    assert moved.table["number"][0] == pytest.approx(4.0 - 2 * np.pi) and moved.table["sigma"].tolist() == [1, 1]
+
+
+def test_cleaned_landmarks_are_left_alone_where_they_are_clean():
+    clean = build_landmarks("text", ["2.1", "Küche"], "x", np.ones((2, 3)), sigma=0.5, room=[0, 1])
+    again = clean_landmarks(clean)
+    assert again.table.tobytes() == clean.table.tobytes() and (again.values, again.sources) == (clean.values, clean.sources)
+    assert len(clean_landmarks(build_landmarks("text", [" ", ""], "x"))) == 0
+    assert len(clean_landmarks(build_landmarks("pressure", [""], "x", number=1000.0))) == 1

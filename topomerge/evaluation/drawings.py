@@ -18,8 +18,10 @@ from scipy import ndimage
 
 from topomerge.code_digest import compute_code_digest
 from topomerge.datasets.core.building import find_physical_building
-from topomerge.datasets.drawings.hands import Drawing, choose_hand, draw_plan, spoil_page
+from topomerge.datasets.drawings.hands import draw_plan
+from topomerge.datasets.drawings.pages import spoil_page
 from topomerge.datasets.drawings.shapes import DrawingRecipe, DrawingShapes, build_drawing_shapes
+from topomerge.datasets.drawings.sheet import Drawing, choose_hand
 from topomerge.evaluation.documents import group_rows, write_mean, write_share, write_table
 from topomerge.evaluation.tasks import Row, TaskSettings, find_optional_data, limit_cases, measure_missing
 from topomerge.extraction.extract import extract

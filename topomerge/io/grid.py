@@ -229,14 +229,12 @@ def read_drawing(path: Path, resolution: float | None, text: bool | None = None)
     """Read the walls and the floor of a drawing on a page, the plan whose pixels they are, and the names of rooms on it.
 
     Args:
-        resolution: m a pixel; None: by what is written on it, or by its doors.
-        text: read what is written on it, as of `ReadOptions`.
+        resolution: m a pixel; None: by what is written on it, or by its doors. text: as of `ReadOptions`.
 
     Raises:
         InputError: it shows no room, or nothing says how large it is.
     """
-    picture = read_picture(path)
-    drawing = parse_drawing(picture, resolution)
+    drawing = parse_drawing(picture := read_picture(path), resolution)
     if not drawing.free.any():
         raise InputError(f"{path}: no walls around a room were found in it; if it is a robot's grid, give --no-drawing")
     found = read_texts(picture) if text is not False else ()

@@ -274,10 +274,9 @@ def _find_landmarks(model: Any, rooms: tuple[TrueRoom, ...], source: str) -> Lan
             if not UNNAMED_SPACE.fullmatch(name.strip()):
                 at = (inside.x, inside.y, min(room.floor + NAME_HEIGHT, room.ceiling))
                 rows.append({"kind": "name", "value": name, "position": at})
-    scale = calculate_unit_scale(model)
     for note in model.by_type("IfcAnnotation"):
         if note.ObjectType in LANDMARK_KINDS and note.Name and note.ObjectPlacement is not None:
-            place = scale * np.asarray(get_local_placement(note.ObjectPlacement), float)[:3, 3]
+            place = calculate_unit_scale(model) * np.asarray(get_local_placement(note.ObjectPlacement), float)[:3, 3]
             rows.append({"kind": note.ObjectType, "value": str(note.Name), "position": place.tolist()})
     return parse_landmarks(rows, source)
 

@@ -50,29 +50,28 @@ def iter_pieces(path: Path, graph: Mapping[str, Any], options: ReadOptions) -> I
 
 
 def find_graph_landmarks(path: Path, graph: Mapping[str, Any]) -> Landmarks:
-    """Find the objects and the names of rooms of a scene graph; a number of a class is told by the graph's own list of them.
-
-    Raises:
-        InputError: a node is none.
-    """
-    rows = []
-    try:
-        spaces = (graph.get("metadata") or {}).get("labelspaces") or {}
-        classes = {layer: dict(spaces.get(f"_l{layer}p0") or []) for layer in (OBJECT_LAYER, ROOM_LAYER)}
-        for node in graph["nodes"]:
-            layer, about = node["layer"], node["attributes"]
-            if layer not in classes or node.get("partition", 0) != 0:
-                continue
-            name = str(about.get("name") or "")
-            if UNNAMED_NODE.fullmatch(name):
-                name = str(classes[layer].get(about.get("semantic_label")) or "")
-            kind = (about.get("metadata") or {}).get("kind") if layer == OBJECT_LAYER else "name"
-            if name.strip():
-                kind = kind if kind in LANDMARK_KINDS else "object"
-                rows.append({"kind": kind, "value": name, "position": [float(v) for v in about["position"]][:3]})
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise build_damage_error(path, GRAPH_KIND, f"node {len(rows)}: {error}") from error
+    """Find the objects and the names of rooms of a scene graph; its own list tells the classes that numbers stand for. Nodes
+    that say nothing of the kind are passed over."""
+    rows = [row for node in graph["nodes"] if (row := _read_node(node, graph)) is not None]
     return parse_landmarks(rows, path.name)
+
+
+def _read_node(node: Any, graph: Mapping[str, Any]) -> dict[str, Any] | None:
+    try:
+        layer, about = node["layer"], node["attributes"]
+        if layer not in (OBJECT_LAYER, ROOM_LAYER) or node.get("partition", 0) != 0:
+            return None
+        name, kind = str(about.get("name") or ""), "name"
+        if UNNAMED_NODE.fullmatch(name):
+            classes = graph["metadata"]["labelspaces"][f"_l{layer}p0"]
+            name = next(str(label) for number, label in classes if number == about["semantic_label"])
+        if layer == OBJECT_LAYER:
+            kind = (about.get("metadata") or {}).get("kind")
+            kind = kind if kind in LANDMARK_KINDS else "object"
+        x, y, z = (float(v) for v in about["position"])
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, StopIteration):
+        return None
+    return {"kind": kind, "value": name, "position": (x, y, z)}
 
 
 def _parse_table(path: Path, rows: Any, name: str) -> Array:

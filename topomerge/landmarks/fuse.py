@@ -63,6 +63,14 @@ class LandmarkSummary:
         return f"{CONTRADICTING}: {'; '.join(words)}" if words else ""
 
 
+def describe_listed(listed: Any, names: Sequence[str]) -> str:
+    """Describe the contradictions of a summary that stands in a file, which may be a stranger's; "" where it is none."""
+    try:
+        return LandmarkSummary(**listed).describe_contradictions(names)
+    except (TypeError, ValueError, KeyError, IndexError, AttributeError):
+        return ""
+
+
 def fuse_landmarks(parts: Sequence[Landmarks], joined: TopometricMap) -> tuple[Landmarks, LandmarkSummary]:
     """Fuse the landmarks of joined maps.
 

@@ -13,13 +13,15 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from topomerge.datasets.drawings.hands import sample_drawing
+from topomerge.datasets.drawings.pages import sample_drawing
 from topomerge.datasets.drawings.shapes import DrawingShapes, build_drawing_shapes
 from topomerge.errors import InputError
 from topomerge.models.convolutional import DrawingProbabilities, DrawingUNet
 from topomerge.networks.drawing import DRAWING_CLASSES, DRAWING_FILE, DRAWING_SIGNATURE
 from topomerge.networks.network import Run, load_network
 from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, prefetch_batches, run_network
+from topomerge.training.plan_segmentation import compute_log_loss
+from topomerge.training.processes import let_chief_first
 from topomerge.training.scan_settings import DrawingSegmentation
 from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
@@ -80,7 +82,8 @@ def fit(settings: DrawingSegmentation, log_line: LogFn) -> dict[str, float]:
     Raises:
         InputError: no plan to draw.
     """
-    shapes = build_drawing_shapes(settings.data, settings.cache, log_line)
+    with let_chief_first(settings):
+        shapes = build_drawing_shapes(settings.data, settings.cache, log_line)
     watched = draw_pages(build_drawing_shapes(settings.watched, settings.cache, log_line), settings, WATCHED)
     torch.manual_seed(derive_seed(settings.seed))
     stream = PageStream(shapes, settings.seed, TRAINED, settings.crop, settings.jobs)
@@ -132,7 +135,7 @@ class DrawingJob(ExportedJob):
                 self.drawn = start
             fresh = [next(self.pages) for _ in range(target - self.drawn)]
             self.drawn = target
-            rng = np.random.default_rng([options.seed, 4, state.epoch, step])
+            rng = self.start_generator(4, state.epoch, step)
             rows = rng.choice(options.pages, options.batch, replace=options.batch > options.pages)
             yield fresh, rows, int(rng.integers(4)), rng.uniform(1 - DARKER, 1, options.batch).astype(np.float32)
 
@@ -170,13 +173,15 @@ class DrawingJob(ExportedJob):
 
 
 def score_pages(pages: Sequence[Page], network: Run) -> dict[str, float]:
-    """Score pages: IoU of each class, their mean over the classes that there are, and the share of pixels that are right."""
+    """Score pages: IoU of each class, their mean over the classes that there are, the share of pixels that are right, and
+    their log loss."""
     count = len(DRAWING_CLASSES)
-    table = np.zeros((count, count), np.int64)
+    table, loss = np.zeros((count, count), np.int64), 0.0
     for picture, truth in pages:
         x = np.ascontiguousarray(picture.transpose(2, 0, 1)[None], np.float32) / np.float32(255)
         (probability,) = network(picture=x)
         prediction = np.asarray(probability[0]).argmax(axis=0)
+        loss += compute_log_loss(np.asarray(probability[0]).reshape(count, -1).T, truth.ravel())
         table += np.bincount(truth.ravel().astype(np.int64) * count + prediction.ravel(), minlength=count**2).reshape(
             count, count
         )
@@ -184,7 +189,8 @@ def score_pages(pages: Sequence[Page], network: Run) -> dict[str, float]:
     iou = right / np.maximum(true + predicted - right, 1)
     scores = {f"iou_{name}": float(value) for name, value in zip(DRAWING_CLASSES, iou, strict=True)}
     there = true > 0
-    return {**scores, "mean_iou": float(iou[there].mean()), "accuracy": float(right.sum() / max(table.sum(), 1))}
+    pixels = max(int(table.sum()), 1)
+    return {**scores, "mean_iou": float(iou[there].mean()), "accuracy": float(right.sum() / pixels), "loss": loss / pixels}
 
 
 def judge(settings: DrawingSegmentation, file: Path, log_line: LogFn) -> dict[str, Any]:
@@ -195,5 +201,5 @@ def judge(settings: DrawingSegmentation, file: Path, log_line: LogFn) -> dict[st
     return {**score_pages(pages, load_network(file, DRAWING_SIGNATURE)), "pages": len(pages)}
 
 
-SCORES = ("mean_iou", "accuracy", *(f"iou_{name}" for name in DRAWING_CLASSES))
-TASK = Task(DrawingSegmentation, fit, SCORES, judge, "topomerge.networks", DRAWING_FILE, hours=0.8)
+SCORES = ("mean_iou", "accuracy", "loss", *(f"iou_{name}" for name in DRAWING_CLASSES))
+TASK = Task(DrawingSegmentation, fit, SCORES, judge, "topomerge.networks", DRAWING_FILE, hours=0.8, lower=("loss",))

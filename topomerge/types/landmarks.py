@@ -171,11 +171,12 @@ def _clean_string(value: str) -> str:
 
 def find_room_names(landmarks: Landmarks, rooms: int) -> list[str]:
     """Return (rooms) the name of each room: the surest of its names, without any its surest sign with a digit; "" without."""
-    rank = np.select([landmarks.is_kind("name"), landmarks.is_kind("text")], [0, 1], 2)
-    rows = np.flatnonzero((landmarks.table["room"] >= 0) & (landmarks.table["room"] < rooms) & (rank < 2))
-    out = [""] * rooms
-    for row in rows[np.lexsort((rows, -landmarks.table["confidence"][rows], rank[rows]))].tolist():
-        room, value = int(landmarks.table["room"][row]), landmarks.values[landmarks.table["value"][row]]
-        if not out[room] and (rank[row] == 0 or any(c.isdigit() for c in value)):
-            out[room] = value
+    table, out = landmarks.table, [""] * rooms
+    digit = np.array([*(any(c.isdigit() for c in value) for value in landmarks.values), False], bool)[table["value"]]
+    rank = np.select([landmarks.is_kind("name"), landmarks.is_kind("text") & digit], [0, 1], 2)
+    rows = np.flatnonzero((table["room"] >= 0) & (table["room"] < rooms) & (rank < 2))
+    rows = rows[np.lexsort((rows, -table["confidence"][rows], rank[rows], table["room"][rows]))]
+    named, first = np.unique(table["room"][rows], return_index=True)
+    for room, value in zip(named.tolist(), table["value"][rows[first]].tolist(), strict=True):
+        out[room] = landmarks.values[value]
     return out

@@ -22,7 +22,7 @@ from topomerge.viz.report import (
     render_warnings,
 )
 from topomerge.viz.svg import lay_out
-from topomerge.viz.tables import Markup, build_element, join, render_rooms_table
+from topomerge.viz.tables import Markup, build_element, join, render_landmarks, render_rooms_table
 
 SEEN_BY_COLOURS = ("#9a9a9a", "#4a90d9", "#4fae74", "#d9a441")  # cells that were assumed, seen by one map, by two, by more
 SEEN_BY_NAMES = ("assumed", "seen by one map", "seen by two maps", "seen by three or more")
@@ -129,7 +129,8 @@ def _render_joined_map(result: AtlasResult, n: int, map: TopometricMap, in_space
     view = build_element(
         "div", render_plan_view(map, sheet, plans), render_scroller(render_rooms_table(map, prefix)), class_="beside"
     )
-    sections = [render_section(f"{_format_names(result, result.components[n])}: rooms extracted again", view, f"joined-{n}")]
+    parts = join([view, *render_landmarks(map, prefix)])
+    sections = [render_section(f"{_format_names(result, result.components[n])}: rooms extracted again", parts, f"joined-{n}")]
     if not in_space:
         return sections, {}
     return [*sections, _render_space(map)], {"scene-data": _build_scene(map, sheet.turn)}

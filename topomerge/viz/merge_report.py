@@ -6,6 +6,7 @@ import base64
 import io
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -203,7 +204,8 @@ def render_merge_html(result: MergeResult) -> str:
     if result.atlas is not None:
         names = " + ".join(m.title for m in result.maps)
         joined = {} if result.map is None else {result.atlas.find_component(0): result.map}
-        return render_atlas_html(result.atlas, joined, names, _render_deformations(result))
+        told = replace(result.atlas, warnings=result.warnings)
+        return render_atlas_html(told, joined, names, _render_deformations(result))
     a, b = result.maps
     registration = result.registration
     pose = registration.transform if registration else None

@@ -146,9 +146,10 @@ def list_room_landmarks(map: TopometricMap) -> list[list[str]]:
     found: list[dict[str, None]] = [{name: None} if name else {} for name in find_room_names(map.landmarks, len(map.rooms))]
     table = map.landmarks.table
     rows = np.flatnonzero(map.landmarks.is_kind(*SHOWN_KINDS) & (table["room"] >= 0))
-    for row in table[rows[np.argsort(-table["confidence"][rows], kind="stable")]]:
-        if len(found[row["room"]]) < MOST_OF_ROOM:
-            found[row["room"]][map.landmarks.values[row["value"]]] = None
+    rows = rows[np.argsort(-table["confidence"][rows], kind="stable")]
+    for room, value in zip(table["room"][rows].tolist(), table["value"][rows].tolist(), strict=True):
+        if len(found[room]) < MOST_OF_ROOM:
+            found[room][map.landmarks.values[value]] = None
     return [list(values) for values in found]
 
 

@@ -60,9 +60,11 @@ from topomerge.fusion.atlas.solve import (
     solve,
 )
 from topomerge.fusion.result import serialise_transform
+from topomerge.fusion.transfer import LANDMARK_PARAMETER
 from topomerge.io.listing import format_json
 from topomerge.io.maps import save_map
 from topomerge.io.rooms_ply import save_rooms_ply
+from topomerge.landmarks.fuse import describe_listed
 from topomerge.types import LEVELLED, Array, Sim3, TopometricMap, convert_pose_to_files, is_level
 
 TILE_CELLS = 1_000_000  # cells of a tile, at most, but for a single room
@@ -184,6 +186,7 @@ def select_tile(map: TopometricMap, rooms: Sequence[int] | Array) -> TopometricM
         edges=map.edges[mine[map.edges["rooms"]].any(axis=1)] if len(map.edges) else map.edges,
         narrows=map.narrows[mine[map.areas["room"][map.narrows["rooms"]]].any(axis=1)] if len(map.narrows) else map.narrows,
         windows=map.windows[mine[map.windows["rooms"][:, 0]]] if len(map.windows) else map.windows,
+        landmarks=map.landmarks.select(np.append(mine, False)[map.landmarks.table["room"]]),
         free=None,
     )
 
@@ -327,6 +330,8 @@ def change(
         atlas = atlas.transform_components({k: e.frame for k, e in enumerate(stored.entries) if e.frame != Sim3()})
         components = [serialise_component(atlas, stored, n) for n in range(len(atlas.components))]
         joined = _write_joined_maps(atlas, components, before, place)
+        told = [describe_listed(c[LANDMARK_PARAMETER], c["names"]) for c in components if LANDMARK_PARAMETER in c]
+        atlas = replace(atlas, warnings=(*atlas.warnings, *filter(None, told)))
         title = folder.resolve().name
         pages = _write_pages(atlas, components, before, place, title, partial(report, atlas, joined, title))
         listing = serialise_atlas(atlas, stored, components)
@@ -360,6 +365,8 @@ def _write_joined_maps(
             joined = atlas.join_component(n)
             save_map(joined, files[n])
             save_rooms_ply(joined, place / component["ply"])
+        listed = joined.parameters if old is None else old
+        component |= {LANDMARK_PARAMETER: listed[LANDMARK_PARAMETER]} if LANDMARK_PARAMETER in listed else {}
         count = len(split_into_tiles(joined)) if old is None else len(old.get("tiles", ()))
         if count > 1:
             component["tiles"] = [f"map_{n}_tile_{k}.html" for k in range(count)]

@@ -19,7 +19,7 @@ import numpy as np
 from topomerge.archive import replace_on_success
 from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.structure.floors import build_floor_polygons, compute_jambs, find_inside_point
-from topomerge.types import Array, TopometricMap
+from topomerge.types import Array, TopometricMap, find_room_names
 
 FRAME = "map"
 BAG_VERSION: Literal[8] = 8  # of rosbag2's metadata: Iron and later, read by Humble
@@ -68,7 +68,8 @@ def _iter_topics(map: TopometricMap, markers: _MarkerFactory) -> Iterator[tuple[
         [markers.build_marker("CUBE_LIST", at, points[map.navigable_room == at[1]], colours[at[1]], flat) for at in of_rooms],
     )
     label = partial(markers.build_marker, "TEXT_VIEW_FACING", points=np.zeros((0, 3)), colour=WHITE, scale=(0, 0, LETTERS))
-    yield "names", [label(at, text=str(at[1]), middle=middles[at[1]]) for at in of_rooms]
+    names = [f"{r} {name}".strip() for r, name in enumerate(find_room_names(map.landmarks, len(map.rooms)))]
+    yield "names", [label(at, text=names[at[1]], middle=middles[at[1]]) for at in of_rooms]
     doors, ways = [], []
     for k, edge in enumerate(map.edges):
         a, b = edge["rooms"].tolist()
