@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from topomerge.errors import InputError
+from topomerge.io.points import read_points
 from topomerge.io.radio_csv import read_radio_csv
 from topomerge.io.trajectory import Trajectory, read_trajectory
 
@@ -77,3 +78,16 @@ def test_files_that_are_none(tmp_path: Path, trajectory: Trajectory) -> None:
         == len(read_radio_csv(write(tmp_path, "t,mac,dbm\n"), trajectory))
         == 0
     )
+
+
+def test_a_table_beside_a_cloud_is_read_without_an_option(tmp_path: Path) -> None:
+    cloud = tmp_path / "a.xyz"
+    np.savetxt(cloud, np.random.default_rng(0).uniform(0, 5, (200, 3)))
+    assert read_points(cloud).landmarks is None or not len(read_points(cloud).landmarks)
+    (tmp_path / "a.radio.csv").write_text("5.0,aa:01,-60\n2.5,aa:02,-70\n")
+    with pytest.raises(InputError, match=r"a\.radio\.csv: has no trajectory; put a\.poses\.txt"):
+        read_points(cloud)
+    (tmp_path / "a.poses.txt").write_text(TUM)
+    found = read_points(cloud).landmarks
+    assert found is not None and found.get_values().tolist() == ["aa:02", "aa:01"] and found.is_kind("radio").all()
+    assert np.allclose(found.table["position"][:, 0], [5.0, 10.0])

@@ -22,6 +22,7 @@ from topomerge.types import LANDMARK_DTYPE, LANDMARK_KINDS, MOST_LANDMARKS, Arra
 COLUMNS = ("kind", "value", "x", "y", "z", "sigma", "room", "storey", "confidence", "number", "group", "time")
 WHOLE = ("room", "storey", "group")  # columns of whole numbers, -1 where nothing is known
 REAL = ("x", "y", "z", "sigma", "number", "time")  # columns of numbers, nan where nothing is known
+RADIO_TABLE = "radio.csv"  # `io.radio_csv`
 TABLE_NAME = "landmarks.csv"  # in a folder of scans; beside a file its stem and a dot stand before it
 LARGEST_TABLE = 1 << 28  # bytes: two million lines
 DELIMITERS = ",;\t"
@@ -29,8 +30,8 @@ MOST_WHOLE = 2**31 - 1
 
 
 def is_landmark_file(path: Path) -> bool:
-    """Return whether a file is a table of landmarks, by its name."""
-    return path.name == TABLE_NAME or path.name.endswith(f".{TABLE_NAME}")
+    """Return whether a file is a table of landmarks, or of readings of radio, by its name."""
+    return any(path.name == name or path.name.endswith(f".{name}") for name in (TABLE_NAME, RADIO_TABLE))
 
 
 def find_landmark_file(path: Path) -> Path | None:

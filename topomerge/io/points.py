@@ -26,6 +26,7 @@ from topomerge.io import frame
 from topomerge.io.frame import get_axis_rotation
 from topomerge.io.landmarks import find_landmark_file, read_landmark_file
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_options
+from topomerge.io.radio_csv import find_radio_file, read_radio_beside
 from topomerge.io.sightings import ObjectFinder
 from topomerge.types import (
     Array,
@@ -383,6 +384,8 @@ def read_chunks(
     pieces = _iter_pieces(path, file_format, reading)
     if (beside := find_landmark_file(path)) is not None:
         pieces = itertools.chain([Piece(np.empty((0, 3)), landmarks=read_landmark_file(beside))], pieces)
+    if (radio := find_radio_file(path)) is not None:
+        pieces = itertools.chain([Piece(np.empty((0, 3)), landmarks=read_radio_beside(radio, path, reading.poses))], pieces)
     return _iter_chunks(path, pieces, gatherer, progress)
 
 

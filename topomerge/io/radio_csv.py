@@ -13,9 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
+from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError
-from topomerge.io.piece import refuse_pointer
-from topomerge.io.trajectory import LONGEST_GAP, Trajectory
+from topomerge.io.landmarks import RADIO_TABLE
+from topomerge.io.trajectory import LONGEST_GAP, Trajectory, read_trajectory
 from topomerge.types import Landmarks, build_landmarks
 
 COLUMNS = {
@@ -23,10 +24,35 @@ COLUMNS = {
     "address": ("address", "bssid", "mac", "addr"),
     "dBm": ("dbm", "rssi", "level", "signal", "power"),
 }
+TRAJECTORIES = ("poses.txt", "traj_lidar.txt", "groundtruth.txt", "trajectory.txt", "poses_tum.txt")
 SAME_SCAN = 0.5  # s between readings of one scan
 POSSIBLE = (-130.0, 20.0)  # dBm
 POSE_GAP = 5.0  # s from the nearest pose, up to which a reading has a place
 POSITION_SIGMA = 0.5  # m
+
+
+def find_radio_file(path: Path) -> Path | None:
+    """Find the table of readings beside a file (`a.radio.csv`), or in a folder (`radio.csv`); None where there is none."""
+    place = path / RADIO_TABLE if path.is_dir() else path.with_name(f"{path.stem}.{RADIO_TABLE}")
+    return place if place.is_file() and place != path else None
+
+
+def read_radio_beside(table: Path, path: Path, poses: str | None = None) -> Landmarks:
+    """Read a table of readings beside a scan, with the trajectory that lies there.
+
+    Args:
+        path: the scan, or the folder of scans.
+        poses: the trajectory that the user names; else the first of `TRAJECTORIES` is taken.
+
+    Raises:
+        InputError: there is no trajectory, or as `read_radio_csv`.
+    """
+    stems = TRAJECTORIES if path.is_dir() else tuple(f"{path.stem}.{name}" for name in TRAJECTORIES) + TRAJECTORIES
+    places = [Path(poses)] if poses else [table.parent / name for name in stems]
+    trajectory = next((place for place in places if place.is_file()), None)
+    if trajectory is None:
+        raise InputError(f"{table}: has no trajectory; put {stems[0]} (time tx ty tz qx qy qz qw) beside it, or take it away")
+    return read_radio_csv(table, read_trajectory(trajectory))
 
 
 def read_radio_csv(path: Path, trajectory: Trajectory) -> Landmarks:

@@ -91,6 +91,7 @@ def collect_radio_scans(landmarks: Landmarks, placed: bool = True, most: int = M
     table = landmarks.table[landmarks.is_kind("radio")]
     good = (table["number"] > POSSIBLE[0]) & (table["number"] < POSSIBLE[1])
     good &= np.isfinite(table["position"][:, :2]).all(axis=1) | (not placed)
+    good &= landmarks.get_values()[landmarks.is_kind("radio")] != ""  # RTAB-Map knows no addresses
     table = table[good]
     names: dict[str, int] = {}
     column = np.array([names.setdefault(v.strip().lower(), len(names)) for v in landmarks.values], np.int64)
