@@ -119,7 +119,9 @@ def same(a: TopometricMap, b: TopometricMap) -> bool:
     arrays += [(a.rooms, b.rooms), (a.storeys, b.storeys)]
     if a.provenance is not None and b.provenance is not None:
         arrays.append((a.provenance, b.provenance))
+    arrays += [(a.landmarks.table, b.landmarks.table)]
     words = [repr((m.source, dict(m.parameters), list(m.seconds.items()), m.warnings)) for m in (a, b)]
+    words = [f"{said} {m.landmarks.values} {m.landmarks.sources}" for said, m in zip(words, (a, b), strict=True)]
     return (
         all(_same_grid(x, y) for x, y in grids)
         and all(x.dtype == y.dtype and x.tobytes() == y.tobytes() for x, y in arrays)

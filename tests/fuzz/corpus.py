@@ -115,7 +115,17 @@ def read_own_pairs(path: Path) -> int:
     return len(read_pairs_file(path).pairs)
 
 
+def read_landmarks(path: Path) -> int:
+    """Read landmarks of a table, GeoJSON or IndoorGML."""
+    from topomerge.io.room_names import load_landmark_source
+
+    return len(load_landmark_source(path))
+
+
 READERS: dict[str, Callable[[Path], int]] = {  # by name or suffix; all others are clouds
+    "a.landmarks.csv": read_landmarks,
+    "rooms.geojson": read_landmarks,
+    "rooms.gml": read_landmarks,
     "plan.xml": read_plans,
     "plan.building.yaml": read_plans,
     "plan.vectormap.json": read_plans,
@@ -140,8 +150,12 @@ def write_corpus(folder: Path) -> dict[str, Path]:
     """Name -> file, in a folder: those of `samples`, and pictures, a map and a folded scene."""
     from PIL import Image
 
+    from tests.io.test_landmark_files import some_landmarks
     from tests.types.test_deformation import deformation
+    from topomerge.extraction.landmarks import add_landmarks
     from topomerge.fusion.result import add_bends
+    from topomerge.io.exports import save_export
+    from topomerge.io.landmarks import format_landmark_table
     from topomerge.io.maps import save_map
     from topomerge.types import Placement, Sim3
 
@@ -156,7 +170,13 @@ def write_corpus(folder: Path) -> dict[str, Path]:
     found["text.pgm"].write_text("P2\n8 6\n255\n" + " ".join(str(v) for v in np.tile([0, 205, 254], 16)) + "\n")
     found["map.tmap"] = folder / "map.tmap"
     turn = deformation(np.tile([0.1, 0.0, 0.01, 0.0], (4, 1)))
-    save_map(add_bends(building(2, 2), {1: Placement(Sim3(0.3), turn)}, ["a.ply", "b.ply"]), found["map.tmap"])
+    marked = add_landmarks(building(2, 2), some_landmarks())
+    save_map(add_bends(marked, {1: Placement(Sim3(0.3), turn)}, ["a.ply", "b.ply"]), found["map.tmap"])
+    found["a.landmarks.csv"] = folder / "a.landmarks.csv"
+    found["a.landmarks.csv"].write_text(format_landmark_table(some_landmarks()))
+    for name, form in (("rooms.geojson", "geojson"), ("rooms.gml", "indoorgml")):
+        found[name] = folder / name
+        save_export(marked, form, found[name])
     found["plain.npz"] = folder / "plain.npz"
     np.savez(found["plain.npz"], points=samples.box_points(50), poses=np.eye(4)[None], pose_of=np.zeros(50, np.int32))
     found["pairs.yaml"] = folder / "pairs.yaml"

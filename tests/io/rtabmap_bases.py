@@ -18,7 +18,7 @@ from tests.io.rgbd import CAMERA, SHAPE
 
 OPTICAL = np.array([[0.0, 0, 1, 0.1], [-1, 0, 0, 0], [0, -1, 0, 0.3], [0, 0, 0, 1]])  # a camera on a robot: z of it is ahead
 LASER = np.array([[1.0, 0, 0, 0.05], [0, 1, 0, 0], [0, 0, 1, 0.2], [0, 0, 0, 1]])
-TYPES = {"u1": 0, "i4": 4, "f4": 5}  # of OpenCV
+TYPES = {"u1": 0, "i4": 4, "f4": 5, "f8": 6}  # of OpenCV
 XY, XYZ, XYZI, XYZRGB = 1, 5, 6, 7  # formats of a scan
 
 
@@ -33,6 +33,10 @@ class Node:
     scan: bytes | None = None
     scan_info: bytes | None = None
     map: int = 0
+    label: str | None = None
+    sensors: Sequence[tuple[float, float, float]] = ()  # kind, value, time
+    user_data: bytes | None = None
+    tags: Sequence[tuple[int, np.ndarray]] = ()  # number and pose on the robot
 
 
 def pose_bytes(pose: np.ndarray) -> bytes:
@@ -88,33 +92,49 @@ def numbers(version: str) -> tuple[int, ...]:
 
 
 def write_rtabmap(
-    path: Path, nodes: Sequence[Node], version: str = "0.23.0", optimised: Sequence[np.ndarray | None] = ()
+    path: Path,
+    nodes: Sequence[Node],
+    version: str = "0.23.0",
+    optimised: Sequence[np.ndarray | None] = (),
+    tag: tuple[int, np.ndarray] = (5, np.eye(4)),
+    parameters: str = "",
 ) -> Path:
     """A database of nodes 1, 2, …
 
     Args:
         optimised: poses of the first nodes (None: not in the graph); with them comes one of a landmark.
+        tag: number and pose of that.
+        parameters: of RTAB-Map, as it stores them.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)
     later = numbers(version) >= (0, 17)
     confidence = "depth_confidence BLOB, " if numbers(version) >= (0, 22) else ""
     with closing(sqlite3.connect(path)) as base:
-        columns = "map_id INTEGER NOT NULL, weight INTEGER, stamp FLOAT, pose BLOB"
+        columns = "map_id INTEGER NOT NULL, weight INTEGER, stamp FLOAT, pose BLOB, label TEXT, env_sensors BLOB"
         base.execute(f"CREATE TABLE Node (id INTEGER NOT NULL, {columns}, PRIMARY KEY (id))")
-        columns = f"image BLOB, depth BLOB, {confidence}calibration BLOB, scan BLOB, scan_info BLOB"
+        columns = f"image BLOB, depth BLOB, {confidence}calibration BLOB, scan BLOB, scan_info BLOB, user_data BLOB"
         base.execute(f"CREATE TABLE Data (id INTEGER NOT NULL, {columns}, PRIMARY KEY (id))")
         base.execute(f"CREATE TABLE Admin (version TEXT{', opt_ids BLOB, opt_poses BLOB' if later else ''})")
+        columns = "to_id INTEGER NOT NULL, type INTEGER NOT NULL, information_matrix BLOB NOT NULL, transform BLOB"
+        base.execute(f"CREATE TABLE Link (from_id INTEGER NOT NULL, {columns})")
+        base.execute("CREATE TABLE Info (parameters TEXT)")
+        base.execute("INSERT INTO Info VALUES (?)", (parameters,))
         base.execute("CREATE UNIQUE INDEX IDX_Node_id on Node (id)")
         base.execute("INSERT INTO Admin(version) VALUES (?)", (version,))
         for number, node in enumerate(nodes, 1):
-            base.execute("INSERT INTO Node VALUES (?, ?, 0, ?, ?)", (number, node.map, 100.0 + number, pose_bytes(node.pose)))
-            values = (number, node.image, node.depth, node.calibration, node.scan, node.scan_info)
-            base.execute("INSERT INTO Data(id, image, depth, calibration, scan, scan_info) VALUES (?, ?, ?, ?, ?, ?)", values)
+            sensors = np.array(node.sensors, "<f8").tobytes() or None
+            values = (number, node.map, 0, 100.0 + number, pose_bytes(node.pose), node.label, sensors)
+            base.execute("INSERT INTO Node VALUES (?, ?, ?, ?, ?, ?, ?)", values)
+            cells = (number, node.image, node.depth, node.calibration, node.scan, node.scan_info, node.user_data)
+            names = "id, image, depth, calibration, scan, scan_info, user_data"
+            base.execute(f"INSERT INTO Data({names}) VALUES (?, ?, ?, ?, ?, ?, ?)", cells)
+            for seen, pose in node.tags:
+                base.execute("INSERT INTO Link VALUES (?, ?, 8, ?, ?)", (number, -seen, packed(np.eye(6)), pose_bytes(pose)))
         present = [(number, pose) for number, pose in enumerate(optimised, 1) if pose is not None]
         if present:
-            ids = np.array([[-5, *(n for n, _ in present)]], "<i4")
-            poses = np.concatenate([np.eye(4)[:3].ravel(), *(p[:3].ravel() for _, p in present)])[None].astype("<f4")
+            ids = np.array([[-tag[0], *(n for n, _ in present)]], "<i4")
+            poses = np.concatenate([tag[1][:3].ravel(), *(p[:3].ravel() for _, p in present)])[None].astype("<f4")
             base.execute("UPDATE Admin SET opt_ids = ?, opt_poses = ?", (packed(ids), packed(poses)))
         base.commit()
     return path

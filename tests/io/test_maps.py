@@ -64,7 +64,7 @@ def test_same_map_same_bytes(scene: TopometricMap, saved: Path, tmp_path: Path) 
 
 def test_numpy_opens_it_and_it_is_small(scene: TopometricMap, saved: Path) -> None:
     with np.load(saved, allow_pickle=False) as arrays:
-        assert int(arrays["format"]) == 2
+        assert int(arrays["format"]) == 3
         assert json.loads(arrays["about"].item())["source"] == "building.ply"
         assert (np.cumsum(arrays["grid_cells"], dtype=np.uint64) == scene.grid.codes).all()
     assert saved.stat().st_size < 0.1 * scene.grid.cells.nbytes

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import html
 import json
 import re
 import subprocess
@@ -21,7 +22,8 @@ from tests.viz.chromium import browser
 from tests.viz.test_figures import without_rooms
 from topomerge.cli.main import main
 from topomerge.errors import InputError
-from topomerge.types import AREA_DTYPE, EDGE_DTYPE, TopometricMap, VoxelGrid
+from topomerge.extraction.landmarks import add_landmarks
+from topomerge.types import AREA_DTYPE, EDGE_DTYPE, TopometricMap, VoxelGrid, build_landmarks, join_landmarks
 from topomerge.viz.plan import build_scene_data
 from topomerge.viz.report import render_report_html, save_report
 from topomerge.viz.tables import build_element, embed_json, join
@@ -298,3 +300,92 @@ def test_without_webgl_words_stand_there(tmp_path: Path) -> None:
     text, console = browse(page, "--dump-dom", "--disable-3d-apis")
     assert 'data-state="missing"' in text and "does not offer" in text
     assert console == []
+
+
+# Landmarks ------------------------------------------------------------------------------------------------------------
+
+SIGN = "<script>document.title='run'</script>"
+
+
+def marked() -> TopometricMap:
+    """Two storeys with a sign that would run, a name, an object upstairs, and a tag that is known by its room alone."""
+    map = building(1, 2)
+    middle = map.rooms["centroid"]
+    parts = [
+        build_landmarks("text", [SIGN], EVIL, middle[:1]),
+        build_landmarks("name", ["Kitchen"], "by hand", room=1),
+        build_landmarks("object", ["Fire Hose"], "robot", middle[4:5]),
+        build_landmarks("tag", ["t:7"], "robot", room=2),
+        build_landmarks("radio", ["aa:bb"] * 3, "robot", middle[:3], number=-60.0),
+    ]
+    return add_landmarks(map, join_landmarks(parts))
+
+
+def test_landmarks_are_on_the_plan_and_in_the_tables() -> None:
+    text = render_report_html(marked())
+    page, plain = Page(text), Page(render_report_html(building(1, 2)))
+    marks = page.all("g", "landmark")
+    assert [(a["class"], a["data-room"]) for a in marks] == [("landmark text", "0"), ("landmark object", "4")]
+    words = {a["data-room"]: a["data-words"] for a in page.all("tr") if "data-room" in a and "data-words" in a}
+    assert words == {"0": f"0\n{SIGN.lower()}", "1": "1\nkitchen", "2": "2\nt:7", "3": "3", "4": "4\nfire hose", "5": "5"}
+    assert [a["data-words"] for a in page.all("tr") if "data-words" in a and "data-room" not in a] == [
+        SIGN.lower(), "kitchen", "fire hose", "t:7",
+    ]  # fmt: skip
+    assert "7 landmarks (1 text, 1 tag, 3 radio, 1 object, 1 name)" in text
+    assert len(page.all("script")) == len(plain.all("script")) == 2 and SIGN not in text and "&lt;script&gt;document" in text
+    assert [a.get("data-layer") for a in page.all("input") if a.get("data-layer")] == [
+        "labels",
+        "graph",
+        "doors",
+        "landmarks",
+        "all",
+    ]
+    assert not plain.all("g", "landmark") and not [a for a in plain.all("input") if "data-find" in a]
+    assert "data-words" not in render_report_html(building(1, 1)).replace("[data-words]", "")
+
+
+def test_very_many_landmarks_are_bounded() -> None:
+    map = building(1, 1)
+    many = build_landmarks("text", [f"sign {k}" for k in range(20_000)], "here", np.tile(map.rooms["centroid"][0], (20_000, 1)))
+    text = render_report_html(add_landmarks(map, many))
+    page = Page(text)
+    assert len(page.all("g", "landmark")) == 1000 and len(text) < len(render_report_html(map)) + 2e6
+    assert "20,000 landmarks (20,000 text), the surest 1000" in text
+
+
+FIND = """
+window.addEventListener("load", () => setTimeout(() => {
+  const input = document.querySelector("input[data-find]");
+  const there = (words) => [...document.querySelectorAll(words)].filter((one) => one.getClientRects().length);
+  const state = () => [
+    there("#plan tr[data-room]").map((row) => row.dataset.room).join(" "),
+    there(".plan .landmark").map((mark) => mark.dataset.words.slice(0, 4)).join(" "),
+    [...document.querySelectorAll(".sheet figure")].findIndex((figure) => !figure.hidden),
+  ];
+  document.querySelector('input[data-layer="all"]').click();
+  const seen = ["", "HOSE", "kitch", "<script>", "nothing"].map((words) => {
+    input.value = words;
+    input.dispatchEvent(new Event("input", { bubbles: true }));
+    return state();
+  });
+  input.value = "";
+  input.dispatchEvent(new Event("input", { bubbles: true }));
+  document.querySelector('input[data-layer="landmarks"]').click();
+  seen.push(there(".plan .landmark").length);
+  document.title = JSON.stringify(seen);
+}, 500));
+"""
+
+
+@pytest.mark.longer
+def test_landmarks_are_searched_shown_and_never_run(tmp_path: Path) -> None:
+    page = tmp_path / "a.html"
+    page.write_text(with_probe(render_report_html(marked()), FIND), encoding="utf-8")
+    text, console = browse(page, "--dump-dom")
+    assert console == []
+    title = re.search("<title>(.*?)</title>", text)
+    assert title
+    every, hose, kitchen, script, nothing, hidden = json.loads(html.unescape(title[1]))
+    assert every == ["0 1 2 3 4 5", "<scr", 0]
+    assert hose == ["4", "fire", 1], "upstairs, which is shown then"
+    assert kitchen == ["1", "", 0] and script == ["0", "<scr", 0] and nothing == ["", "", 0] and hidden == 0

@@ -28,6 +28,7 @@ from topomerge.cli.options import (
     CONTEXT_STEPS,
     DESCRIPTOR,
     ONE_FRAME,
+    TEXT,
     UNIT,
     UP,
     build_json_option,
@@ -53,21 +54,9 @@ def run_extract(args: argparse.Namespace) -> int:
         from topomerge.extraction.extract import extract
         from topomerge.io.points import read_chunks
 
-        reading = collect_given(
-            args,
-            "up",
-            "unit",
-            "scale",
-            "resolution",
-            "drawing",
-            "extrude",
-            "ceiling",
-            "spacing",
-            "doors",
-            "poses",
-            "topic",
-            "one_frame",
-        )
+        lengths = ("scale", "resolution", "extrude", "spacing")
+        others = ("up", "unit", "drawing", "ceiling", "doors", "poses", "topic", "one_frame", "text")
+        reading = collect_given(args, *lengths, *others)
         chunks = read_chunks(args.input, **reading, progress=bars.start_task("read"))
         choices = collect_given(args, "voxel_size", "preset")
         topomap = extract(chunks, **choices, name=args.input, progress=bars.start_task("extract"))
@@ -111,6 +100,7 @@ EXTRACT = Command(
         UP,
         UNIT,
         ONE_FRAME,
+        *TEXT,
         build_option("--scale", type=parse_positive, metavar="S", help="multiply coordinates by this (default 1)"),
         build_option("--resolution", type=parse_positive, metavar="R", help="m per pixel of a plain image of a floor plan"),
         build_option(

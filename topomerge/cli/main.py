@@ -41,6 +41,7 @@ from topomerge.cli.console import (
 from topomerge.cli.dataset import DATASET, FINETUNE
 from topomerge.cli.export import EXPORT
 from topomerge.cli.extract import EMBED, EXPORT_EMBEDDER, EXTRACT, INFO
+from topomerge.cli.landmarks import FIND, MARK
 from topomerge.cli.merge import MATCH, MERGE
 from topomerge.cli.options import build_output_option, build_quiet_option, collect_given, parse_whole_number
 from topomerge.errors import InputError, make_printable
@@ -203,6 +204,8 @@ VIEW = Command(
 COMMANDS = (
     EXTRACT,
     INFO,
+    MARK,
+    FIND,
     EMBED,
     MATCH,
     MERGE,
@@ -220,12 +223,13 @@ EXIT_STATUSES = """\
 exit status:
   0    done
   1    bad input or a wrong command line: one line on stderr says which file and why; no output is written
-  2    no trustworthy merge: the reason is printed and stands in merge.json; of finetune: it did not help
+  2    no trustworthy merge: the reason is printed and stands in merge.json; of finetune: it did not help;
+       of find: nothing was found
   130  interrupted
   141  what read the output went away (`| head`)
   143  terminated
 Set TOPOMERGE_DEBUG=1, or give -v twice, to see the traceback of a failure."""
-SIGNED_OPTIONS = ("--origin", "--up")  # their value may start with a dash
+SIGNED_OPTIONS = ("--origin", "--up", "--at")  # their value may start with a dash
 
 
 class _Parser(argparse.ArgumentParser):

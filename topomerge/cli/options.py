@@ -174,11 +174,21 @@ JOBS = build_option(
 CONTEXT_STEPS = build_option(
     "--k", type=parse_whole_number, default=0, metavar="K", help="steps of context around each room (default 0)"
 )
+TEXT = (
+    build_option("--no-text", dest="text", action="store_false", help="don't read signs and tags on the pictures of a recording"),
+    build_option(
+        "--text",
+        dest="text",
+        action="store_true",
+        help="read signs and tags on pictures, or fail (default: where topomerge[text] is installed)",
+    ),
+)
 CLOUD_OPTIONS = (
     build_option("--voxel-size", type=parse_positive, metavar="E", help="edge length of the cells of a cloud, m (default 0.1)"),
     UP,
     UNIT,
     ONE_FRAME,
+    *TEXT,
     build_option(
         "--sensor",
         choices=SENSORS,

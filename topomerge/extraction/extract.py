@@ -14,6 +14,7 @@ from topomerge.errors import InputError
 from topomerge.extraction.attributes import estimate_attributes
 from topomerge.extraction.elevations.doorways import StoreyWalls
 from topomerge.extraction.elevations.wall_doors import WALL_DOOR_FEATURES, build_door_candidates
+from topomerge.extraction.landmarks import add_landmarks
 from topomerge.extraction.navigable import add_crossed_cells, compute_navigable_volume, find_free_space
 from topomerge.extraction.parameters import DefaultParameters, Parameters, ThesisParameters, resolve_parameters
 from topomerge.extraction.plans.part_rooms import PartRooms
@@ -197,7 +198,7 @@ def extract(
     chosen = {**asdict(p), **floor.chosen_parameters, "voxel_size": scan.grid.edge}
     if scan.levelling is not None:
         chosen[LEVELLED] = scan.levelling.tolist()
-    return replace(
+    map = replace(
         map,
         free=free,
         source=scan.source if name is None else name,
@@ -205,6 +206,7 @@ def extract(
         seconds=watch.end(),
         warnings=(*scan.warnings, *doubts, *_list_warnings(map)),
     )
+    return add_landmarks(map, scan.landmarks)
 
 
 def read_navigable(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from topomerge.types import Array, PointCloud, VoxelGrid, transform_points
+from topomerge.types import Array, PointCloud, VoxelGrid, transform_landmarks, transform_points
 
 # Which way is up in a cloud: the normals of its floors and ceilings say so, and its walls are the witnesses (beyond the thesis).
 #
@@ -230,14 +231,15 @@ def build_rotation_about(middle: Array, rotation: Array) -> Array:
 
 
 def transform_cloud(cloud: PointCloud, matrix: Array) -> PointCloud:
-    """Move a cloud, its sensor's poses and its free cells by a rigid motion (4, 4). True rooms stay."""
+    """Move a cloud, its sensor's poses, free cells and landmarks by a rigid motion (4, 4). True rooms and headings stay."""
     points = np.empty(cloud.points.shape, cloud.points.dtype if cloud.points.dtype.kind == "f" else np.float32)
     for first in range(0, len(points), BLOCK):
         block = slice(first, first + BLOCK)
         points[block] = transform_points(matrix, cloud.points[block] + cloud.shift) - cloud.shift
     poses = None if cloud.poses is None else matrix @ np.asarray(cloud.poses, np.float64)
     free = None if cloud.free is None else transform_grid(cloud.free, matrix)
-    return replace(cloud, points=points, poses=poses, free=free)
+    landmarks = cloud.landmarks and transform_landmarks(cloud.landmarks, partial(transform_points, matrix))
+    return replace(cloud, points=points, poses=poses, free=free, landmarks=landmarks)
 
 
 def transform_grid(grid: VoxelGrid, matrix: Array) -> VoxelGrid:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from topomerge.errors import InputError
 from topomerge.extraction.cleaning import COARSEST_CELL, coarsen_until_dense
 from topomerge.extraction.levelling import LevelledChunks
 from topomerge.extraction.voxels import LatticeCells, voxelise
-from topomerge.types import Array, PointCloud, VoxelGrid
+from topomerge.types import Array, Landmarks, PointCloud, VoxelGrid, join_landmarks
 
 FINEST_CELL = 0.02  # m
 FINE_CELL = 0.05  # m: of the cells in which walls are looked at closely
@@ -39,6 +39,7 @@ class Scan:
         levelling: (4, 4) that took the points of a tilted cloud into the frame of the grid; None where it was level.
         raised: is it a robot's grid or a drawing, whose walls were all raised alike (`slices.is_raised`)?
         flat: is it a slice, in which nothing tells walls from what else stands about (`slices.is_slice`)?
+        landmarks: of its file, in the frame of the grid.
     """
 
     grid: VoxelGrid
@@ -51,6 +52,7 @@ class Scan:
     levelling: Array | None = None
     raised: bool = False
     flat: bool = False
+    landmarks: Landmarks = field(default_factory=Landmarks)
 
     @property
     def places(self) -> Array:
@@ -106,7 +108,8 @@ def read_scan(
         chunks.warnings.append("the scan is large: doors are read off its plan alone, not off its walls")
     if least_neighbours:
         grid = coarsen_until_dense(grid, least_neighbours, chunks.warnings)
-    scan = Scan(grid, close, chunks.rays, chunks.free, chunks.source, tuple(chunks.warnings))
+    landmarks = join_landmarks(chunks.landmarks)
+    scan = Scan(grid, close, chunks.rays, chunks.free, chunks.source, tuple(chunks.warnings), landmarks=landmarks)
     return scan if levelled is None else replace(scan, levelling=levelled.matrix, warnings=(*levelled.warnings, *scan.warnings))
 
 
@@ -138,6 +141,7 @@ class _Chunks:
         self.source = ""
         self.free: VoxelGrid | None = None
         self.warnings: list[str] = []
+        self.landmarks: list[Landmarks] = []
         self._rays: list[tuple[Array, Array]] = []
         self._step = 1  # of the rays, every one or every second, fourth ... is held
 
@@ -149,6 +153,7 @@ class _Chunks:
             self.source = chunk.source
             self.free = chunk.free or self.free
             self.warnings += [w for w in chunk.warnings if w not in self.warnings]
+            self.landmarks += [] if chunk.landmarks is None else [chunk.landmarks]
             if chunk.poses is not None and chunk.pose_of is not None and len(chunk):
                 self._add_rays(*_select_rays(chunk, chunk.poses, chunk.pose_of))
             if self.fine is not None:

@@ -26,12 +26,15 @@ from topomerge.extraction.plans.part_rooms import PartRooms
 from topomerge.extraction.scan import COARSEST_CELL, FINEST_CELL
 from topomerge.fusion.resampling import decode_cells, encode_cells, find_wall_copies, resample_cells, transform_means
 from topomerge.fusion.transfer import (
+    add_joined_landmarks,
     add_joined_windows,
     add_part_doors,
     add_part_odds,
     transform_floor,
     transform_part,
+    transform_part_landmarks,
     transform_windows,
+    vote_rooms,
 )
 from topomerge.kernels.voxels import OFFSET_STEPS
 from topomerge.matching.consistency import find_matches
@@ -74,16 +77,20 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
     cells = _JoinedCells(maps[poses[0][0]].grid.origin, _choose_edge(parts))
     order = sorted(range(len(poses)), key=lambda n: parts[n].assumed)  # what was assumed comes last
     placements = [Placement.of(pose, (bends or {}).get(k), maps[k].grid.edge) for k, pose in poses]
-    windows, laid = [], []
+    windows, laid, marks = [], [], {}
     for n in order:
         map = maps[poses[n][0]]
         cells.add_map(map, placements[n], int(first_bits[n]), parts[n].assumed and n != order[0])
         windows.append(transform_windows(map, placements[n]))
         laid.append(transform_part(map, placements[n]))
+        if len(map.landmarks):
+            marks[n] = transform_part_landmarks(map, placements[n], laid[-1].rooms)
     name = JOINED.join(maps[k].source or "map" for k, _ in poses)
     rooms = [part.rooms for part in laid]
     joined = _extract_joined(cells, min(part.neighbours for part in parts), name, rooms)
     joined = add_joined_windows(add_part_doors(add_part_odds(joined, rooms), laid), windows)
+    if marks:
+        joined = add_joined_landmarks(joined, marks, [maps[k].title for k, _ in poses])
     first = maps[poses[0][0]].levelling
     if not is_level(first):  # the frame of the joined map is that of the first one
         joined = replace(joined, parameters={**joined.parameters, LEVELLED: first.tolist()})
@@ -256,12 +263,5 @@ def find_joined_rooms(part: TopometricMap, joined: TopometricMap, pose: Sim3, be
         pose: of the part in the joined map.
         bend: of the part, in its own frame, before it is posed; None: rigid.
     """
-    rooms = np.full(len(part.rooms), -1, np.int64)
     floor, part_room = transform_floor(part, Placement.of(pose, bend))
-    joined_room = find_rooms_at(joined, floor)
-    for i in range(len(part.rooms)):
-        votes = joined_room[part_room == i]
-        votes = votes[votes >= 0]
-        if len(votes):
-            rooms[i] = np.bincount(votes).argmax()
-    return rooms
+    return vote_rooms(part_room, find_rooms_at(joined, floor), len(part.rooms))

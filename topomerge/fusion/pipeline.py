@@ -31,6 +31,7 @@ from topomerge.fusion.inputs import (
     resolve_threshold,
 )
 from topomerge.fusion.result import MERGE_STEPS, MergeResult, RoomMatch
+from topomerge.landmarks.fuse import CONTRADICTING
 from topomerge.matching.consistency import compute_match_probability
 from topomerge.matching.match import Matching, match
 from topomerge.matching.poses import PoseHypothesis
@@ -292,7 +293,8 @@ def _join(result: MergeResult) -> MergeResult:
     for k, m in combinations(poses, 2):
         pose = poses[m] if k == 0 else poses[k].inverse() @ poses[m]
         matches += _iter_room_matches(result.maps, (k, m), pose, result.probability, result.bends)
-    return replace(result, matches=tuple(matches), map=joined)
+    told = tuple(w for w in joined.warnings if w.startswith(CONTRADICTING))
+    return replace(result, matches=tuple(matches), map=joined, warnings=(*result.warnings, *told))
 
 
 def _iter_room_matches(

@@ -11,6 +11,7 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.pairs import serialise_contradiction
+from topomerge.fusion.transfer import LANDMARK_PARAMETER
 from topomerge.io.listing import convert_to_plain
 from topomerge.matching.match import describe_map
 from topomerge.registration.evidence.places import Places
@@ -262,6 +263,8 @@ def serialise_merge(result: MergeResult) -> dict[str, Any]:
         "places": serialise_places(registration.places) if registration and registration.places else [],
         "contradictions": [serialise_contradiction(c) for c in result.atlas.contradictions] if result.atlas else [],
     }
+    if result.map is not None and LANDMARK_PARAMETER in result.map.parameters:
+        listing["landmarks"] = result.map.parameters[LANDMARK_PARAMETER]
     plain_listing: dict[str, Any] = convert_to_plain(listing)
     return plain_listing
 

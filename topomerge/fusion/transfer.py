@@ -1,9 +1,9 @@
-"""What the maps know that were joined -> the joined map: doors, windows, and who was in the rooms (method 4)."""
+"""What the maps know that were joined -> the joined map: doors, windows, landmarks, and who was in the rooms (method 4)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,14 +11,17 @@ from scipy.spatial import cKDTree
 
 from topomerge.extraction.attributes import LEVEL_KINDS, find_rooms_at, select_distinct_doors
 from topomerge.extraction.elevations.windows import iter_same_windows, select_windows
+from topomerge.extraction.landmarks import assign_landmarks
 from topomerge.extraction.plans.part_rooms import PartRooms
-from topomerge.types import EDGE_DTYPE, WINDOW_DTYPE, Array, Placement, TopometricMap
+from topomerge.landmarks.fuse import fuse_landmarks
+from topomerge.types import EDGE_DTYPE, WINDOW_DTYPE, Array, Landmarks, Placement, TopometricMap, transform_landmarks
 from topomerge.types.grid import wrap_to_turn
 
 DOOR_SIDE = 1.0  # m around a door in which floor says which rooms it joins
 LEAST_FLOOR = 5  # cells of it, from which a map saw that side of a door
 ONE_DOOR = 1.2  # m: doors of two maps that are this close are one
 SEEN_BY_A_PART = ("centre", "lower", "upper", "direction", "width", "height", "kind", "open", "half")  # of a door
+LANDMARK_PARAMETER = "landmarks"  # of a joined map: what became of those of its maps (`LandmarkSummary`)
 LEAST_COVER = 0.3  # of a joined room's floor, from which on a part knows who was in it
 
 
@@ -174,3 +177,72 @@ def add_joined_windows(joined: TopometricMap, parts: Sequence[Array]) -> Topomet
     windows = np.concatenate([np.zeros(0, WINDOW_DTYPE), *parts])
     first = [int(group[0]) for group in iter_same_windows(windows)]
     return replace(joined, windows=select_windows(joined, windows[first]))
+
+
+def vote_rooms(part_room: Array, joined_room: Array, count: int) -> Array:
+    """Return (count,) room of the joined map in which most floor of each room of a part lies, -1 none.
+
+    Args:
+        part_room: (k,) room of each place of a part's floor.
+        joined_room: (k,) room of the joined map there, -1 none.
+    """
+    inside = joined_room >= 0
+    pairs, votes = np.unique(np.column_stack([part_room[inside], joined_room[inside]]), axis=0, return_counts=True)
+    best = pairs[np.lexsort((-pairs[:, 1], votes))]  # the most votes, then the first room, comes last
+    out = np.full(count, -1, np.int64)
+    out[best[:, 0]] = best[:, 1]
+    return out
+
+
+class PlacedLandmarks(NamedTuple):
+    """Landmarks of a part as they lie in the joined map, with the part's rooms; what of the part says where those are."""
+
+    landmarks: Landmarks
+    rooms: PartRooms
+    floors: Array  # (S,) m in the joined map, of the part's storeys
+    total: int  # of its rooms
+
+
+def transform_part_landmarks(part: TopometricMap, placement: Placement, rooms: PartRooms) -> PlacedLandmarks:
+    """Return the landmarks of a part as they lie in the joined map.
+
+    Args:
+        rooms: of the part, as they lie there.
+    """
+    pose = placement.pose
+    moved = transform_landmarks(part.landmarks, placement.transform_points, pose.yaw, pose.scale)
+    return PlacedLandmarks(moved, rooms, pose.scale * part.storeys["floor"] + pose.translation[2], len(part.rooms))
+
+
+def add_joined_landmarks(joined: TopometricMap, parts: Mapping[int, PlacedLandmarks], names: Sequence[str]) -> TopometricMap:
+    """Return the joined map with the landmarks of its parts, fused; what contradicts is told in a warning.
+
+    Args:
+        parts: by the number of the map.
+        names: of all maps.
+    """
+    placed = [_assign_joined_rooms(joined, parts[n]) if n in parts else Landmarks() for n in range(len(names))]
+    landmarks, summary = fuse_landmarks(placed, joined)
+    words = summary.describe_contradictions(names)
+    parameters = {**joined.parameters, LANDMARK_PARAMETER: asdict(summary)}
+    return replace(joined, landmarks=landmarks, parameters=parameters, warnings=(*joined.warnings, *([words] if words else [])))
+
+
+def _assign_joined_rooms(joined: TopometricMap, part: PlacedLandmarks) -> Landmarks:
+    """Landmarks of a part with rooms and storeys of the joined map: by their position; without one by the room that they had."""
+    table = part.landmarks.table.copy()
+    known = np.isfinite(table["position"]).all(axis=1)
+    room = np.append(vote_rooms(part.rooms.room, find_rooms_at(joined, part.rooms.places), part.total), -1)[table["room"]]
+    floors = joined.storeys["floor"]
+    level = (
+        np.abs(floors[None] - part.floors[:, None]).argmin(axis=1) if len(floors) and len(part.floors) else np.zeros(0, np.int64)
+    )
+    table["storey"] = np.where(known | (table["storey"] < 0) | (len(level) == 0), -1, np.append(level, -1)[table["storey"]])
+    table["room"] = np.where(known, -1, room)
+    assigned = assign_landmarks(joined, replace(part.landmarks, table=table))
+    lost = known & (assigned.table["room"] < 0) & (room >= 0)
+    if not lost.any():
+        return assigned
+    again = assigned.table.copy()
+    again["room"][lost] = room[lost]
+    return assign_landmarks(joined, replace(assigned, table=again))

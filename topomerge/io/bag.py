@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,9 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.io.bag_file import (
     BAG_KIND,
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
     LASER_SCAN,
     OCCUPANCY_GRID,
     POINT_CLOUD,
@@ -29,14 +33,13 @@ from topomerge.io.bag_file import (
     list_bag_files,
     measure_bag_size,
 )
+from topomerge.io.bag_landmarks import PACKED, CloudSample, LandmarkReader
 from topomerge.io.depth_images import Camera, PosedScan, iter_pieces, read_pixels, unproject_depth
 from topomerge.io.grid import check_outside_floor, classify, extrude
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_in_subprocess
 from topomerge.io.trajectory import BACKWARD, LONGEST_GAP, WORLD_NAMES, FrameTree, Trajectory, read_trajectory
 from topomerge.types import Array
 
-IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 ENCODINGS = {"16UC1": ("u2", 1000.0), "32FC1": ("f4", 1.0)}  # kind of number, values of depth in a metre
 TRANSPORT = "/compressedDepth"  # how the name of a packed topic ends
 PACKED_HEAD = 12  # bytes before the image of a packed message
@@ -74,7 +77,9 @@ def _read_first_message(bag: Bag, topic: Topic) -> Any:
 
 def _read_camera(bag: Bag, topic: Topic) -> Camera:
     """The camera of a topic of images, as its CameraInfo states it after rectification (P), else before (K)."""
-    beside = bag.find_topic(topic.name.removesuffix(TRANSPORT).rstrip("/").rpartition("/")[0] + "/camera_info")
+    beside = bag.find_topic(
+        topic.name.removesuffix(TRANSPORT).removesuffix(PACKED).rstrip("/").rpartition("/")[0] + "/camera_info"
+    )
     if beside is None or beside.type != CAMERA_INFO or not beside.count:
         frame = _read_first_message(bag, topic).header.frame_id
         fitting = [t for t in bag.find_topics(CAMERA_INFO) if _read_first_message(bag, t).header.frame_id == frame]
@@ -82,6 +87,11 @@ def _read_camera(bag: Bag, topic: Topic) -> Camera:
             have = f"no CameraInfo beside {topic.name}, and {len(fitting)} of its frame {frame!r}"
             raise InputError(f"{bag.path}: has {have}; record camera_info, too: the bag holds {bag.format_topics()}")
         beside = fitting[0]
+    return _decode_camera(bag, beside)
+
+
+def _decode_camera(bag: Bag, beside: Topic) -> Camera:
+    """The camera of a topic of CameraInfo."""
     message = next(bag.iter_messages([beside]))
     info = message.content
     projection, matrix = (np.asarray(getattr(info, name, getattr(info, name.lower(), ())), float) for name in "PK")
@@ -165,6 +175,21 @@ class SensorPoses:
             return None if stands is None else PosedScan(points, stands)
         points = points @ stands[:3, :3].T + stands[:3, 3]
         return PosedScan(points, None if self.carrier is None else self.by.compute_pose(self.carrier, time), registered=True)
+
+    def locate(self, sensor: str, frame: str, time: float) -> Array | None:
+        """Return the pose (4, 4) of a frame in the fixed one at a time (s).
+
+        Args:
+            sensor: the frame of the scans.
+            frame: any; None is returned where nothing is known of it.
+            time: s.
+        """
+        frame = frame.strip("/")
+        if isinstance(self.by, FrameTree):
+            known = frame and self.by.list_chain(frame)[-1] == self.by.list_chain(sensor)[-1]
+            return self.by.compute_pose(frame, time) if known else None
+        near = self.by.times is not None and self.by.measure_gap(np.array([time]))[0] <= LONGEST_GAP
+        return np.asarray(self.by.interpolate(np.array([time]))[0]) if near and frame == sensor else None
 
 
 def find_sensor_poses(bag: Bag, topic: Topic, requested: str | None, frame: str) -> SensorPoses:
@@ -273,6 +298,7 @@ def _get_xyzw(turn: Any) -> Iterable[float]:
 
 # Of a bag of any size, and bytes of memory for each of its own: the largest messages, and all poses. At most LARGEST_MEMORY.
 LEAST_MEMORY, MEMORY_RATIO, LARGEST_MEMORY = 1 << 30, 16, 4 << 30
+PICTURE_MEMORY = 3 << 30  # more, for what reads pictures
 LEAST_SECONDS, BYTES_A_SECOND = 30, 250_000  # of the processor for one piece; an old one goes through ten times as many bytes
 DECODERS: dict[str, Decoder] = {POINT_CLOUD: decode_point_cloud, LASER_SCAN: decode_laser_scan}
 READ_TYPES = (*DECODERS, IMAGE, COMPRESSED_IMAGE, OCCUPANCY_GRID)
@@ -286,6 +312,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     size = measure_bag_size(list_bag_files(path))
     seconds = LEAST_SECONDS + size // BYTES_A_SECOND
     room = min(LEAST_MEMORY + MEMORY_RATIO * size, LARGEST_MEMORY)
+    if options.text is not False and find_spec("rapidocr_onnxruntime") is not None:
+        room += PICTURE_MEMORY
     yield from read_in_subprocess("bag", BAG_KIND, path, options, seconds=seconds, room=room)
 
 
@@ -305,7 +333,12 @@ def _read(path: Path, options: ReadOptions) -> Iterator[Piece]:
             return
         poses = find_sensor_poses(bag, topic, options.poses, _read_first_frame(bag, topic))
         decode = DECODERS.get(topic.type) or build_depth_decoder(bag, topic)
-        yield from iter_pieces(_iter_scans(bag, topic, decode, poses), poses.warnings)
+        sample = CloudSample()
+        yield from iter_pieces(sample.watch(_iter_scans(bag, topic, decode, poses)), poses.warnings)
+        frame = _read_first_frame(bag, topic).strip("/")
+        carrier = frame if not poses.registered else poses.carrier or ""
+        reader = LandmarkReader(bag, partial(poses.locate, frame), carrier, _read_camera, options.text)
+        yield from reader.read(sample)
 
 
 def _select_topic(bag: Bag, name: str | None) -> Topic:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+import logging
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -20,6 +21,7 @@ from topomerge.io.grid import PIXELS, Plan
 from topomerge.io.piece import build_damage_error, is_outside_link
 from topomerge.types import Array
 
+log = logging.getLogger(__name__)
 MODEST_CHUNK, CHUNK_RATIO = 64 << 20, 200  # bytes that any chunk may have, and times that a larger one may have shrunk
 LARGEST_CHUNK = 1 << 30  # bytes
 MODEST_BAG, BAG_RATIO = 64 << 20, 1000  # likewise of all chunks together, each time that the bag is gone through
@@ -148,6 +150,7 @@ SAME_LAYOUT = {"tf/msg/tfMessage": TRANSFORMS}  # of ROS 1, before tf2
 BAG_STARTS = {".bag": b"#ROSBAG V2.0", ".mcap": b"\x89MCAP", ".db3": b"SQLite format 3"}
 BAG_TOOLS = {".bag": "rosbag reindex", ".mcap": "mcap recover"}  # that make a new index
 MOST_LISTED = 12  # topics in a message
+LONGEST_DEFINITION = 1 << 16  # letters of the definition of a type
 
 
 @dataclass(frozen=True)
@@ -218,6 +221,38 @@ class Bag:
     def find_topic(self, name: str) -> Topic | None:
         """Find the topic of that name, with or without its slash."""
         return next((t for t in self.topics.values() if t.name.strip("/") == name.strip("/")), None)
+
+    def get_definition(self, topic: Topic) -> str:
+        """Return the definition of a topic's type that the bag holds; "": none."""
+        for connection in (c for reader in self.readers for c in reader.connections if c.topic == topic.name):
+            text = str(connection.msgdef.data)
+            if text and len(text) <= LONGEST_DEFINITION:
+                return text
+        return ""
+
+    def is_known(self, topic: Topic) -> bool:
+        """Return whether messages of a topic can be decoded without its definition."""
+        return topic.type in self._store.fielddefs
+
+    def learn_type(self, topic: Topic, usual: str = "") -> bool:
+        """Learn to decode a topic by the definition of its type; False: there is none, or it can't be used.
+
+        Args:
+            topic: of it.
+            usual: the definition to go by where the bag holds none.
+        """
+        from rosbags.typesys import get_types_from_idl, get_types_from_msg
+
+        text = self.get_definition(topic) or usual
+        if self.is_known(topic) or not text:
+            return self.is_known(topic)
+        try:
+            idl = re.search(r"(?m)^\s*module\s", text) is not None
+            types = get_types_from_idl(text) if idl else get_types_from_msg(text, topic.type)
+            self._store.register({name: fields for name, fields in types.items() if name not in self._store.fielddefs})
+        except Exception as error:  # the library's parser raises kinds of its own
+            log.debug("the definition of %s can't be used: %s", topic.type, error)
+        return self.is_known(topic)
 
     def format_topics(self) -> str:
         """Format the topics of the bag in one line."""
@@ -338,6 +373,8 @@ def _build_typestore(readers: list[Any]) -> Any:
     return store
 
 
+IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 POINT_CLOUD, LASER_SCAN = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/LaserScan"
 OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from topomerge.errors import InputError
 from topomerge.io.grid import PIXELS
 from topomerge.io.piece import BLOCK_POINTS, Piece, build_damage_error
 from topomerge.io.trajectory import find_invalid_rotations
-from topomerge.types import Array
+from topomerge.types import Array, Landmarks
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,9 @@ class PosedScan:
     done: float = 0.0
 
 
-def iter_pieces(scans: Iterable[PosedScan], warnings: Iterable[str] = ()) -> Iterator[Piece]:
+def iter_pieces(
+    scans: Iterable[PosedScan], warnings: Iterable[str] = (), landmarks: Callable[[], Landmarks] = Landmarks
+) -> Iterator[Piece]:
     """Yield the scans as few large pieces, so that a long walk of small scans costs no more than one large one.
 
     Rays that met nothing (not finite, or at the sensor itself) are left out.
@@ -44,6 +46,7 @@ def iter_pieces(scans: Iterable[PosedScan], warnings: Iterable[str] = ()) -> Ite
     Args:
         scans: in their order; read one at a time.
         warnings: what the user should know; asked for when all scans are read.
+        landmarks: gives what else they showed; called when all scans are read.
     """
     batch: list[PosedScan] = []
     size, before = 0, 0
@@ -56,7 +59,8 @@ def iter_pieces(scans: Iterable[PosedScan], warnings: Iterable[str] = ()) -> Ite
             batch, size = [], 0
     if batch:
         yield _build_piece(batch, before)
-    yield Piece(np.empty((0, 3)), warnings=tuple(warnings), done=1.0)
+    found = landmarks()
+    yield Piece(np.empty((0, 3)), warnings=tuple(warnings), landmarks=found, done=1.0)
 
 
 def _transform_scan(scan: PosedScan) -> PosedScan:
@@ -127,6 +131,7 @@ class Frame:
         color: a file, or (h, w, 3) uint8.
         lens: the camera of the colours; None: they show what the depth image shows.
         done: share of all frames.
+        time: s; nan: not known.
     """
 
     name: Path | str
@@ -136,15 +141,22 @@ class Frame:
     color: Path | Array | None = None
     lens: Camera | None = None
     done: float = 0.0
+    time: float = np.nan
 
 
-def iter_posed_scans(path: Path, frames: Iterable[Frame | None], said: list[str]) -> Iterator[PosedScan]:
+Show = Callable[[Frame, Array, Array | None], None]  # frame, its depth (h, w), its colours (h, w, 3)
+
+
+def iter_posed_scans(
+    path: Path, frames: Iterable[Frame | None], said: list[str], show: Show | None = None
+) -> Iterator[PosedScan]:
     """Yield the scan of each frame; those without a pose are left out, and counted in what is said.
 
     Args:
         path: of the recording, for messages.
         frames: read one at a time; None: an image without a pose.
         said: takes warnings.
+        show: takes each frame with its images.
 
     Raises:
         InputError: no frame has a pose, or one can't be used.
@@ -157,18 +169,21 @@ def iter_posed_scans(path: Path, frames: Iterable[Frame | None], said: list[str]
         elif len(find_invalid_rotations(frame.pose[None])):
             raise InputError(f"{frame.name}: its pose is not a rotation and a place; mend it, or remove the image")
         else:
-            yield _build_scan(frame)
+            yield _build_scan(frame, show)
     if lost == count:
         raise InputError(f"{path}: none of its {count:,} depth images has a pose that can be used; give another recording")
     if lost:
         said.append(f"{lost:,} of {count:,} depth images have no pose that can be used and are left out")
 
 
-def _build_scan(frame: Frame) -> PosedScan:
+def _build_scan(frame: Frame, show: Show | None) -> PosedScan:
     """The points of one frame as its camera sees them."""
     depth = read_depth(frame.depth) if isinstance(frame.depth, Path) else frame.depth
     points, rows, columns = unproject_depth(frame.name, depth, frame.camera)
-    return PosedScan(points, frame.pose, _sample_colors(frame, points, rows, columns, depth.shape), done=frame.done)
+    shown = read_color(frame.color) if isinstance(frame.color, Path) else frame.color
+    if show is not None:
+        show(frame, depth, shown)
+    return PosedScan(points, frame.pose, _sample_colors(frame, shown, points, rows, columns, depth.shape), done=frame.done)
 
 
 def unproject_depth(name: Path | str, depth: Array, camera: Camera) -> tuple[Array, Array, Array]:
@@ -213,9 +228,10 @@ def _check_camera(name: Path | str, camera: Camera, shape: tuple[int, ...]) -> N
         raise InputError(f"{name}: has {width} x {height} pixels, and a camera of {stated} can't be its own; {camera.mend}")
 
 
-def _sample_colors(frame: Frame, points: Array, rows: Array, columns: Array, shape: tuple[int, ...]) -> Array | None:
+def _sample_colors(
+    frame: Frame, shown: Array | None, points: Array, rows: Array, columns: Array, shape: tuple[int, ...]
+) -> Array | None:
     """(n, 3) uint8 of the points; None where the colours show something else than the depth image."""
-    shown = read_color(frame.color) if isinstance(frame.color, Path) else frame.color
     if shown is None:
         return None
     height, width = shown.shape[:2]

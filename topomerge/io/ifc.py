@@ -15,9 +15,10 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from topomerge.errors import InputError
+from topomerge.io.landmarks import parse_landmarks
 from topomerge.io.mesh import sample
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_in_subprocess
-from topomerge.types import Array, TrueRoom
+from topomerge.types import LANDMARK_KINDS, Array, Landmarks, TrueRoom
 
 NOT_SAID = re.compile(rb"'[^']*'|/\*.*?\*/", re.DOTALL)  # strings and comments
 STATEMENT = re.compile(rb"#(\d+)\s*=\s*([^;]*)")
@@ -88,6 +89,8 @@ STEP_END = b"END-ISO-10303-21"
 GEOMETRY_KERNELS = ("hybrid-cgal-simple-opencascade", "opencascade")  # the first is three to six times as fast
 IFC_SECONDS = 600  # of the processor for one piece: 50 elements, which take a second
 IFC_MEMORY = 8 << 30  # bytes that the library may take
+NAME_HEIGHT = 1.0  # m above the floor, of a space's name
+UNNAMED_SPACE = re.compile(r"room \d+|")  # what topomerge calls a room without a name
 WELD = 1e-3  # m, corners closer than this are one
 
 
@@ -117,7 +120,8 @@ def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
     if not built:
         raise InputError(f"{path}: has no building elements with a shape; export it with its geometry")
     spaces = _read_spaces(model)
-    yield Piece(np.empty((0, 3)), rooms=_build_rooms(spaces), done=0.05)
+    rooms = _build_rooms(spaces)
+    yield Piece(np.empty((0, 3)), rooms=rooms, done=0.05, landmarks=_find_landmarks(model, rooms, path.name))
     shapes: dict[int, tuple[Array, Array]] = {}
     for number, (element, vertices, faces) in enumerate(_iter_shapes(model, built)):
         shapes[element] = vertices, faces
@@ -255,6 +259,27 @@ def _build_rooms(spaces: list[tuple[Any, Array, Array]]) -> tuple[TrueRoom, ...]
         if len(polygon) >= 3
     ]
     return tuple(sorted(rooms, key=lambda r: (r.storey, r.name, r.floor, *r.polygon[0])))
+
+
+def _find_landmarks(model: Any, rooms: tuple[TrueRoom, ...], source: str) -> Landmarks:
+    """Names of spaces, both the short and the long one, and annotations whose type is a kind of landmark."""
+    import shapely
+    from ifcopenshell.util.placement import get_local_placement
+    from ifcopenshell.util.unit import calculate_unit_scale
+
+    rows: list[dict[str, Any]] = []
+    for room in rooms:
+        inside = shapely.make_valid(shapely.Polygon(room.polygon)).representative_point()
+        for name in dict.fromkeys((room.name, room.kind)):
+            if not UNNAMED_SPACE.fullmatch(name.strip()):
+                at = (inside.x, inside.y, min(room.floor + NAME_HEIGHT, room.ceiling))
+                rows.append({"kind": "name", "value": name, "position": at})
+    scale = calculate_unit_scale(model)
+    for note in model.by_type("IfcAnnotation"):
+        if note.ObjectType in LANDMARK_KINDS and note.Name and note.ObjectPlacement is not None:
+            place = scale * np.asarray(get_local_placement(note.ObjectPlacement), float)[:3, 3]
+            rows.append({"kind": note.ObjectType, "value": str(note.Name), "position": place.tolist()})
+    return parse_landmarks(rows, source)
 
 
 def _find_storey_id(space: Any) -> int:

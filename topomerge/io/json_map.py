@@ -1,8 +1,9 @@
-"""Maps in JSON: of vacuum robots (`valetudo.py`), scene graphs with their mesh (`scene_graph.py`). What is in it tells which."""
+"""Maps in JSON: of vacuum robots (`valetudo.py`), scene graphs with their mesh. What is in it tells which."""
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,15 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io import valetudo
+from topomerge.io.landmarks import parse_landmarks
 from topomerge.io.mesh import sample
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error
-from topomerge.types import Array
+from topomerge.types import LANDMARK_KINDS, Array, Landmarks
 
 BEYOND_NUMBERS = 2**53  # of a vertex: from here on not every whole number is a float64
 GRAPH_KIND = "a scene graph"
+OBJECT_LAYER, ROOM_LAYER = 2, 4
+UNNAMED_NODE = re.compile(r"[A-Za-z]\(\d+\)|room \d+|")  # of an object or a room that nobody named
 
 
 def is_scene_graph(about: object) -> bool:
@@ -25,7 +29,7 @@ def is_scene_graph(about: object) -> bool:
 
 
 def iter_pieces(path: Path, graph: Mapping[str, Any], options: ReadOptions) -> Iterator[Piece]:
-    """Yield the vertices of the mesh, then points sampled on its faces, in metres.
+    """Yield the vertices of the mesh with the graph's objects and names, then points sampled on its faces, in metres.
 
     Raises:
         InputError: the graph has no mesh, or a damaged one.
@@ -41,8 +45,34 @@ def iter_pieces(path: Path, graph: Mapping[str, Any], options: ReadOptions) -> I
     if not (np.abs(faces) < BEYOND_NUMBERS).all() or (faces != np.round(faces)).any():  # so of nan, too
         raise build_damage_error(path, GRAPH_KIND, "a face of its mesh names a vertex that does not exist")
     colors = _parse_colors(path, mesh, len(vertices))
-    yield Piece(vertices, colors, done=0.5)
+    yield Piece(vertices, colors, done=0.5, landmarks=find_graph_landmarks(path, graph))
     yield from sample(path, vertices, faces.astype(np.int64), options, colors)
+
+
+def find_graph_landmarks(path: Path, graph: Mapping[str, Any]) -> Landmarks:
+    """Find the objects and the names of rooms of a scene graph; a number of a class is told by the graph's own list of them.
+
+    Raises:
+        InputError: a node is none.
+    """
+    rows = []
+    try:
+        spaces = (graph.get("metadata") or {}).get("labelspaces") or {}
+        classes = {layer: dict(spaces.get(f"_l{layer}p0") or []) for layer in (OBJECT_LAYER, ROOM_LAYER)}
+        for node in graph["nodes"]:
+            layer, about = node["layer"], node["attributes"]
+            if layer not in classes or node.get("partition", 0) != 0:
+                continue
+            name = str(about.get("name") or "")
+            if UNNAMED_NODE.fullmatch(name):
+                name = str(classes[layer].get(about.get("semantic_label")) or "")
+            kind = (about.get("metadata") or {}).get("kind") if layer == OBJECT_LAYER else "name"
+            if name.strip():
+                kind = kind if kind in LANDMARK_KINDS else "object"
+                rows.append({"kind": kind, "value": name, "position": [float(v) for v in about["position"]][:3]})
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise build_damage_error(path, GRAPH_KIND, f"node {len(rows)}: {error}") from error
+    return parse_landmarks(rows, path.name)
 
 
 def _parse_table(path: Path, rows: Any, name: str) -> Array:

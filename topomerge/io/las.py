@@ -159,6 +159,7 @@ def _iter_nodes(path: Path, stream: IO[bytes], octree: Octree, deepest: int) -> 
                 pages.append((start, length))
 
 
+LAST_STANDARD_CLASS = 22  # of ASPRS, LAS 1.4 R15: temporal exclusion; users define their own from 64 on
 LASZIP = b"laszip encoded"
 LARGEST_HEAD = 64 << 20  # bytes searched for the record of the compression
 MOST_POINTS_A_BYTE = 200  # of a packed file: equal points pack that well, and no scan does
@@ -173,7 +174,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     for header, rows, done in records(path) if octree is None else iter_coarse_records(path, octree, options):
         colored = {"red", "green", "blue"} <= set(header.point_format.dimension_names)
         bright = np.asarray(rows.intensity, np.float32)
-        yield Piece(get_coordinates(rows), _convert_colors(rows) if colored else None, done=done, intensities=bright)
+        colors, classes = _convert_colors(rows) if colored else None, _convert_classes(rows)
+        yield Piece(get_coordinates(rows), colors, done=done, intensities=bright, classes=classes)
 
 
 def read_las_node(path: Path, promised: int, options: ReadOptions) -> Iterator[Piece]:
@@ -225,6 +227,12 @@ def records(path: Path) -> Iterator[tuple[Any, Any, float]]:
 def get_coordinates(rows: Any) -> Array:
     """Return (n, 3) float64 of records, in the file's frame and unit."""
     return np.stack([np.asarray(rows.x), np.asarray(rows.y), np.asarray(rows.z)], axis=1)
+
+
+def _convert_classes(rows: Any) -> Array | None:
+    """(n,) int32 classes beyond those of the standard (ground, buildings, noise and such), -1 of others; None: there are none."""
+    classes = np.asarray(rows.classification, np.int32)
+    return np.where(classes > LAST_STANDARD_CLASS, classes, -1) if int(classes.max(initial=0)) > LAST_STANDARD_CLASS else None
 
 
 def _convert_colors(rows: object) -> Array | None:

@@ -4,7 +4,7 @@ JSON, format 1. Lengths are m, areas m², volumes m³, angles radians, times sec
 what is not known is null. A height of 0 means that no ceiling (or lintel) was seen.
 
     {"format": 1, "source": "a.ply", "voxel_size": 0.1,
-     "rooms": [{"id", "storey", "centroid": [x, y, z], "area", "height", "volume",
+     "rooms": [{"id", "name" (where it has one), "storey", "centroid": [x, y, z], "area", "height", "volume",
                 "bounding_box": {"min": [x, y, z], "max": [x, y, z]}, "cells",
                 "completeness", "glimpsed", "confidence", "whole", "entered", "outside"}, …],
      "edges": [{"rooms": [id, id], "door": {"centre": [x, y, z], "width", "height", "direction"}, "kind",
@@ -12,6 +12,8 @@ what is not known is null. A height of 0 means that no ceiling (or lintel) was s
      "windows": [{"rooms": [id, id], "centre": [x, y, z], "width", "sill", "head", "direction", "confidence"}, …],
      "areas": [{"id", "room", "centroid": [x, y, z], "area"}, …], "narrows": [like edges, "areas" for "rooms"],
      "storeys": [{"id", "floor", "ceiling", "area"}, …],
+     "landmarks": [{"kind", "value", "position": [x, y, z], "room", "storey", "group", "sigma", "number", "time", "confidence",
+                    "source"}, …],
      "seconds": {step: s}, "parameters": {…}, "warnings": […]}
 
 `completeness` is the share of a floor's outline at which a wall was seen; `confidence` the probability that it is a room, `whole`
@@ -33,7 +35,8 @@ from typing import Any
 import numpy as np
 
 from topomerge.io.archive import replace_on_success
-from topomerge.types import ROOM_ODDS, TopometricMap
+from topomerge.io.landmarks import serialise_landmarks
+from topomerge.types import LANDMARK_KINDS, ROOM_ODDS, Landmarks, TopometricMap, find_room_names
 
 LISTING_FORMAT = 1
 EDGE_FACTS = ("kind", "open", "half", "confidence", "lower", "upper")
@@ -68,9 +71,11 @@ def _convert_to_strict_json(value: Any) -> Any:
 
 def convert_map_to_json(map: TopometricMap) -> dict[str, Any]:
     """The map as a dictionary of plain Python values that is valid JSON; see the top of this file for its fields."""
+    names = find_room_names(map.landmarks, len(map.rooms))
     rooms = [
         {
             "id": i,
+            **({"name": names[i]} if names[i] else {}),
             **{name: room[name] for name in ("storey", "centroid", "area", "height", "volume")},
             "bounding_box": {"min": room["lo"], "max": room["hi"]},
             "cells": room["cells"],
@@ -92,6 +97,7 @@ def convert_map_to_json(map: TopometricMap) -> dict[str, Any]:
         "areas": areas,
         "narrows": [_build_edge_entry(e, "areas") for e in map.narrows],
         "storeys": storeys,
+        "landmarks": serialise_landmarks(map.landmarks),
         "seconds": map.seconds,
         "parameters": map.parameters,
         "warnings": list(map.warnings),
@@ -160,7 +166,7 @@ def _list_neighbours(map: TopometricMap) -> list[list[str]]:
     return [[f"{room}{rooms[room]}" for room in sorted(rooms)] for rooms in beside]
 
 
-def _iter_room_rows(map: TopometricMap) -> Iterable[Sequence[str]]:
+def _iter_room_rows(map: TopometricMap, names: Sequence[str]) -> Iterable[Sequence[str]]:
     doors = np.bincount(map.edges["rooms"].ravel(), minlength=len(map.rooms))
     for i, (room, beside) in enumerate(zip(map.rooms, _list_neighbours(map), strict=True)):
         yield (
@@ -170,6 +176,7 @@ def _iter_room_rows(map: TopometricMap) -> Iterable[Sequence[str]]:
             _format_number(room["height"], 2, room["height"] == 0),
             str(room["cells"]),
             str(doors[i]),
+            *([names[i]] if any(names) else []),
             "  ".join([", ".join(beside), *describe_room(room)]),
         )
 
@@ -181,6 +188,13 @@ def _iter_storey_rows(map: TopometricMap) -> Iterable[Sequence[str]]:
         yield str(i), _format_number(floor, 2), _format_number(ceiling, 2), _format_number(area, 1), str(rooms[i])
 
 
+def describe_landmarks(landmarks: Landmarks) -> str:
+    """Describe how many landmarks of which kinds there are: "3 landmarks (2 text, 1 tag)"."""
+    count = np.bincount(landmarks.table["kind"], minlength=len(LANDMARK_KINDS)).tolist()
+    kinds = ", ".join(f"{many:,} {kind}" for kind, many in zip(LANDMARK_KINDS, count, strict=True) if many)
+    return f"{len(landmarks):,} landmark{'s' * (len(landmarks) != 1)}{f' ({kinds})' if kinds else ''}"
+
+
 def format_map(map: TopometricMap) -> str:
     """Return tables of rooms, storeys and seconds for a terminal, without a line break at the end."""
     kinds = Counter(map.edges["kind"].tolist())
@@ -188,6 +202,9 @@ def format_map(map: TopometricMap) -> str:
     counts += [_format_count(kinds[kind], kind) for kind in ("door", "opening", "stairs")]
     counts += [_format_count(kinds["ramp"], "ramp")] if kinds["ramp"] else []
     counts += [_format_count(len(map.windows), "window")] if len(map.windows) else []
+    counts += [describe_landmarks(map.landmarks)] if len(map.landmarks) else []
+    names = find_room_names(map.landmarks, len(map.rooms))
+    columns = ("room", "storey", "area m²", "height m", "cells", "doors", *(("name",) if any(names) else ()), "leads to")
     steps = [(f"{s:.2f}", step) for step, s in map.seconds.items()]
     steps.append((f"{sum(map.seconds.values()):.2f}", "all"))
     source = " ".join((map.source or "map").splitlines())  # names of files may hold line breaks
@@ -195,7 +212,7 @@ def format_map(map: TopometricMap) -> str:
         (
             f"{source}: {', '.join(counts)}; {_format_count(len(map.grid), 'cell')} of {map.grid.edge:g} m",
             "",
-            *_format_columns(("room", "storey", "area m²", "height m", "cells", "doors", "leads to"), _iter_room_rows(map)),
+            *_format_columns(columns, _iter_room_rows(map, names)),
             "",
             *_format_columns(("storey", "floor m", "ceiling m", "area m²", "rooms"), _iter_storey_rows(map)),
             "",

@@ -19,15 +19,20 @@ from topomerge.kernels import voxels
 from topomerge.types import (
     AREA_DTYPE,
     EDGE_DTYPE,
+    LANDMARK_DTYPE,
+    LONGEST_VALUE,
+    MOST_LANDMARKS,
     OLDER_EDGE_DTYPE,
     ROOM_DTYPE,
     ROOM_ODDS,
     STOREY_DTYPE,
     WINDOW_DTYPE,
     Array,
+    Landmarks,
     TopometricMap,
     VoxelGrid,
     add_outline_odds,
+    clean_landmarks,
     read_levelling,
 )
 
@@ -37,6 +42,7 @@ ROOM_COLUMNS, TOTAL_COLUMNS = 50_000_000, 100_000_000  # of the grid, in the rec
 CONNECTION_LIMIT = 30_000  # of edges, areas, narrows and windows each, however many rooms there are
 EDGES_PER_ROOM, AREAS_PER_ROOM, WINDOWS_PER_ROOM = 20, 20, 100  # on average
 ABOUT_LIMIT = 1 << 24  # bytes of what a map says about itself
+STRINGS_LIMIT = 1 << 28  # bytes of the strings of its landmarks
 PROPERTY_WIDTH = 64  # numbers of one property in a cell
 CELL_ARRAYS = {"grid": ("room", "provenance"), "navigable": ("navigable_room", "navigable_area"), "free": ()}  # a row for each
 
@@ -59,6 +65,7 @@ def require_sane_counts(heads: Mapping[str, ArrayHeader]) -> None:
         "areas": (min(AREAS_PER_ROOM * rooms, CONNECTION_LIMIT), f" ({AREAS_PER_ROOM} a room)"),
         "narrows": (min(EDGES_PER_ROOM * areas, CONNECTION_LIMIT), f" ({EDGES_PER_ROOM} an area)"),
         "windows": (min(WINDOWS_PER_ROOM * rooms, CONNECTION_LIMIT), f" ({WINDOWS_PER_ROOM} a room)"),
+        "landmarks": (MOST_LANDMARKS, ""),
     }
     for name, (limit, share) in limits.items():
         words = share if limit < CONNECTION_LIMIT else ""
@@ -68,6 +75,8 @@ def require_sane_counts(heads: Mapping[str, ArrayHeader]) -> None:
         raise ValueError(f"declares {rooms:,} rooms and has only {cells:,} cells")
     if heads["about"].size * heads["about"].dtype.itemsize > ABOUT_LIMIT:
         raise ValueError(f"says more than {ABOUT_LIMIT >> 20} MB about itself")
+    if "landmarks" in heads and heads["landmark_strings"].size * heads["landmark_strings"].dtype.itemsize > STRINGS_LIMIT:
+        raise ValueError(f"has more than {STRINGS_LIMIT >> 20} MB of strings of landmarks")
     _require_rows(heads)
 
 
@@ -103,7 +112,8 @@ def require_compact_rooms(navigable: VoxelGrid, room: Array, rooms: int) -> None
 
 
 __all__ = ["TMAP_FORMAT", "convert_map_to_json", "load_map", "save_json", "save_map", "save_rooms_ply"]
-TMAP_FORMAT = 2
+TMAP_FORMAT = 3  # raised with landmarks
+READ_FORMATS = (2, 3)
 KIND = "map of topomerge (.tmap)"
 COORDINATE_LIMIT = 1e9  # m, either way: beyond, float64 is coarser than 0.1 micrometres
 AREA_LIMIT = 1e12  # m2, and m3 for volumes
@@ -121,7 +131,7 @@ def save_map(map: TopometricMap, path: str | Path) -> None:
     Tuples in the parameters come back as lists.
 
     Raises:
-        InputError: the path can't be written, or a frame is one that `load_map` refuses.
+        InputError: the path can't be written, or a frame or a number of landmarks is one that `load_map` refuses.
         ValueError: a property of a grid holds Python objects.
     """
     for name, grid in (("grid", map.grid), ("navigable", map.navigable)):
@@ -137,6 +147,10 @@ def save_map(map: TopometricMap, path: str | Path) -> None:
         arrays |= _pack("free", map.free)
     if len(map.windows):
         arrays["windows"] = map.windows
+    if len(map.landmarks) > MOST_LANDMARKS:
+        raise InputError(f"{path}: not written ({len(map.landmarks):,} landmarks, more than {MOST_LANDMARKS:,}); take fewer")
+    if len(map.landmarks):
+        arrays |= _pack_landmarks(clean_landmarks(map.landmarks))
     if map.provenance is not None:
         arrays["provenance"] = map.provenance.astype("<u4")
     about = {
@@ -161,18 +175,23 @@ def load_map(path: str | Path) -> TopometricMap:
             number in a table that is none, a frame that no building has.
     """
     heads = archive.read_array_headers(path, KIND)
-    if "format" not in heads or "about" not in heads:
-        raise InputError(f"{path}: is not a {KIND}: make one with `topomerge extract SCAN -o A.tmap`")
-    number: Any = archive.read(path, KIND, ["format"])["format"] if heads["format"].shape == () else heads["format"]
-    if number.shape != () or number.dtype.kind not in "iu" or int(number) != TMAP_FORMAT:
-        older = number.shape == () and number.dtype.kind in "iu" and int(number) < TMAP_FORMAT
-        advice = "make it again with `topomerge extract`" if older else "update topomerge"
-        raise InputError(f"{path}: is of format {number}, and this topomerge reads format {TMAP_FORMAT}; {advice}")
+    _check_format(path, heads)
     with _convert_map_errors(path):
         require_sane_counts(heads)  # before anything is unpacked
     arrays = archive.read(path, KIND, [name for name in heads if name not in UNREAD])
     with _convert_map_errors(path):
         return _build_map(arrays)
+
+
+def _check_format(path: str | Path, heads: Mapping[str, ArrayHeader]) -> None:
+    """Refuse what is no map, or one of another format."""
+    if "format" not in heads or "about" not in heads:
+        raise InputError(f"{path}: is not a {KIND}: make one with `topomerge extract SCAN -o A.tmap`")
+    number: Any = archive.read(path, KIND, ["format"])["format"] if heads["format"].shape == () else heads["format"]
+    if number.shape != () or number.dtype.kind not in "iu" or int(number) not in READ_FORMATS:
+        older = number.shape == () and number.dtype.kind in "iu" and int(number) < TMAP_FORMAT
+        advice = "make it again with `topomerge extract`" if older else "update topomerge"
+        raise InputError(f"{path}: is of format {number}, and this topomerge reads format {TMAP_FORMAT}; {advice}")
 
 
 @contextmanager
@@ -287,6 +306,45 @@ def _read_windows(arrays: dict[str, Array]) -> Array:
     return windows
 
 
+def _pack_landmarks(landmarks: Landmarks) -> dict[str, Array]:
+    """Landmarks as arrays: their table, and the strings that it counts as JSON."""
+    strings = json.dumps([landmarks.values, landmarks.sources], separators=(",", ":")).encode()
+    return {"landmarks": landmarks.table, "landmark_strings": np.frombuffer(strings, np.uint8)}
+
+
+def _read_landmarks(arrays: dict[str, Array]) -> Landmarks:
+    """The landmarks. Files of earlier versions have none.
+
+    Raises:
+        ValueError: a string, a position or another number is none that `clean_landmarks` leaves.
+    """
+    if "landmarks" not in arrays:
+        return Landmarks()
+    table = _check_array(arrays, "landmarks", "V", 1)
+    if table.dtype != LANDMARK_DTYPE:
+        raise ValueError("landmarks has other columns")
+    strings = json.loads(_check_array(arrays, "landmark_strings", "u", 1).tobytes())
+    if not isinstance(strings, list) or [type(part) for part in strings] != [list, list]:
+        raise ValueError("landmarks have no strings")
+    values, sources = (tuple(part) for part in strings)
+    if max(len(values), len(sources)) > MOST_LANDMARKS:
+        raise ValueError(f"has more than {MOST_LANDMARKS:,} strings of landmarks")
+    if not all(isinstance(value, str) and len(value) <= LONGEST_VALUE and value.isprintable() for value in (*values, *sources)):
+        raise ValueError(f"has a string of a landmark that can't be printed or is longer than {LONGEST_VALUE} characters")
+    known = np.isfinite(table["position"])
+    if (
+        not ((np.abs(table["position"]) <= COORDINATE_LIMIT) | ~known.any(axis=1, keepdims=True)).all()
+        or np.isinf(table["position"]).any()
+    ):
+        raise ValueError(f"landmarks has a position that is no number or beyond {COORDINATE_LIMIT:.0e}")
+    for column in ("sigma", "number", "time"):
+        if np.isinf(table[column]).any() or ((table[column] < 0).any() and column == "sigma"):
+            raise ValueError(f"landmarks has a {column} that is no number")
+    if not ((table["confidence"] >= 0) & (table["confidence"] <= 1)).all():
+        raise ValueError("landmarks has a confidence that is not from 0 to 1")
+    return Landmarks(table, values, sources)
+
+
 def _limit_warnings(messages: list[Any]) -> tuple[str, ...]:
     """The first warnings, each one line of bounded length, and how many more there are."""
     surplus = len(messages) - WARNING_LIMIT
@@ -324,6 +382,7 @@ def _build_map(arrays: dict[str, Array]) -> TopometricMap:
         navigable_area=_check_array(arrays, "navigable_area", "i", 1).astype(np.int32),
         narrows=narrows,
         windows=_read_windows(arrays),
+        landmarks=_read_landmarks(arrays),
         free=_unpack(arrays, "free") if "free_cells" in arrays else None,
         provenance=provenance,
         source=str(about["source"]),
@@ -331,3 +390,19 @@ def _build_map(arrays: dict[str, Array]) -> TopometricMap:
         seconds={str(step): float(s) for step, s in about["seconds"].items()},
         warnings=_limit_warnings(list(about["warnings"])),
     )
+
+
+def load_landmarks(path: str | Path) -> tuple[Landmarks, Array]:
+    """Read the landmarks of a map and its rooms' storeys, (R,) int32, without its cells.
+
+    Raises:
+        InputError: as `load_map`, as far as the tables of rooms and landmarks show it.
+    """
+    _check_format(path, (heads := archive.read_array_headers(path, KIND)))
+    arrays = archive.read(path, KIND, ["rooms", "landmarks", "landmark_strings"])
+    with _convert_map_errors(path):
+        require_sane_counts(heads)
+        rooms, landmarks = _read_rooms(arrays), _read_landmarks(arrays)
+        if int(landmarks.table["room"].max(initial=-1)) >= len(rooms):
+            raise ValueError("a landmark's room does not exist")
+    return landmarks, rooms["storey"]

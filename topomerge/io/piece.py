@@ -19,7 +19,7 @@ import numpy as np
 
 from topomerge.errors import InputError, is_memory_short
 from topomerge.io.frame import TURNS, UNITS
-from topomerge.types import Array, TrueRoom, VoxelGrid
+from topomerge.types import LANDMARK_DTYPE, Array, Landmarks, TrueRoom, VoxelGrid
 
 LFS_POINTER = b"version https://git-lfs.github.com/spec/v1"
 BLOCK_POINTS = 1 << 19  # points a reader hands over at a time
@@ -29,7 +29,8 @@ MOST_POINTS = 100_000_000  # points that a sampled or extruded file may become; 
 @dataclass(frozen=True)
 class Piece:
     """Some of the points of a file. `free` and `rooms` describe the whole file and come with its first piece; `poses` come with
-    the first piece whose points need them, and are counted by `pose_of` over all pieces."""
+    the first piece whose points need them, and are counted by `pose_of` over all pieces; `landmarks` come with any, also with
+    one without points."""
 
     points: Array  # (n, 3) float, in the file's frame and unit
     colors: Array | None = None  # (n, 3) uint8
@@ -41,6 +42,8 @@ class Piece:
     warnings: tuple[str, ...] = ()
     done: float = 0.0  # share of the file read so far
     intensities: Array | None = None  # (n,) float32, in whatever the file counts in
+    classes: Array | None = None  # (n,) int32, of what the points lie on, as the file counts them; -1: none
+    landmarks: Landmarks | None = None  # positions in the file's frame and unit
 
 
 def refuse_pointer(path: Path) -> None:
@@ -137,6 +140,7 @@ class ReadOptions:
             of a topic with poses. None: what lies beside the scans, or what the bag holds.
         one_frame: read all files of a folder as parts of one cloud, whose points lie in one frame.
         topic: of a bag, where it has several with points or maps.
+        text: read signs and tags on pictures. True: must; None: where the packages for that are installed; False: don't.
     """
 
     up: str | None = None
@@ -151,6 +155,7 @@ class ReadOptions:
     poses: str | None = None
     topic: str | None = None
     one_frame: bool = False
+    text: bool | None = None
 
     @property
     def factor(self) -> float:
@@ -247,8 +252,9 @@ def decode_colors(rows: np.ndarray[Any, Any]) -> np.ndarray[Any, Any] | None:
     return convert_to_uint8(np.stack([rows[name] for name in COLOR_NAMES], axis=1))
 
 
-ARRAYS = {  # of a piece
+ARRAYS: dict[str, Any] = {  # of a piece
     "points": np.float64, "colors": np.uint8, "poses": np.float64, "pose_of": np.int32, "intensities": np.float32,
+    "landmarks": LANDMARK_DTYPE,
 }  # fmt: skip
 
 
@@ -297,6 +303,8 @@ def _receive_piece(path: Path, kind: str, stream: IO[bytes]) -> Piece | None:
         raise build_damage_error(path, kind, header["fault"])
     arrays: dict[str, Any] = {name: _receive_array(stream, ARRAYS[name], shape) for name, shape in header["arrays"].items()}
     rooms = tuple(TrueRoom(**{**room, "polygon": np.array(room["polygon"], float).reshape(-1, 2)}) for room in header["rooms"])
+    if "landmarks" in arrays:
+        arrays["landmarks"] = Landmarks(arrays["landmarks"], *map(tuple, header["strings"]))
     return replace(Piece(**arrays), rooms=rooms, warnings=tuple(header["warnings"]), done=header["done"])
 
 
@@ -327,10 +335,13 @@ def _iter_messages(
     try:
         limit(seconds=seconds)
         for piece in reader.read_in_process(path, options):
-            arrays = {name: getattr(piece, name) for name in ARRAYS}
+            marks = piece.landmarks
+            arrays: dict[str, Any] = {name: getattr(piece, name) for name in ARRAYS}
+            arrays["landmarks"] = None if marks is None else marks.table
             given = {name: np.ascontiguousarray(v, ARRAYS[name]) for name, v in arrays.items() if v is not None}
             rooms = [{**vars(room), "polygon": np.asarray(room.polygon).tolist()} for room in piece.rooms]
             header = {"arrays": {name: v.shape for name, v in given.items()}, "rooms": rooms}
+            header["strings"] = [] if marks is None else [marks.values, marks.sources]
             yield {**header, "warnings": piece.warnings, "done": piece.done}, list(given.values())
             limit(seconds=seconds)
     except InputError as error:

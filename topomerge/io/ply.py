@@ -33,6 +33,7 @@ PLY_TYPES = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 INTENSITY_NAMES = ("intensity", "scalar_intensity", "reflectance", "scalar_reflectance")
+CLASS_NAMES = ("label", "class", "classification", "semantic", "semantics", "sem_class", "category", "class_id", "label_id")
 ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -139,6 +140,18 @@ def find_intensity_name(names: list[str]) -> str:
     return next((n for n in names if n.lower() in INTENSITY_NAMES), "")
 
 
+def find_class_name(names: list[str]) -> str:
+    """Find the name of the field that says what a point lies on, or none."""
+    return next((n for n in names if n.lower().removeprefix("scalar_") in CLASS_NAMES), "")
+
+
+def convert_to_classes(values: Array) -> Array:
+    """Return (n,) int32 classes; -1 where the value is no whole number from 0 on."""
+    numbers = np.nan_to_num(np.asarray(values, np.float64), nan=-1.0, posinf=-1.0, neginf=-1.0)
+    whole = (numbers >= 0) & (numbers < 1 << 31) & (numbers == np.rint(numbers))
+    return np.where(whole, numbers, -1).astype(np.int32)
+
+
 def _read_binary(path: Path, header: Header, before: list[Element], vertex: Element) -> Iterator[Piece]:
     dtype = vertex.build_dtype(header.order)
     start = header.start + sum(e.count * e.build_dtype(header.order).itemsize for e in before)
@@ -149,12 +162,14 @@ def _read_binary(path: Path, header: Header, before: list[Element], vertex: Elem
         return
     rows = np.memmap(path, dtype, "r", start, (vertex.count,))
     names = [n for n, _ in vertex.properties]
-    colors, shade = find_color_names(names), find_intensity_name(names)
+    colors, shade, kind = find_color_names(names), find_intensity_name(names), find_class_name(names)
     for first in range(0, vertex.count, BLOCK_POINTS):
         block = rows[first : first + BLOCK_POINTS]
         done = (first + len(block)) / vertex.count
         bright = convert_to_float32(block[shade]) if shade else None
-        yield Piece(_stack_columns(block, ("x", "y", "z")), _stack_colors(block, colors), done=done, intensities=bright)
+        classes = convert_to_classes(block[kind]) if kind else None
+        points = _stack_columns(block, ("x", "y", "z"))
+        yield Piece(points, _stack_colors(block, colors), done=done, intensities=bright, classes=classes)
 
 
 def _stack_columns(rows: Array, names: tuple[str, ...]) -> Array:
@@ -172,8 +187,8 @@ def _stack_colors(rows: Array, names: tuple[str, ...]) -> Array | None:
 
 def _read_ascii(path: Path, header: Header, before: list[Element], vertex: Element) -> Iterator[Piece]:
     names = [n for n, _ in vertex.properties]
-    shades, shade = find_color_names(names), find_intensity_name(names)
-    requested = ("x", "y", "z", *shades, *([shade] if shade else []))
+    shades, shade, kind = find_color_names(names), find_intensity_name(names), find_class_name(names)
+    requested = ("x", "y", "z", *shades, *filter(None, (shade, kind)))
     columns = tuple(names.index(n) for n in requested)
     count = 0
     with path.open(encoding="latin-1") as stream:
@@ -182,11 +197,12 @@ def _read_ascii(path: Path, header: Header, before: list[Element], vertex: Eleme
         for values in text.iter_rows(path, lines, columns, skip=skip):
             count += len(values)
             colors = values[:, 3:6] if shades else None
-            bright = convert_to_float32(values[:, -1]) if shade else None
+            bright = convert_to_float32(values[:, requested.index(shade)]) if shade else None
+            classes = convert_to_classes(values[:, -1]) if kind else None
             if colors is not None and vertex.properties[columns[3]][1] not in ("f4", "f8"):
                 colors = colors.clip(0, 65535).astype(np.int64)
             shown = None if colors is None else convert_to_uint8(colors)
-            yield Piece(values[:, :3], shown, done=count / vertex.count, intensities=bright)
+            yield Piece(values[:, :3], shown, done=count / vertex.count, intensities=bright, classes=classes)
     if count < vertex.count:
         raise build_truncation_error(path, count, vertex.count)
 
@@ -207,7 +223,8 @@ def _read_whole(path: Path, options: ReadOptions) -> Iterator[Piece]:
     rows = data["vertex"].data
     vertices = _stack_columns(rows, ("x", "y", "z"))
     colors = _stack_colors(rows, find_color_names(list(rows.dtype.names or ())))
-    yield Piece(vertices, colors, done=0.5)
+    kind = find_class_name(list(rows.dtype.names or ()))
+    yield Piece(vertices, colors, done=0.5, classes=convert_to_classes(rows[kind]) if kind else None)
     faces = data["face"].data if "face" in data else np.empty(0, [("none", "u1")])
     name = next((n for n in ("vertex_indices", "vertex_index") if n in (faces.dtype.names or ())), None)
     if name is not None and len(faces):

@@ -14,6 +14,7 @@ import logging
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,8 +23,19 @@ import numpy as np
 from topomerge.errors import InputError, is_memory_short
 from topomerge.io import frame
 from topomerge.io.frame import get_axis_rotation
+from topomerge.io.landmarks import find_landmark_file, read_landmark_file
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_options, refuse_pointer
-from topomerge.types import Array, PointCloud, TrueRoom, VoxelGrid
+from topomerge.io.sightings import ObjectFinder
+from topomerge.types import (
+    Array,
+    Landmarks,
+    PointCloud,
+    TrueRoom,
+    VoxelGrid,
+    clean_landmarks,
+    join_landmarks,
+    transform_landmarks,
+)
 
 LARGE, HIGH = 2000.0, 100.0  # m, extents beyond what is scanned as one building
 SLAB_THICKNESS = 0.1  # m
@@ -186,6 +198,8 @@ class Gatherer:
         self.parts: list[_Part] = []
         self.size = 0
         self.poses: Array | None = None
+        self.landmarks: list[Landmarks] = []
+        self.objects = ObjectFinder()
         self.free: VoxelGrid | None = None
         self.rooms: tuple[TrueRoom, ...] = ()
         self.pending: PointCloud | None = None  # the last full cloud, held back because the last one carries the warnings
@@ -214,7 +228,8 @@ class Gatherer:
         if self.dropped:
             self.warnings.append(f"{self.dropped:,} points were not finite and are left out")
         self.warnings += warn_about(self.sample.points, self.up)
-        yield replace(self.pending, warnings=tuple(dict.fromkeys(self.warnings)))
+        found = join_landmarks([*self.landmarks, self.objects.find_objects("classes of points")])
+        yield replace(self.pending, warnings=tuple(dict.fromkeys(self.warnings)), landmarks=found if len(found) else None)
 
     def _update_metadata(self, piece: Piece) -> None:
         """Keep what a piece says about the whole file."""
@@ -223,11 +238,16 @@ class Gatherer:
         if piece.poses is not None:
             placed = frame.transform_poses(piece.poses, self.rotation, self.factor)
             self.poses = placed if self.poses is None else np.concatenate([self.poses, placed])
+        if piece.landmarks is not None and len(piece.landmarks):
+            place = partial(frame.transform_points, rotation=self.rotation, factor=self.factor)
+            self.landmarks.append(transform_landmarks(clean_landmarks(piece.landmarks), place, scale=self.factor))
         if piece.free is not None and len(piece.free):
             self.free = frame.transform_grid(piece.free, self.rotation, self.factor)
 
     def _transform_piece(self, piece: Piece) -> _Part:
         points = frame.transform_points(piece.points, self.rotation, self.factor)
+        if piece.classes is not None:
+            self.objects.add(points, piece.classes)
         part = _Part(points, piece.colors, piece.labels, piece.pose_of, piece.intensities)
         if not (points.min() > -BEYOND and points.max() < BEYOND):  # so of nan, too
             finite = np.asarray((np.abs(points) < BEYOND).all(axis=1))
@@ -311,12 +331,14 @@ def list_suffixes() -> tuple[str, ...]:
 def read_points(path: str | Path, *, progress: Progress | None = None, **options: Any) -> PointCloud:
     """Read the points of a file as one cloud, in metres, z up: ``read_points("a.ply", up="y", unit="mm")``.
 
+    Landmarks in a file beside it (docs/landmarks.md) come along.
+
     Args:
         path: the file, whose suffix names the format, or a folder of scans.
         progress: called now and then with the share done and a text.
         options: those of `topomerge.io.piece.ReadOptions`: ``up``, ``unit``, ``scale`` of the coordinates; ``resolution``,
             ``extrude``, ``ceiling`` of floor plans; ``spacing`` of points on surfaces; ``doors`` of building models; ``poses``
-            and ``topic`` of scans; ``one_frame`` of a folder whose files are parts of one cloud.
+            and ``topic`` of scans; ``one_frame`` of a folder whose files are parts of one cloud; ``text`` of pictures.
 
     Raises:
         InputError: anything that keeps the file from being read, or a wrong option, in one line.
@@ -329,8 +351,8 @@ def read_chunks(
 ) -> Iterator[PointCloud]:
     """Read the points of a file as clouds of at most `chunk` points, for files larger than memory.
 
-    All clouds share one shift. Poses, free space and true rooms come with the first, warnings about the whole file with the
-    last. Meshes, building models, OctoMaps and NumPy archives are read whole and then cut.
+    All clouds share one shift. Poses, free space and true rooms come with the first, warnings about the whole file and landmarks
+    with the last. Meshes, building models, OctoMaps and NumPy archives are read whole and then cut.
 
     Args:
         path: of the file or folder.
@@ -357,7 +379,10 @@ def read_chunks(
         reading = replace(reading, unit=None, up=None)
     up = None if file_format.fixed else reading.up or file_format.up
     gatherer = Gatherer(str(path), up, reading.factor, chunk, warnings)
-    return _iter_chunks(path, _iter_pieces(path, file_format, reading), gatherer, progress)
+    pieces = _iter_pieces(path, file_format, reading)
+    if (beside := find_landmark_file(path)) is not None:
+        pieces = itertools.chain([Piece(np.empty((0, 3)), landmarks=read_landmark_file(beside))], pieces)
+    return _iter_chunks(path, pieces, gatherer, progress)
 
 
 def detect_format(path: Path) -> Format:

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.depth_images import Camera, Frame, iter_pieces, iter_posed_scans
+from topomerge.io.depth_images import Camera, Frame
+from topomerge.io.pictures import iter_frame_pieces
 from topomerge.io.piece import Piece, ReadOptions
 from topomerge.io.trajectory import LONGEST_GAP, Trajectory, read_trajectory
 
@@ -39,7 +40,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     camera, said = _read_camera(path)
     depths = _read_image_list(path, "depth.txt")
     colors = _read_image_list(path, "rgb.txt") if (path / "rgb.txt").is_file() else []
-    yield from iter_pieces(iter_posed_scans(path, _iter_frames(path, depths, colors, trajectory, camera), said), said)
+    yield from iter_frame_pieces(path, _iter_frames(path, depths, colors, trajectory, camera), said, options.text)
 
 
 def _read_camera(path: Path) -> tuple[Camera, list[str]]:
@@ -102,4 +103,4 @@ def _iter_frames(
         if len(colors) and abs(color_times[nearest := int(np.abs(color_times - time).argmin())] - time) <= COLOR_GAP:
             shown = colors[nearest][1]
         done = (number + 1) / len(depths)
-        yield Frame(file, file, camera, pose if near[number] else None, shown, done=done)
+        yield Frame(file, file, camera, pose if near[number] else None, shown, done=done, time=time)

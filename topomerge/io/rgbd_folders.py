@@ -19,7 +19,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from topomerge.errors import InputError
-from topomerge.io.depth_images import Camera, Frame, iter_pieces, iter_posed_scans, read_depth, read_pixels
+from topomerge.io.depth_images import Camera, Frame, read_depth, read_pixels
+from topomerge.io.pictures import iter_frame_pieces
 from topomerge.io.piece import Piece, ReadOptions
 from topomerge.io.trajectory import LONGEST_GAP, Trajectory, iter_number_rows
 from topomerge.types import Array
@@ -41,12 +42,10 @@ class Layout:
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Read points of every depth image in the fixed frame, image by image."""
-    del options
     place = find_layout(path)
     assert place is not None
     layout, folder = place
-    said: list[str] = []
-    yield from iter_pieces(iter_posed_scans(folder, layout.frames(folder), said), said)
+    yield from iter_frame_pieces(folder, layout.frames(folder), [], options.text)
 
 
 def find_layout(path: Path) -> tuple[Layout, Path] | None:

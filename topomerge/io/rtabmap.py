@@ -6,19 +6,22 @@ import re
 import sqlite3
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.depth_images import Camera, Frame, PosedScan, iter_pieces, iter_posed_scans, read_color, read_pixels
+from topomerge.io.depth_images import Camera, Frame, PosedScan, iter_pieces, read_color, read_pixels
+from topomerge.io.pictures import PictureReader, iter_frame_pieces
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_head
+from topomerge.io.sightings import MOST_SIGHTINGS, Sighting, clean_text, compute_heading, fuse_sightings
 from topomerge.io.trajectory import find_invalid_rotations
-from topomerge.types import Array
+from topomerge.types import Array, Landmarks, build_landmarks, join_landmarks
 
 LARGEST_BLOB = 1 << 27  # bytes of a cell, packed or unpacked: an image of 32 megapixels of float depth
 POSE_NUMBERS = 12  # of the upper three rows of a pose
@@ -206,7 +209,6 @@ Poses = dict[int, Array | None]  # (4, 4) of the robot, by node
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Points in the frame of the map, node by node."""
-    del options
     read_head(path, RTABMAP_KIND, b"SQLite format 3\0", 100)
     for ending in ("-journal", "-wal"):
         beside = path.with_name(path.name + ending)
@@ -218,20 +220,33 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         with closing(sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True)) as base:
             base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_BLOB)
             base.execute("PRAGMA trusted_schema = OFF")
-            yield from _iter_pieces(path, base)
+            yield from _iter_pieces(path, base, options.text)
     except sqlite3.Error as error:
         raise build_damage_error(path, RTABMAP_KIND, error) from error
 
 
-def _iter_pieces(path: Path, base: sqlite3.Connection) -> Iterator[Piece]:
+def _iter_pieces(path: Path, base: sqlite3.Connection, text: bool | None) -> Iterator[Piece]:
     version = _read_version(path, base)
     said: list[str] = []
     poses = _read_poses(path, base, version, said)
     kind = _detect_kind(path, base, version)
     if kind == "depth":
-        yield from iter_pieces(iter_posed_scans(path, _iter_frames(path, base, version, poses), said), said)
+        yield from iter_frame_pieces(path, _iter_frames(path, base, version, poses), said, text)
     else:
         yield from iter_pieces(_iter_scans(path, base, version, poses, kind == "flat", said), said)
+        yield _read_pictures(path, base, version, poses, text)
+    yield Piece(np.empty((0, 3)), landmarks=_read_landmarks(path, base, poses), done=1.0)
+
+
+def _read_pictures(path: Path, base: sqlite3.Connection, version: tuple[int, ...], poses: Poses, text: bool | None) -> Piece:
+    """Signs and tags on the pictures of a recording whose points are those of a laser."""
+    reader = PictureReader(text)
+    if reader.wanted:
+        for frame in _iter_frames(path, base, version, poses, reader.is_due):
+            if frame is not None and isinstance(frame.depth, np.ndarray) and not isinstance(frame.color, Path):
+                reader.read_frame(frame, frame.depth, frame.color)
+    landmarks = reader.collect()
+    return Piece(np.empty((0, 3)), landmarks=landmarks, warnings=tuple(reader.warnings), done=1.0)
 
 
 def _read_version(path: Path, base: sqlite3.Connection) -> tuple[int, ...]:
@@ -269,7 +284,7 @@ def _read_poses(path: Path, base: sqlite3.Connection, version: tuple[int, ...], 
         if len(numbers) != POSE_NUMBERS * len(ids) or ids.dtype != np.int32 or numbers.dtype != np.float32:
             raise build_damage_error(path, RTABMAP_KIND, f"{len(numbers):,} numbers of optimised poses for {len(ids):,} nodes")
         rows = numbers.reshape(-1, POSE_NUMBERS)
-        poses: Poses = {int(i): build_pose_matrix(r) for i, r in zip(ids, rows, strict=True) if i > 0}  # below 0 are landmarks
+        poses: Poses = {int(i): build_pose_matrix(r) for i, r in zip(ids, rows, strict=True) if i}  # below 0 are landmarks
     else:
         sessions = base.execute("SELECT COUNT(DISTINCT map_id) FROM Node").fetchone()[0]
         if sessions > 1:
@@ -281,7 +296,7 @@ def _read_poses(path: Path, base: sqlite3.Connection, version: tuple[int, ...], 
         poses = {int(i): decode_pose(blob) for i, blob in nodes}
         said.append("it has no optimised poses: those of the odometry are taken, which drift")
     for node, pose in poses.items():
-        if pose is not None and len(find_invalid_rotations(pose[None])):
+        if pose is not None and node > 0 and len(find_invalid_rotations(pose[None])):
             raise InputError(
                 f"{path}: node {node} has a pose that is not a rotation and a place; optimise the graph in RTAB-Map again"
             )
@@ -332,11 +347,18 @@ def _iter_scans(
         said.append("its scans are slices: it has no depth images, nor scans in space")
 
 
-def _iter_frames(path: Path, base: sqlite3.Connection, version: tuple[int, ...], poses: Poses) -> Iterator[Frame | None]:
-    """The depth images of all nodes; those of several cameras lie side by side in one image."""
+def _iter_frames(
+    path: Path,
+    base: sqlite3.Connection,
+    version: tuple[int, ...],
+    poses: Poses,
+    is_due: Callable[[Array, float], bool] = lambda pose, done: True,
+) -> Iterator[Frame | None]:
+    """The depth images of the nodes that are due; those of several cameras lie side by side in one image."""
     count = base.execute("SELECT COUNT(*) FROM Data WHERE LENGTH(depth) > 4").fetchone()[0]
-    rows = base.execute("SELECT id, calibration, depth, image FROM Data WHERE LENGTH(depth) > 4 ORDER BY id")
-    for number, (node, calibration, blob, image) in enumerate(rows, 1):
+    columns = "Data.id, Node.stamp, calibration, depth, image"
+    rows = base.execute(f"SELECT {columns} FROM Data LEFT JOIN Node USING (id) WHERE LENGTH(depth) > 4 ORDER BY Data.id")
+    for number, (node, stamp, calibration, blob, image) in enumerate(rows, 1):
         check_bytes(f"{path}: node {node}", calibration, blob, image)
         pose = poses.get(node)
         if pose is None:
@@ -346,6 +368,8 @@ def _iter_frames(path: Path, base: sqlite3.Connection, version: tuple[int, ...],
         cameras = decode_cameras(calibration or b"", version, f"{path}: node {node}")
         if not cameras:
             raise InputError(f"{path}: node {node} has a depth image and no camera; calibrate it, or mend the database")
+        if not any(is_due(pose @ camera.mount, number / count) for camera in cameras):
+            continue
         depth, metre = decode_depth(blob, what)
         colors = read_color(image, f"{path}: the image of node {node}") if image and len(image) > 4 else None
         if depth.shape[1] % len(cameras):
@@ -353,7 +377,8 @@ def _iter_frames(path: Path, base: sqlite3.Connection, version: tuple[int, ...],
         shown = _split_image(colors, len(cameras))
         for camera, part, color in zip(cameras, _split_image(depth, len(cameras)), shown, strict=True):
             assert part is not None
-            yield Frame(what, part, camera.scale_to_depth(part.shape, metre), pose @ camera.mount, color, done=number / count)
+            lens, time = camera.scale_to_depth(part.shape, metre), _read_number(stamp)
+            yield Frame(what, part, lens, pose @ camera.mount, color, done=number / count, time=time)
 
 
 def _split_image(image: Array | None, count: int) -> list[Array | None]:
@@ -361,3 +386,92 @@ def _split_image(image: Array | None, count: int) -> list[Array | None]:
     if image is None or image.shape[1] % count:
         return [None] * count
     return list(np.split(image, count, axis=1))
+
+
+LANDMARK_LINK = 8  # type of a link: from a node to a tag, whose number is negative
+NODE_SIGMA, TAG_SIGMA = 1.0, 0.1  # m: of what was named or measured at a node, and of a tag
+WIFI_SENSOR, PRESSURE_SENSOR = 1, 3  # kinds of sensors of a node: dBm of the network it is in, hPa
+WEAKEST, STRONGEST = -127.0, -1.0  # dBm
+LOWEST_PRESSURE, HIGHEST_PRESSURE = 300.0, 1200.0  # hPa
+OWN_NAME = re.compile(r"map-?\d+")  # the label that RTAB-Map itself gives the first node of a session
+FAMILIES = {17: "tag16h5", 18: "tag25h9", 19: "tag36h10", 20: "tag36h11"}  # of OpenCV's dictionaries
+DICTIONARY = re.compile(r"Marker/Dictionary[:=](\d{1,3})\b")
+
+
+def _read_number(value: object) -> float:
+    return float(value) if isinstance(value, int | float) else np.nan
+
+
+def _read_landmarks(path: Path, base: sqlite3.Connection, poses: Poses) -> Landmarks:
+    """Tags, labels, readings of radio and of pressure, where the graph puts their nodes."""
+    tables = dict(base.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
+    plain = {name for name, sql in tables.items() if not re.search(r"(?i)\bAS\b", str(sql))}
+    columns = {f"{table}.{row[1]}" for table in plain & {"Node", "Data"} for row in base.execute(f"PRAGMA table_info({table})")}
+    parts = [_read_tags(path, base, poses, "Info" in plain)] if "Link" in plain else []
+    if "Node.label" in columns:
+        parts.append(_read_labels(base, poses))
+    readings = _read_readings(path, base, columns)
+    for kind in ("radio", "pressure"):
+        rows = [(node, value, time) for k, node, value, time in readings if k == kind and poses.get(node) is not None]
+        nodes, values, times = np.array(rows[:MOST_SIGHTINGS]).reshape(-1, 3).T
+        known: dict[str, Any] = {"number": values, "time": times, "group": nodes, "sigma": NODE_SIGMA}
+        parts.append(build_landmarks(kind, [""] * len(nodes), "RTAB-Map", _find_places(poses, nodes.tolist()), **known))
+    return join_landmarks(parts)
+
+
+def _read_readings(path: Path, base: sqlite3.Connection, columns: set[str]) -> list[tuple[str, int, float, float]]:
+    """Kind, node, value and time of each reading of radio (dBm) and of pressure (hPa); senders of radio are not known."""
+    readings = []
+    if "Node.env_sensors" in columns:
+        for node, blob in base.execute("SELECT id, env_sensors FROM Node WHERE LENGTH(env_sensors) >= 24 ORDER BY id"):
+            check_bytes(f"{path}: node {node}", blob)
+            for kind, value, time in np.frombuffer(blob, "<f8", len(blob) // 24 * 3).reshape(-1, 3).tolist():
+                if kind == WIFI_SENSOR and WEAKEST <= value <= STRONGEST:
+                    readings.append(("radio", node, value, time))
+                elif kind == PRESSURE_SENSOR and LOWEST_PRESSURE <= value <= HIGHEST_PRESSURE:
+                    readings.append(("pressure", node, value, time))
+    if "Data.user_data" in columns:  # as the example of RTAB-Map stores WiFi: dBm and time
+        for node, blob in base.execute("SELECT id, user_data FROM Data WHERE LENGTH(user_data) BETWEEN 13 AND 100 ORDER BY id"):
+            check_bytes(f"{path}: node {node}", blob)
+            values = decode_matrix(blob, f"{path}: the user data of node {node}")
+            if values.shape == (1, 2, 1) and values.dtype == np.float64 and WEAKEST <= values[0, 0, 0] <= STRONGEST:
+                readings.append(("radio", node, float(values[0, 0, 0]), float(values[0, 1, 0])))
+    return readings
+
+
+def _find_places(poses: Poses, nodes: list[int]) -> Array:
+    """(n, 3) m of nodes that have a pose."""
+    places = [pose[:3, 3] for node in nodes if (pose := poses.get(node)) is not None]
+    return np.array(places).reshape(-1, 3)
+
+
+def _read_labels(base: sqlite3.Connection, poses: Poses) -> Landmarks:
+    """What the user called nodes, as names of where they are."""
+    rows = base.execute(f"SELECT id, label FROM Node WHERE LENGTH(label) > 0 ORDER BY id LIMIT {MOST_SIGHTINGS}")
+    named = [(node, clean_text(label)) for node, label in rows if isinstance(label, str) and poses.get(node) is not None]
+    named = [(node, label) for node, label in named if label and not OWN_NAME.fullmatch(label)]
+    places = _find_places(poses, [node for node, _ in named])
+    return build_landmarks("name", [label for _, label in named], "RTAB-Map", places, sigma=NODE_SIGMA)
+
+
+def _read_tags(path: Path, base: sqlite3.Connection, poses: Poses, stated: bool) -> Landmarks:
+    """Tags that nodes saw, where the graph puts them, else where the nodes saw them."""
+    dictionary = None
+    for (text,) in base.execute("SELECT parameters FROM Info LIMIT 1") if stated else ():
+        dictionary = DICTIONARY.search(text if isinstance(text, str) else "")
+    family = FAMILIES.get(int(dictionary[1]), "tag") if dictionary else "tag"
+    links = (
+        f"SELECT from_id, to_id, transform FROM Link WHERE type = {LANDMARK_LINK} ORDER BY from_id, to_id LIMIT {MOST_SIGHTINGS}"
+    )
+    sightings = []
+    for node, tag, blob in base.execute(links):
+        check_bytes(f"{path}: the link of node {node}", blob)
+        place, seen = poses.get(node), decode_pose(blob)
+        if place is None or seen is None or not isinstance(tag, int) or tag >= 0:
+            continue
+        optimised = poses.get(tag)
+        pose = place @ seen if optimised is None else optimised
+        towards = place[:3, 3] - pose[:3, 3]
+        normal = pose[:3, 2] if pose[:3, 2] @ towards > 0 else -pose[:3, 2]
+        sightings.append(Sighting("tag", f"{family}:{-tag}", pose[:3, 3], TAG_SIGMA, heading=compute_heading(normal)))
+    return fuse_sightings(sightings, "RTAB-Map")

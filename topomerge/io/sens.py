@@ -15,8 +15,9 @@ from typing import IO
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.depth_images import Camera, Frame, iter_pieces, iter_posed_scans, read_color
+from topomerge.io.depth_images import Camera, Frame, read_color
 from topomerge.io.grid import PIXELS
+from topomerge.io.pictures import iter_frame_pieces
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error
 from topomerge.types import Array
 
@@ -32,9 +33,7 @@ PNG_COLOR, JPEG_COLOR = 1, 2
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Read points of every frame in the frame of the poses."""
-    del options
-    said: list[str] = []
-    yield from iter_pieces(iter_posed_scans(path, _iter_frames(path), said), said)
+    yield from iter_frame_pieces(path, _iter_frames(path), [], options.text)
 
 
 def _iter_frames(path: Path) -> Iterator[Frame]:

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from topomerge.errors import InputError
+from topomerge.io.landmarks import is_landmark_file
 from topomerge.io.piece import Piece, ReadOptions
 from topomerge.io.points import Format, detect_format, iter_guarded
 
@@ -75,6 +76,7 @@ def list_tile_suffixes() -> tuple[str, ...]:
 def _list_tiles(folder: Path) -> list[Path]:
     able = list_tile_suffixes()
     files = [p for p in folder.iterdir() if p.suffix.lower() in able and not p.name.startswith(".") and p.is_file()]
+    files = [p for p in files if not is_landmark_file(p)]
     return sorted(files, key=lambda p: ([int(n) for n in re.findall(r"\d+", p.stem)], p.name))
 
 

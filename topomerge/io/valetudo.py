@@ -2,7 +2,7 @@
 
 Layers of pixels: `wall`, `floor`, and one `segment` for each room that the robot tells apart, whose pixels are floor. Walls
 become walls as of a floor plan. The frame is the robot's own, so that maps of one home on two days fit: x right, y up, the corner
-of pixel (0, 0) at the origin. The robot's own rooms are no truth and are not kept: `parse_robot_map` gives them.
+of pixel (0, 0) at the origin. The robot's own rooms are no truth and are not kept: `parse_robot_map` gives them. Their names are.
 Source: https://valetudo.cloud (map data format); `pixels` lists x, y, `compressedPixels` x, y and how many follow to the right.
 """
 
@@ -20,10 +20,11 @@ from topomerge.errors import InputError
 from topomerge.io import grid
 from topomerge.io.grid import check_outside_floor
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error
-from topomerge.types import Array
+from topomerge.types import Array, Landmarks, build_landmarks
 
 KIND = "a vacuum robot's map"
 FREE_LAYERS = ("floor", "segment")
+NAME_HEIGHT = 1.0  # m above the floor, of a room's name
 WALLED = 0.3  # share of the floor's outline along which robots that draw walls have one: they have 0.5 to 1, the others under 0.1
 
 
@@ -65,7 +66,8 @@ def iter_pieces(path: Path, about: Mapping[str, Any], options: ReadOptions) -> I
         walls |= outline
         warnings = (f"{path}: draws walls along {walled:.0%} of its floor's outline; the outline was taken for walls",)
     outside = [f"{path}: {doubt}; save the map again" for doubt in check_outside_floor(walls, free, drawn.resolution)]
-    yield Piece(np.empty((0, 3)), warnings=(*warnings, *outside), done=0.1)
+    names = find_segment_names(drawn, path.name)
+    yield Piece(np.empty((0, 3)), warnings=(*warnings, *outside), done=0.1, landmarks=names)
     x, y = (drawn.origin - drawn.resolution).tolist()
     plan = grid.Plan(path, drawn.resolution, (x, y, 0.0))
     yield from grid.extrude(path, np.flipud(walls), np.flipud(free), plan, options)
@@ -108,6 +110,20 @@ def parse_robot_map(path: Path, about: Mapping[str, Any]) -> RobotMap:
     origin = np.array([low[0], -(low[1] + height)]) * cell / 100
     rooms[walls] = 0
     return RobotMap(np.flipud(walls), np.flipud(free), np.flipud(rooms), tuple(names), cell / 100, origin)
+
+
+def find_segment_names(drawn: RobotMap, source: str) -> Landmarks:
+    """Find the names that people gave the robot's rooms, each at the pixel of its room that is nearest to its middle."""
+    row, column = np.nonzero(drawn.rooms)
+    room = drawn.rooms[row, column]
+    size = np.maximum(np.bincount(room, minlength=len(drawn.names) + 1), 1)
+    middle = [np.bincount(room, axis, len(size)) / size for axis in (row, column)]
+    order = np.lexsort((np.hypot(row - middle[0][room], column - middle[1][room]), room))
+    rooms, first = np.unique(room[order], return_index=True)
+    places = drawn.origin + (np.column_stack([column, row])[order[first]] + 0.5) * drawn.resolution
+    named = np.array([bool(drawn.names[i - 1].strip()) for i in rooms.tolist()], bool)
+    position = np.column_stack([places, np.full(len(places), NAME_HEIGHT)])[named]
+    return build_landmarks("name", [drawn.names[i - 1] for i in rooms[named].tolist()], source, position)
 
 
 def _get_layer_name(layer: dict[str, Any]) -> str:

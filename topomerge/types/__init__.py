@@ -5,7 +5,19 @@ points of map b into the frame of map a. A room label of -1 means "no room".
 """
 
 from topomerge.types.grid import Array, LogFn, PointCloud, Sim3, TrueRoom, VoxelGrid, select_lowest_of_column
-from topomerge.types.landmarks import LANDMARK_DTYPE, LANDMARK_KINDS, Landmarks, build_landmarks, join_landmarks, move_landmarks
+from topomerge.types.landmarks import (
+    LANDMARK_DTYPE,
+    LANDMARK_KINDS,
+    LONGEST_VALUE,
+    MOST_LANDMARKS,
+    Landmarks,
+    build_landmarks,
+    clean_landmarks,
+    find_room_names,
+    join_landmarks,
+    move_landmarks,
+    transform_landmarks,
+)
 from topomerge.types.placement import Deformation, Placement
 from topomerge.types.topometric_map import (
     AREA_DTYPE,
@@ -38,6 +50,8 @@ __all__ = [
     "LANDMARK_DTYPE",
     "LANDMARK_KINDS",
     "LEVELLED",
+    "LONGEST_VALUE",
+    "MOST_LANDMARKS",
     "OLDER_EDGE_DTYPE",
     "ROOM_DTYPE",
     "ROOM_ODDS",
@@ -56,9 +70,11 @@ __all__ = [
     "add_outline_odds",
     "build_landmarks",
     "classify_door_state",
+    "clean_landmarks",
     "convert_pose_to_files",
     "convert_pose_to_maps",
     "filter_confident",
+    "find_room_names",
     "is_level",
     "is_mostly_unseen",
     "join_landmarks",
@@ -67,5 +83,6 @@ __all__ = [
     "read_levelling",
     "select_lowest_of_column",
     "select_rooms",
+    "transform_landmarks",
     "transform_points",
 ]

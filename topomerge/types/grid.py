@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from topomerge.kernels import stencil, voxels
+
+if TYPE_CHECKING:
+    from topomerge.types.landmarks import Landmarks
 
 Array = NDArray[Any]
 LogFn = Callable[[str], None]  # is called with a line of progress
@@ -189,6 +192,7 @@ class PointCloud:
         warnings: what looked wrong while it was read.
         intensities: (N,) float32, how much of its light came back, in whatever the file counts in.
         upright: z is known to be up, so that nobody needs to level it: of a plan, a building model, a simulated scan.
+        landmarks: signs, tags, radio, pressure, objects and names in the file's frame, m; of portions the last one has them.
 
     Raises:
         ValueError: arrays of other shapes, or points that are no array of numbers.
@@ -206,6 +210,7 @@ class PointCloud:
     warnings: tuple[str, ...] = ()
     intensities: Array | None = None
     upright: bool = False
+    landmarks: Landmarks | None = None
 
     def __post_init__(self) -> None:
         numbers = isinstance(self.points, np.ndarray) and self.points.dtype.kind in "biuf"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,6 +10,9 @@ import numpy as np
 from topomerge.types.grid import Array, Sim3, require
 
 LANDMARK_KINDS = ("text", "tag", "radio", "pressure", "object", "name")
+MOST_LANDMARKS = 2_000_000  # of a map: a walk of a day reads radio a million times
+LONGEST_VALUE = 200  # characters of a text, a tag, an address, a class or a name
+FARTHEST = 1e9  # m, of a coordinate
 LANDMARK_DTYPE = np.dtype(
     [
         ("kind", "u1"),  # index into LANDMARK_KINDS
@@ -116,9 +119,63 @@ def join_landmarks(parts: Iterable[Landmarks]) -> Landmarks:
 
 def move_landmarks(landmarks: Landmarks, pose: Sim3) -> Landmarks:
     """Carry landmarks into another frame: positions, their uncertainty, and headings of tags and signs."""
+    return transform_landmarks(landmarks, pose.apply, pose.yaw, pose.scale)
+
+
+def transform_landmarks(
+    landmarks: Landmarks, transform: Callable[[Array], Array], yaw: float = 0.0, scale: float = 1.0
+) -> Landmarks:
+    """Carry landmarks into another frame by a function of positions.
+
+    Args:
+        landmarks: any.
+        transform: (n, 3) m -> (n, 3) m; is given the positions that are known.
+        yaw: rad, by which headings of tags and signs turn.
+        scale: of the uncertainty of positions.
+    """
     table = landmarks.table.copy()
-    table["position"] = pose.apply(table["position"])
-    table["sigma"] *= pose.scale
+    known = np.isfinite(table["position"]).all(axis=1)
+    table["position"][known] = transform(table["position"][known])
+    table["sigma"] *= scale
     turned = landmarks.is_kind("tag", "text")
-    table["number"][turned] = (table["number"][turned] + pose.yaw + np.pi) % (2 * np.pi) - np.pi
+    table["number"][turned] = (table["number"][turned] + yaw + np.pi) % (2 * np.pi) - np.pi
     return replace(landmarks, table=table)
+
+
+def clean_landmarks(landmarks: Landmarks) -> Landmarks:
+    """Return landmarks that a map can keep: what a stranger's file says is bounded, and what is no number is not known.
+
+    Strings are one printable line of `LONGEST_VALUE` characters at most. A position of which a coordinate is not finite or beyond
+    `FARTHEST` is not known. Confidences are 0 to 1. Signs, tags, objects and names without a string are left out.
+    """
+    values, sources = (tuple(map(_clean_string, strings)) for strings in (landmarks.values, landmarks.sources))
+    table = landmarks.table.copy()
+    table["position"][~(np.abs(table["position"]) <= FARTHEST).all(axis=1)] = np.nan
+    table["sigma"][~((table["sigma"] >= 0) & (table["sigma"] <= FARTHEST))] = np.nan
+    for column in ("number", "time"):
+        table[column][~np.isfinite(table[column])] = np.nan
+    table["confidence"] = np.clip(np.nan_to_num(table["confidence"], nan=0.0), 0, 1)
+    for column in ("room", "storey", "group"):
+        table[column] = np.maximum(table[column], -1)
+    empty = np.array([not value for value in (*values, "")])[table["value"]]
+    kept = ~empty | landmarks.is_kind("radio", "pressure")
+    return Landmarks(table if kept.all() else table[kept], values, sources)
+
+
+def _clean_string(value: str) -> str:
+    if value.isprintable() and len(value) <= LONGEST_VALUE and value == value.strip():
+        return value
+    printable = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in " ".join(value.split()))
+    return printable[:LONGEST_VALUE].strip()
+
+
+def find_room_names(landmarks: Landmarks, rooms: int) -> list[str]:
+    """Return (rooms) the name of each room: the surest of its names, without any its surest sign with a digit; "" without."""
+    rank = np.select([landmarks.is_kind("name"), landmarks.is_kind("text")], [0, 1], 2)
+    rows = np.flatnonzero((landmarks.table["room"] >= 0) & (landmarks.table["room"] < rooms) & (rank < 2))
+    out = [""] * rooms
+    for row in rows[np.lexsort((rows, -landmarks.table["confidence"][rows], rank[rows]))].tolist():
+        room, value = int(landmarks.table["room"][row]), landmarks.values[landmarks.table["value"][row]]
+        if not out[room] and (rank[row] == 0 or any(c.isdigit() for c in value)):
+            out[room] = value
+    return out

@@ -42,6 +42,7 @@ from topomerge.viz.tables import (
     build_element,
     join,
     render_cell,
+    render_landmarks,
     render_properties,
     render_room_link,
     render_rooms_table,
@@ -216,7 +217,8 @@ def render_merge_html(result: MergeResult) -> str:
         view = build_element(
             "div", render_plan_view(result.map, sheet, plans), render_scroller(render_rooms_table(result.map)), class_="beside"
         )
-        sections.append(render_section("The joined map, rooms extracted again", view, "joined"))
+        parts = join([view, *render_landmarks(result.map)])
+        sections.append(render_section("The joined map, rooms extracted again", parts, "joined"))
         sections.append(_render_space(result))
         data = {"scene-data": _build_scene(result, sheet.turn), "mates": _collect_partners(result)}
     if registration is not None:

@@ -17,16 +17,19 @@ import numpy as np
 from topomerge import __version__
 from topomerge.errors import InputError
 from topomerge.fusion.result import BEND_PARAMETER
+from topomerge.fusion.transfer import LANDMARK_PARAMETER
 from topomerge.io.archive import replace_on_success
 from topomerge.types import Array, TopometricMap
 from topomerge.viz.plan import StoreyPlan, build_scene_data
 from topomerge.viz.svg import Sheet, lay_out, render_plan_svgs
 from topomerge.viz.tables import (
+    SHOWN_KINDS,
     Markup,
     build_element,
     embed_json,
     join,
     render_doors_table,
+    render_landmarks,
     render_properties,
     render_rooms_table,
     render_seconds_table,
@@ -59,7 +62,7 @@ def render_report_html(map: TopometricMap) -> str:
     sections = [
         render_summary(map),
         render_warnings(map.warnings),
-        render_section("Plan and rooms", rooms, "plan"),
+        render_section("Plan and rooms", join([rooms, *render_landmarks(map)]), "plan"),
         render_section("3D view", render_scene_view("scene-data"), "space"),
         render_section("Doors and stairs", render_scroller(render_doors_table(map)), "doors"),
         render_section("How it was made", origin, "made"),
@@ -124,6 +127,7 @@ def render_summary(map: TopometricMap) -> Markup:
         (str(len(map.storeys)), "storey" if len(map.storeys) == 1 else "storeys", ""),
         (str(int(way.sum())), "doors and openings", f"{shut} shut" if shut else ""),
         (str(stairs), "stairs and ramps", ""),
+        (f"{len(map.landmarks):,}".replace(",", "\u202f"), "landmark" if len(map.landmarks) == 1 else "landmarks", ""),
         (f"{map.grid.edge * 100:.3g} cm", "cells", f"{len(map.grid):,} occupied".replace(",", "\u202f")),
     ]
     items = [
@@ -149,6 +153,7 @@ def render_parameters(map: TopometricMap) -> Markup:
     values = {"source": map.source or "–", "voxel_size": float(map.grid.edge), **map.parameters}
     if isinstance(values.get(BEND_PARAMETER), list):  # hundreds of numbers
         values[BEND_PARAMETER] = f"of {len(values[BEND_PARAMETER])} of its maps"
+    values.pop(LANDMARK_PARAMETER, None)  # the table of landmarks shows them
     return render_properties(values, "Parameters")
 
 
@@ -172,6 +177,9 @@ def render_plan_view(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPla
     names = list_storey_names(map)
     choices = [build_element("button", name, type="button", data_storey=i) for i, (name, _) in enumerate(names) if len(names) > 1]
     layers = [("labels", "numbers", True), ("graph", "graph", True), ("doors", "doors", True)]
+    marked = bool(map.landmarks.is_kind(*SHOWN_KINDS).any())
+    if marked:
+        layers.append(("landmarks", "landmarks", True))
     if len(map.narrows):
         layers.append(("areas", "areas", True))
     if len(names) > 1:
@@ -183,6 +191,8 @@ def render_plan_view(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPla
     if len(map.rooms):
         slider = build_element("input", type="range", min=0, max=90, step=10, value=0, data_sure="")
         boxes.append(build_element("label", "minimum confidence: ", slider))
+    if marked:
+        boxes.append(build_element("label", "find: ", build_element("input", type="search", data_find="", size=12)))
     groups = [("choices", choices), ("layers", boxes), ("zoom", render_zoom_buttons())]
     bar = build_element("div", *(build_element("div", *parts, class_=name) for name, parts in groups if parts), class_="controls")
     figures = [
@@ -215,6 +225,7 @@ def render_legend(map: TopometricMap) -> Markup:
         ("stairs", "stairs or ramp", bool((~way).any())),
         ("glimpsed", "glimpsed: only looked into", bool(map.rooms["glimpsed"].any())),
         ("narrow", "narrowing within a room", len(map.narrows) > 0),
+        ("landmark", "sign, tag, object or name", bool(map.landmarks.is_kind(*SHOWN_KINDS).any())),
         ("wall", "wall, cut at 1 to 1.9 m", True),
         ("seen", "seen, not a room", True),
     ]

@@ -12,9 +12,18 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.io.rooms_ply import assign_room_colours
-from topomerge.types import Array, TopometricMap
+from topomerge.types import LANDMARK_KINDS, Array, TopometricMap, find_room_names
 from topomerge.viz.plan import Frame, Place, StoreyPlan, compute_frame, find_label_places, format_hex_colour, rasterize_storeys
-from topomerge.viz.tables import Markup, build_element, format_edge_confidence, format_room_confidence, format_window_confidence
+from topomerge.viz.tables import (
+    SHOWN_KINDS,
+    Markup,
+    build_element,
+    fold_words,
+    format_edge_confidence,
+    format_room_confidence,
+    format_window_confidence,
+    shorten,
+)
 
 UPRIGHT_ANGLE = np.radians(3.0)  # buildings that stand this nearly upright are drawn as they are
 TALL = 1.15  # turned buildings that are taller than wide by this are laid down
@@ -222,6 +231,7 @@ def _format_ring(pixels: Array, sheet: Sheet) -> str:
 
 SCREEN = (840, 560)  # pixels that the drawing is expected to have: the page's script knows better
 PLAN_MARGIN = 0.04  # of the longer side, around the building
+MOST_LANDMARKS_DRAWN = 1000  # on a storey
 SHORTEST_FLIGHT = 0.5  # m: stairs whose ends are nearer to each other, seen from above, are drawn as a sign
 
 
@@ -239,6 +249,7 @@ def render_plan_svgs(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPla
     """
     colours = assign_room_colours(map) if colours is None else colours
     named = [find_label_places(plan, sheet.frame) for plan in plans]
+    names = find_room_names(map.landmarks, len(map.rooms))
     everywhere = {room: place for of_storey in named for room, place in of_storey.items()}
     drawings = []
     for storey, plan in enumerate(plans):
@@ -251,7 +262,10 @@ def render_plan_svgs(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPla
             _render_layer("areas", _render_narrows(map, sheet, storey)),
             _render_layer("graph", _render_graph(map, sheet, storey, everywhere)),
             _render_layer("doors", _render_doors(map, sheet, storey)),
-            _render_layer("labels", [_render_label(map, sheet, i, place) for i, place in sorted(named[storey].items())]),
+            _render_layer("landmarks", _render_landmarks(map, sheet, storey)),
+            _render_layer(
+                "labels", [_render_label(map, sheet, i, place, names[i]) for i, place in sorted(named[storey].items())]
+            ),
         ]
         drawings.append(render_drawing(map, sheet, storey, layers))
     return drawings
@@ -320,11 +334,30 @@ def _render_room(map: TopometricMap, sheet: Sheet, room: int, path: str, colour:
     return Markup(shape + build_element("path", class_="over", **drawn))
 
 
-def _render_label(map: TopometricMap, sheet: Sheet, room: int, place: Place) -> Markup:
-    """Number and area; the page's script hides what has no room."""
+def _render_landmarks(map: TopometricMap, sheet: Sheet, storey: int) -> list[Markup]:
+    """A mark with its text for each sign, tag, object and name of a storey whose place is known, of very many the surest."""
+    table = map.landmarks.table
+    shown = map.landmarks.is_kind(*SHOWN_KINDS) & np.isfinite(table["position"]).all(axis=1) & (table["storey"] == storey)
+    rows = np.flatnonzero(shown)
+    rows = np.sort(rows[np.argsort(-table["confidence"][rows], kind="stable")[:MOST_LANDMARKS_DRAWN]])
+    parts = []
+    for row, (x, y) in zip(table[rows], sheet.convert_to_cm(table["position"][rows]).tolist(), strict=True):
+        value, kind = map.landmarks.values[row["value"]], LANDMARK_KINDS[row["kind"]]
+        words = build_element("title", f"{kind}: {value}")
+        dot, text = build_element("circle", r=1), build_element("text", shorten(value))
+        about = {
+            "data_room": sheet.format_room_id(int(row["room"])) if row["room"] >= 0 else None,
+            "data_words": fold_words([value]),
+        }
+        parts.append(build_element("g", words, dot, text, class_=f"landmark {kind}", transform=f"translate({x} {y})", **about))
+    return parts
+
+
+def _render_label(map: TopometricMap, sheet: Sheet, room: int, place: Place, name: str) -> Markup:
+    """Number, and its name or else its area; the page's script hides what has no room."""
     x, y = sheet.locate((place.x, place.y))
     number = build_element("text", str(room), class_="number")
-    area = build_element("text", f"{map.rooms['area'][room]:.1f} m²", class_="size")
+    area = build_element("text", shorten(name) if name else f"{map.rooms['area'][room]:.1f} m²", class_="size")
     clear = round(100 * place.clear)
     about = {"data_room": sheet.format_room_id(room), "data_clear": clear, "data_sure": format_room_confidence(map.rooms[room])}
     return build_element("g", number, area, class_="label", transform=f"translate({x} {y})", **about)

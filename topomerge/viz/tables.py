@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.io.listing import convert_to_plain, describe_room
+from topomerge.io.listing import convert_to_plain, describe_landmarks, describe_room
 from topomerge.io.rooms_ply import assign_room_colours
-from topomerge.types import TopometricMap, classify_door_state
+from topomerge.types import LANDMARK_KINDS, TopometricMap, classify_door_state, find_room_names
 from topomerge.viz.plan import format_hex_colour
 
 CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")  # no text on a page needs them, and names of files may hold them
@@ -85,6 +85,9 @@ def _format_probability(odds: float) -> str:
     return f"{odds:.3f}"
 
 
+SHOWN_KINDS = ("text", "tag", "object", "name")  # of landmarks; readings of radio are as many as points of a cloud
+MOST_OF_ROOM, MOST_LISTED = 50, 1000  # landmarks of a room that can be found, and of a map that are listed
+SHOWN_OF_ROOM, SHOWN_LETTERS = 6, 24
 ROOM_WORDS = {  # of `describe_room`, and why
     "outside": "probably outdoors",
     "glimpsed": "probably only looked into, through a door or a window",
@@ -127,12 +130,60 @@ def render_share_bar(share: float) -> Markup:
     return join([bar, f"{100 * full:.0f} %"])
 
 
+def shorten(value: str) -> str:
+    """Shorten a text to what fits on a plan."""
+    return value if len(value) <= SHOWN_LETTERS else value[: SHOWN_LETTERS - 1] + "…"
+
+
+def fold_words(values: Iterable[str]) -> str:
+    """Fold texts to what the page's search compares: small letters, a line each."""
+    return "\n".join(value.lower() for value in values)
+
+
+def list_room_landmarks(map: TopometricMap) -> list[list[str]]:
+    """List for each room the strings of its landmarks, each once: its name first, then the surest."""
+    found: list[dict[str, None]] = [{name: None} if name else {} for name in find_room_names(map.landmarks, len(map.rooms))]
+    table = map.landmarks.table
+    rows = np.flatnonzero(map.landmarks.is_kind(*SHOWN_KINDS) & (table["room"] >= 0))
+    for row in table[rows[np.argsort(-table["confidence"][rows], kind="stable")]]:
+        if len(found[row["room"]]) < MOST_OF_ROOM:
+            found[row["room"]][map.landmarks.values[row["value"]]] = None
+    return [list(values) for values in found]
+
+
+def render_landmarks(map: TopometricMap, key: str = "") -> list[Markup]:
+    """Render the list of a map's landmarks, folded; nothing where it has none."""
+    table = map.landmarks.table
+    rows = np.flatnonzero(map.landmarks.is_kind(*SHOWN_KINDS))
+    if not len(rows):
+        return []
+    names = (("kind", "text"), ("value", "text"), ("room", "number"), ("storey", "number"), ("x m", "number"), ("y m", "number"))
+    lines = []
+    for row in table[np.sort(rows[np.argsort(-table["confidence"][rows], kind="stable")[:MOST_LISTED]])]:
+        value, room = map.landmarks.values[row["value"]], int(row["room"])
+        cells = [
+            render_cell(LANDMARK_KINDS[row["kind"]], kind="text"),
+            render_cell(value, kind="text"),
+            render_cell(render_room_link(key, room) if room >= 0 else "–", room),
+            render_cell(str(row["storey"]) if row["storey"] >= 0 else "–", int(row["storey"])),
+            *(measure(v, 2) for v in row["position"][:2].tolist()),
+            render_cell(f"{100 * row['confidence']:.0f} %", float(row["confidence"])),
+            render_cell(map.landmarks.sources[row["source"]], kind="text"),
+        ]
+        lines.append(build_element("tr", *cells, data_words=fold_words([value])))
+    listed = render_table([*names, ("confidence", "number"), ("source", "text")], lines, "Landmarks")
+    words = f"{describe_landmarks(map.landmarks)}{f', the surest {MOST_LISTED}' if len(rows) > MOST_LISTED else ''}"
+    frame = build_element("div", listed, class_="scroller", tabindex=0)
+    return [build_element("details", build_element("summary", words), frame, class_="more")]
+
+
 def render_rooms_table(map: TopometricMap, key: str = "", only: Iterable[int] | None = None) -> Markup:
     """Render all rooms, or some of them; rows carry `data-room`, `data-storey` and `data-sure`."""
-    names = ("room", "storey", "area m²", "height m", "seen", "entered", "confidence", "doors")
-    columns = [*((name, "number") for name in names), ("leads to", "text")]
-    several_storeys = len(map.storeys) > 1
-    columns = [column for column in columns if several_storeys or column[0] != "storey"]
+    names = ("area m²", "height m", "seen", "entered", "confidence", "doors")
+    marks, several_storeys = list_room_landmarks(map), len(map.storeys) > 1
+    columns = [("room", "number"), *([("storey", "number")] if several_storeys else [])]
+    columns += [("landmarks", "text")] if any(marks) else []
+    columns += [*((name, "number") for name in names), ("leads to", "text")]
     colours = assign_room_colours(map)
     doors = np.bincount(map.edges["rooms"].ravel(), minlength=len(map.rooms))
     rows = []
@@ -147,6 +198,7 @@ def render_rooms_table(map: TopometricMap, key: str = "", only: Iterable[int] | 
         cells = [
             render_cell(join([swatch, str(i)]), i),
             *([render_cell(str(room["storey"]), int(room["storey"]))] if several_storeys else []),
+            *([render_cell(_join_shown(marks[i]), kind="text")] if any(marks) else []),
             measure(room["area"], 1),
             measure(room["height"], 2, room["height"] > 0),
             render_cell(seen, float(room["completeness"])),
@@ -155,8 +207,13 @@ def render_rooms_table(map: TopometricMap, key: str = "", only: Iterable[int] | 
             render_cell(leads, kind="text"),
         ]
         place = {"data_room": f"{key}{i}", "data_storey": int(room["storey"]), "data_sure": format_room_confidence(room)}
+        place |= {"data_words": fold_words([str(i), *marks[i]])} if any(marks) else {}
         rows.append(build_element("tr", *cells, **place, tabindex=0))
     return render_table(columns, rows, "Rooms")
+
+
+def _join_shown(values: Sequence[str]) -> str:
+    return ", ".join([*map(shorten, values[:SHOWN_OF_ROOM]), *(["…"] if len(values) > SHOWN_OF_ROOM else [])])
 
 
 def _list_neighbours(map: TopometricMap) -> list[list[int]]:

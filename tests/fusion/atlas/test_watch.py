@@ -19,13 +19,14 @@ from tests.fusion.atlas.atlas_scenes import NAMES, office_map, truth
 from tests.scenes import Scene
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
+from topomerge.extraction.landmarks import add_landmarks
 from topomerge.fusion.atlas.folder import read_atlas
 from topomerge.fusion.atlas.maps import Maps, hash_map
 from topomerge.fusion.atlas.store import add, remove
 from topomerge.fusion.atlas.watch import SOURCES_FILE, FolderWatcher, Reader, compute_stamp, iter_changes, read_sources
 from topomerge.io.maps import load_map
 from topomerge.matching.poses import PoseHypothesis
-from topomerge.types import Sim3
+from topomerge.types import Sim3, build_landmarks
 
 SEEDS = {"three": 3, "twenty": 20}
 forks = pytest.mark.skipif(not hasattr(os, "fork"), reason="kills a copy of this process")
@@ -290,3 +291,19 @@ def test_words_of_what_is_taken_apart_and_joined():
     before = {"a": 0, "b": 0, "c": 1}
     assert list(iter_changes({"a": 0, "b": 1, "c": 0, "d": 0}, before)) == ["taken apart: a | b", "joined now: a + c"]
     assert list(iter_changes({"a": 0, "b": 0, "c": 1, "d": 0}, before)) == []
+
+
+def test_a_table_of_landmarks_is_no_map_but_its_map_is_read_again(scans, apart, tmp_path):
+    seen(scans, tmp_path / "site")
+    (scans / "1.landmarks.csv").write_text("kind,value,room\nname,Lab,0\n")
+    lines = seen(scans, tmp_path / "site")
+    assert lines.read == ["1.tmap"] and not lines.warned and len(read_atlas(tmp_path / "site").entries) == 4
+    assert seen(scans, tmp_path / "site").read == []
+    (scans / "1.landmarks.csv").write_text("kind,value,room\nname,Hall,0\n")
+    assert seen(scans, tmp_path / "site").read == ["1.tmap"]
+
+
+def test_maps_that_differ_by_a_sign_are_two():
+    marked = add_landmarks(room(1), build_landmarks("text", ["101"], "here", room=0))
+    assert len({hash_map(room(1)), hash_map(marked)}) == 2 and hash_map(marked) == hash_map(marked)
+    assert len({hash_map(add_landmarks(room(1), build_landmarks("text", [v], "here", room=0))) for v in ("101", "102")}) == 2

@@ -25,6 +25,7 @@ from topomerge.fusion.atlas.solve import Proposed
 from topomerge.fusion.atlas.store import Change, Report, build_entry, change
 from topomerge.fusion.fuse import match_common_rooms
 from topomerge.fusion.inputs import check_cells, check_units, resolve_link_threshold
+from topomerge.io.landmarks import find_landmark_file, is_landmark_file
 from topomerge.io.listing import format_json
 from topomerge.io.maps import load_map
 from topomerge.io.points import PICTURES, list_suffixes
@@ -95,7 +96,7 @@ def compute_stamp(path: Path, options: str) -> str:
     """Hash of the names, sizes and times of change of a file, or of all files of a folder, and of the options that it is read
     with; empty where it is gone."""
     try:
-        of = [(str(p.relative_to(path)), p.stat().st_size, p.stat().st_mtime_ns) for p in files_of(path)]
+        of = [(_name_file(p, path), p.stat().st_size, p.stat().st_mtime_ns) for p in files_of(path)]
     except OSError:
         return ""
     return hashlib.sha256(repr((of, options)).encode()).hexdigest()[:16] if of else ""
@@ -109,17 +110,22 @@ def compute_digest(path: Path, options: str) -> str:
     """
     digest = hashlib.sha256(f"{options}\0{path.suffix.lower()}\0".encode())
     for file in files_of(path):
-        digest.update(f"{file.relative_to(path)}\0{file.stat().st_size}\0".encode())
+        digest.update(f"{_name_file(file, path)}\0{file.stat().st_size}\0".encode())
         with file.open("rb") as stream:
             while block := stream.read(HASHED_AT_ONCE):
                 digest.update(block)
     return digest.hexdigest()[:32]
 
 
+def _name_file(file: Path, path: Path) -> str:
+    return str(file.relative_to(path)) if file.is_relative_to(path) else file.name
+
+
 def files_of(path: Path) -> list[Path]:
-    """The file itself, or all files in a folder, in their order; without hidden ones."""
+    """The file itself and the landmarks beside it, or all files in a folder, in their order; without hidden ones."""
     if not path.is_dir():
-        return [path]
+        beside = find_landmark_file(path)
+        return [path] if beside is None else [path, beside]
     inside = (p for p in path.rglob("*") if not any(part.startswith(".") for part in p.relative_to(path).parts))
     return sorted(p for p in inside if p.is_file())
 
@@ -271,7 +277,7 @@ class FolderWatcher:
         simulated = list_simulation_files(self.folder)
         described = {p.stem for p in there if p.suffix.lower() in (".yaml", ".yml")}  # their pictures are no maps of their own
         kinds = {*list_suffixes(), ".tmap"}
-        there = [p for p in there if p.name not in simulated]
+        there = [p for p in there if p.name not in simulated and not is_landmark_file(p)]
         own = [p for p in there if not (p.suffix.lower() in PICTURES and p.stem in described)]
         for p in sorted({p for p in own if p.is_symlink() and not p.exists()} - self._broken):
             self.tell(f"{p}: is a link to what is not there; it is skipped until it is", True)

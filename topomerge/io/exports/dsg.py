@@ -1,6 +1,7 @@
 """A 3D scene graph as JSON of Spark-DSG, which Hydra and its tools read: buildings, rooms and places.
 
-The layers of that library are 3 places, 4 rooms, 5 buildings. There is one building; the storey of a room stands in its metadata.
+The layers of that library are 2 objects, 3 places, 4 rooms, 5 buildings. Objects, signs and tags are objects (`kind` in their
+metadata) of the place that is nearest in their room. There is one building; the storey of a room stands in its metadata.
 Places are the areas of rooms (`p0`, …) and the doors, stairs and so on between them; they are joined as one can walk. Written as
 spark-dsg 1.1.3 writes: https://github.com/MIT-SPARK/Spark-DSG.
 """
@@ -18,11 +19,17 @@ import shapely
 from topomerge.io.archive import replace_on_success
 from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.structure.floors import build_floor_polygons, find_inside_point
-from topomerge.types import ROOM_ODDS, Array, TopometricMap
+from topomerge.types import LANDMARK_KINDS, ROOM_ODDS, Array, TopometricMap, find_room_names
 
 VERSION = {"major": 1, "minor": 1, "patch": 3}
-PLACE_LAYER, ROOM_LAYER, BUILDING_LAYER = 3, 4, 5
-LAYERS = {"AGENTS": 2, "OBJECTS": 2, "PLACES": PLACE_LAYER, "ROOMS": ROOM_LAYER, "BUILDINGS": BUILDING_LAYER}
+OBJECT_LAYER, PLACE_LAYER, ROOM_LAYER, BUILDING_LAYER = 2, 3, 4, 5
+LAYERS = {
+    "AGENTS": OBJECT_LAYER,
+    "OBJECTS": OBJECT_LAYER,
+    "PLACES": PLACE_LAYER,
+    "ROOMS": ROOM_LAYER,
+    "BUILDINGS": BUILDING_LAYER,
+}
 NO_LABEL = 2**32 - 1
 NO_ROTATION = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
 GREY = (128, 128, 128)
@@ -38,6 +45,9 @@ def save(map: TopometricMap, path: Path) -> None:
     """
     nodes, edges = [*_iter_building_nodes(map), *_iter_room_nodes(map)], list(_iter_room_edges(map))
     for node, its_edges in _iter_places(map):
+        nodes.append(node)
+        edges += its_edges
+    for node, its_edges in _iter_objects(map):
         nodes.append(node)
         edges += its_edges
     graph = {
@@ -99,10 +109,12 @@ def _iter_building_nodes(map: TopometricMap) -> Iterator[Json]:
 
 
 def _iter_room_nodes(map: TopometricMap) -> Iterator[Json]:
+    names = find_room_names(map.landmarks, len(map.rooms))
     for r, (room, colour) in enumerate(zip(map.rooms, assign_room_colours(map), strict=True)):
         properties = {name: room[name].tolist() for name in ROOM_METADATA}
         more = {"metadata": properties, "bounding_box": _build_box(room["lo"], room["hi"]), "semantic_class_probabilities": {}}
-        yield _build_node(ROOM_LAYER, encode_symbol("R", r), "RoomNodeAttributes", f"room {r}", room["centroid"], colour, **more)
+        name = names[r] or f"room {r}"
+        yield _build_node(ROOM_LAYER, encode_symbol("R", r), "RoomNodeAttributes", name, room["centroid"], colour, **more)
 
 
 def _iter_room_edges(map: TopometricMap) -> Iterator[Json]:
@@ -155,6 +167,23 @@ def _iter_places(map: TopometricMap) -> Iterator[tuple[Json, list[Json]]]:
             near = int(areas_of_room[apart.argmin()])
             edges.append(_build_edge(encode_symbol("p", near), encode_symbol("p", number), metadata, float(apart.min())))
         yield place, edges
+
+
+def _iter_objects(map: TopometricMap) -> Iterator[tuple[Json, list[Json]]]:
+    """Each object, sign and tag whose place is known, with the edge to its parent."""
+    table = map.landmarks.table
+    known = np.isfinite(table["position"]).all(axis=1) & map.landmarks.is_kind("object", "text", "tag")
+    owner, centres = _compute_area_centres(map, build_floor_polygons(map)) if known.any() else (np.zeros(0), np.zeros((0, 3)))
+    for number, row in enumerate(table[known]):
+        about = {"kind": LANDMARK_KINDS[row["kind"]], "confidence": float(row["confidence"])}
+        shape = {"mesh_connections": [], "registered": False, "world_R_object": NO_ROTATION, "metadata": about}
+        name, id = map.landmarks.values[row["value"]], encode_symbol("O", number)
+        own = np.flatnonzero(owner == row["room"])
+        edges = []
+        if len(own):
+            near = int(own[np.linalg.norm(centres[own] - row["position"], axis=1).argmin()])
+            edges.append(_build_edge(encode_symbol("p", near), id))
+        yield _build_node(OBJECT_LAYER, id, "ObjectNodeAttributes", name, row["position"], **shape), edges
 
 
 def _compute_area_centres(map: TopometricMap, floors: list[Any]) -> tuple[Array, Array]:

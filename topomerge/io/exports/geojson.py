@@ -18,10 +18,11 @@ import shapely
 
 from topomerge.errors import InputError
 from topomerge.io.archive import replace_on_success
+from topomerge.io.landmarks import serialise_landmarks
 from topomerge.structure.floors import compute_jambs, is_flight, measure_room_levels
 from topomerge.structure.plan_structure import build_plan_structure
 from topomerge.structure.walls import build_wall_polygon
-from topomerge.types import ROOM_ODDS, Array, TopometricMap
+from topomerge.types import ROOM_ODDS, Array, TopometricMap, find_room_names
 
 SEMI_MAJOR, FLATTENING = 6378137.0, 1 / 298.257223563  # m; the ellipsoid of WGS84
 ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
@@ -58,7 +59,7 @@ def parse_origin(text: str) -> Origin:
 
 def save(map: TopometricMap, path: Path, origin: Origin | None = None, storey: int | None = None) -> None:
     """Write one FeatureCollection: a feature for each room, then for each door, opening and flight of stairs, each window,
-    each wall, and each door, opening or window as a hole in its wall.
+    each wall, each door, opening or window as a hole in its wall, and each landmark.
 
     Args:
         map: any map.
@@ -76,7 +77,7 @@ def save(map: TopometricMap, path: Path, origin: Origin | None = None, storey: i
         _check_near(map)
     place = _round_positions if origin is None else _build_geodetic_transform(origin)
     features = [*_iter_rooms(map, place, storey), *_iter_doors(map, place, storey), *_iter_windows(map, place, storey)]
-    features += [*_iter_walls(map, place, storey), *_iter_openings(map, place, storey)]
+    features += [*_iter_walls(map, place, storey), *_iter_openings(map, place, storey), *_iter_landmarks(map, place, storey)]
     listing: dict[str, Any] = {"type": "FeatureCollection"}
     if origin is None:
         listing |= {
@@ -103,10 +104,12 @@ def _format_collection(listing: dict[str, Any], features: list[dict[str, Any]]) 
 
 def _iter_rooms(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
     levels, seen = measure_room_levels(map)
+    names = find_room_names(map.landmarks, len(map.rooms))
     for r, (room, floor) in enumerate(zip(map.rooms, build_plan_structure(map).rooms, strict=True)):
         if storey not in (None, int(room["storey"])):
             continue
-        properties = {"kind": "room", "room": r, "storey": int(room["storey"]), "area": round(float(room["area"]), 3)}
+        properties: dict[str, Any] = {"kind": "room", "room": r, **({"name": names[r]} if names[r] else {})}
+        properties |= {"storey": int(room["storey"]), "area": round(float(room["area"]), 3)}
         properties["height"] = round(float(room["height"]), 3) if seen[r] else None
         properties |= {"floor": round(float(levels[r, 0]), 3), "completeness": round(float(room["completeness"]), 3)}
         properties["glimpsed"] = bool(room["glimpsed"])
@@ -133,6 +136,15 @@ def _iter_windows(map: TopometricMap, place: Place, storey: int | None) -> Itera
             properties = {"kind": "window", "window": k, "rooms": _list_side_rooms(window), "storey": level}
             properties |= {name: _round_height(window[name]) for name in ("width", "sill", "head", "confidence")}
             yield _build_feature(f"window {k}", {"type": "LineString", "coordinates": place(compute_jambs(pane))}, properties)
+
+
+def _iter_landmarks(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
+    """A point each; its `position` stays in metres. Readings of radio are as many as points of a cloud and are left out."""
+    for k, row in enumerate(serialise_landmarks(map.landmarks.select(~map.landmarks.is_kind("radio", "pressure")))):
+        if storey in (None, row["storey"]):
+            at = None if row["position"] is None else place(np.array([row["position"]]))[0]
+            geometry = None if at is None else {"type": "Point", "coordinates": at}
+            yield _build_feature(f"landmark {k}", geometry, {**row, "kind": "landmark", "of": row["kind"]})
 
 
 def _round_height(value: Any) -> float | None:

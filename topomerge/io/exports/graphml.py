@@ -14,7 +14,7 @@ from typing import Any
 from xml.etree import ElementTree as xml
 
 from topomerge.io.exports.markup import replace_forbidden, write_xml
-from topomerge.types import TopometricMap
+from topomerge.types import TopometricMap, find_room_names
 
 SPACE = "http://graphml.graphdrawing.org/xmlns"
 Item = tuple[tuple[str, ...], dict[str, Any]]  # the id of a node or the two of an edge, attributes
@@ -81,8 +81,10 @@ def _rename_position(values: dict[str, Any], name: str) -> dict[str, Any]:
 def _iter_nodes(map: TopometricMap) -> Iterator[Item]:
     for i, storey in enumerate(map.storeys):
         yield (f"s{i}",), {"kind": "storey", "label": f"storey {i}", **_read_row(storey)}
+    names = find_room_names(map.landmarks, len(map.rooms))
     for i, room in enumerate(map.rooms):
-        yield (f"r{i}",), {"kind": "room", "label": f"room {i}", **_rename_position(_read_row(room), "centroid")}
+        label = replace_forbidden(names[i]) or f"room {i}"
+        yield (f"r{i}",), {"kind": "room", "label": label, **_rename_position(_read_row(room), "centroid")}
     for i, area in enumerate(map.areas):
         yield (f"a{i}",), {"kind": "area", "label": f"area {i}", **_rename_position(_read_row(area), "centroid")}
 

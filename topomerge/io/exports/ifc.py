@@ -15,7 +15,7 @@ from topomerge.io.listing import describe_room
 from topomerge.structure.floors import is_flight, measure_room_levels
 from topomerge.structure.plan_structure import build_plan_structure
 from topomerge.structure.walls import build_wall_polygon
-from topomerge.types import ROOM_ODDS, Array, TopometricMap
+from topomerge.types import LANDMARK_KINDS, ROOM_ODDS, Array, TopometricMap, find_room_names
 
 STAMP = "1970-01-01T00:00:00"  # the same map gives the same bytes
 
@@ -24,7 +24,7 @@ class Model:
     """A file with a project, a site and a building. Names of methods are what they make.
 
     Attributes:
-        map: the map that it is made of.
+        map, names: the map that it is made of, and the names of its rooms.
         file: the model of ifcopenshell.
         shift: (3,) m, where the site stands in the input's frame; all else counts from there.
         site, building: entities.
@@ -33,7 +33,7 @@ class Model:
     def __init__(self, map: TopometricMap) -> None:
         import ifcopenshell
 
-        self.map = map
+        self.map, self.names = map, find_room_names(map.landmarks, len(map.rooms))
         self.file = ifcopenshell.file(schema="IFC4")
         head = self.file.header
         head.file_name.time_stamp, head.file_name.name = STAMP, "topomerge"
@@ -190,6 +190,8 @@ def save(map: TopometricMap, path: Path) -> None:
         for n, r in enumerate(rooms):
             side = spaces[rooms[1 - n]].PredefinedType if len(rooms) > 1 else "NOTDEFINED"
             model.add_boundary(f"window {k}", spaces[r], element, side)
+    for storey in range(len(storeys)):
+        model.contain(storeys[storey], [model.add_annotation(k, storeys[storey]) for k in model.list_annotated(storey)])
     with replace_on_success(path) as beside:
         model.file.write(str(beside))
 
@@ -213,6 +215,8 @@ class _BuildingModel(Model):
             "Representation": self.extrude_polygons(floor, low, high - low),
         }
         side = "EXTERNAL" if "outside" in describe_room(room) else "INTERNAL"
+        if self.names[r]:
+            body["LongName"] = replace_forbidden(self.names[r])
         space = self.create_rooted("IfcSpace", f"room {r}", CompositionType="ELEMENT", PredefinedType=side, **body)
         quantities = [self.create("IfcQuantityArea", Name="GrossFloorArea", AreaValue=float(room["area"]))]
         if seen:
@@ -383,6 +387,20 @@ class _BuildingModel(Model):
         out = self.create("IfcDirection", DirectionRatios=[0.0, 0.0, 1.0])
         swept = {"SweptArea": profile, "Position": where, "ExtrudedDirection": out, "Depth": width or 1.0}
         return self.create("IfcExtrudedAreaSolid", **swept)
+
+    def list_annotated(self, s: int) -> list[int]:
+        """Signs, tags and objects of a storey whose place is known."""
+        landmarks = self.map.landmarks
+        known = np.isfinite(landmarks.table["position"]).all(axis=1) & (landmarks.table["storey"] == s)
+        return np.flatnonzero(known & landmarks.is_kind("text", "tag", "object")).tolist()  # type: ignore[no-any-return]
+
+    def add_annotation(self, k: int, storey: Any) -> Any:
+        """A sign, a tag or an object: its text as the name, its kind as the type."""
+        row = self.map.landmarks.table[k]
+        at = self.create_placement(storey.ObjectPlacement, *(row["position"] - self.shift - (0, 0, storey.Elevation)))
+        note = self.create_rooted("IfcAnnotation", f"landmark {k}", ObjectPlacement=at, ObjectType=LANDMARK_KINDS[row["kind"]])
+        note.Name = replace_forbidden(self.map.landmarks.values[row["value"]])
+        return note
 
     def add_boundary(self, i: int | str, space: Any, element: Any, side: str = "INTERNAL") -> None:
         """A space is bounded by an element, which leads out of it, to a space on the other side that is INTERNAL or EXTERNAL."""

@@ -23,7 +23,7 @@ from topomerge.io.exports.markup import replace_forbidden, write_xml
 from topomerge.structure.floors import compute_jambs, find_inside_point, is_flight, measure_room_levels
 from topomerge.structure.plan_structure import PlanStructure, build_plan_structure
 from topomerge.structure.walls import build_wall_polygon
-from topomerge.types import ROOM_ODDS, Array, TopometricMap
+from topomerge.types import ROOM_ODDS, Array, TopometricMap, find_room_names
 
 CORE, GML = "http://www.opengis.net/indoorgml/1.0/core", "http://www.opengis.net/gml/3.2"
 LINK, SCHEMA = "http://www.w3.org/1999/xlink", "http://www.w3.org/2001/XMLSchema-instance"
@@ -52,8 +52,9 @@ def save(map: TopometricMap, path: Path) -> None:
     _add_description(root, map.source or "map")
     _add_bounds(root, map)
     place = _add_element(_add_element(root, "primalSpaceFeatures"), "PrimalSpaceFeatures", "PS")
+    names = _list_room_names(map)
     for r, floor in enumerate(floors):
-        _add_cell(_add_element(place, "cellSpaceMember"), map, r, floor, levels[r])
+        _add_cell(_add_element(place, "cellSpaceMember"), map, names[r], r, floor, levels[r])
     for k, bodies in enumerate(_build_wall_bodies(structure)):
         for n, body in enumerate(bodies):
             _add_wall(_add_element(place, "cellSpaceMember"), f"W{k}-{n}", structure.walls[k], *body)
@@ -104,11 +105,15 @@ def _format_point(point: Any) -> str:
     return " ".join(f"{value:.4f}" for value in np.asarray(point).tolist())
 
 
-def _add_cell(member: Any, map: TopometricMap, r: int, floor: shapely.MultiPolygon, level: Array) -> None:
+def _list_room_names(map: TopometricMap) -> list[str]:
+    return [name or f"room {r}" for r, name in enumerate(find_room_names(map.landmarks, len(map.rooms)))]
+
+
+def _add_cell(member: Any, map: TopometricMap, name: str, r: int, floor: shapely.MultiPolygon, level: Array) -> None:
     room = map.rooms[r]
     cell = _add_element(member, "CellSpace", f"C{r}")
     facts = {"storey": int(room["storey"]), "area": f"{room['area']:.2f}", "height": f"{room['height']:.2f}"}
-    _add_description(cell, f"room {r}", **facts, **{name: f"{room[name]:.2f}" for name in ROOM_ODDS})
+    _add_description(cell, name, **facts, **{odds: f"{room[odds]:.2f}" for odds in ROOM_ODDS})
     if not floor.is_empty:
         _add_solid(cell, f"C{r}", max(floor.geoms, key=lambda part: part.area), *level.tolist())
     _add_link(cell, "duality", f"S{r}")
@@ -211,10 +216,10 @@ def _add_graph(root: Any, map: TopometricMap, points: list[Array]) -> None:
     graph = _add_element(_add_element(root, "multiLayeredGraph"), "MultiLayeredGraph", "MG")
     layer = _add_element(_add_element(_add_element(graph, "spaceLayers", "SL"), "spaceLayerMember"), "SpaceLayer", "L0")
     _add_description(layer, "rooms")
-    nodes = _add_element(layer, "nodes", "N")
+    nodes, names = _add_element(layer, "nodes", "N"), _list_room_names(map)
     for r, point in enumerate(points):
         state = _add_element(_add_element(nodes, "stateMember"), "State", f"S{r}")
-        _add_description(state, f"room {r}")
+        _add_description(state, names[r])
         _add_link(state, "duality", f"C{r}")
         for t in np.flatnonzero((map.edges["rooms"] == r).any(axis=1)):
             _add_link(state, "connects", f"T{t}")

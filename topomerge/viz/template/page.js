@@ -18,6 +18,7 @@ function startTheme(button) {
 startTheme(document.getElementById("theme"));
 startHighlights();
 document.querySelectorAll("table.sortable").forEach(startTable);
+document.querySelectorAll("input[data-find]").forEach(startFind);
 document.querySelectorAll(".plan-view").forEach(startPlan);
 document.querySelectorAll("input[data-blend]").forEach(startBlend);
 document.querySelectorAll("input[data-bend]").forEach(startBend);

@@ -23,3 +23,22 @@ function sortRows(body, column, sign) {
   keyed.sort(([a], [b]) => sign * (number ? a - b : a.localeCompare(b)));
   body.append(...keyed.map(([, row]) => row));
 }
+
+// What is searched for: rows of rooms and landmarks of the same section whose words hold it, and marks on its plans.
+
+function startFind(input) {
+  const section = input.closest("section");
+  const rows = () => [...section.querySelectorAll("[data-words]")];
+  input.addEventListener("input", () => {
+    const words = input.value.trim().toLowerCase();
+    for (const row of rows()) {
+      const found = row.dataset.words.includes(words);
+      row.classList.toggle("missed", !found);
+      row.classList.toggle("found", words !== "" && found);
+    }
+    const first = words && rows().find((row) => row.matches(".found[data-room]"));
+    if (!first) return light(null);
+    light(placeOf(first));
+    document.dispatchEvent(new CustomEvent("go", { detail: { place: placeOf(first), from: first } }));
+  });
+}

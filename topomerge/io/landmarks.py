@@ -1,0 +1,206 @@
+"""Landmarks in files: tables beside a scan (`a.landmarks.csv`), and rows of JSON, that come back as they were written.
+
+The columns of a table are `COLUMNS`; its first line names those that it has, in any order. What is empty is not known. Positions
+are those of the file beside which the table lies, in its unit: docs/landmarks.md.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.io.piece import refuse_pointer
+from topomerge.types import LANDMARK_DTYPE, LANDMARK_KINDS, MOST_LANDMARKS, Array, Landmarks, clean_landmarks
+
+COLUMNS = ("kind", "value", "x", "y", "z", "sigma", "room", "storey", "confidence", "number", "group", "time")
+WHOLE = ("room", "storey", "group")  # columns of whole numbers, -1 where nothing is known
+REAL = ("x", "y", "z", "sigma", "number", "time")  # columns of numbers, nan where nothing is known
+TABLE_NAME = "landmarks.csv"  # in a folder of scans; beside a file its stem and a dot stand before it
+LARGEST_TABLE = 1 << 28  # bytes: two million lines
+DELIMITERS = ",;\t"
+MOST_WHOLE = 2**31 - 1
+
+
+def is_landmark_file(path: Path) -> bool:
+    """Return whether a file is a table of landmarks, by its name."""
+    return path.name == TABLE_NAME or path.name.endswith(f".{TABLE_NAME}")
+
+
+def find_landmark_file(path: Path) -> Path | None:
+    """Find the table of landmarks beside a file, or in a folder of scans; None where there is none."""
+    place = path / TABLE_NAME if path.is_dir() else path.with_name(f"{path.stem}.{TABLE_NAME}")
+    return place if place.is_file() and place != path else None
+
+
+def read_landmark_file(path: Path) -> Landmarks:
+    """Read a table of landmarks; its name is their source.
+
+    Raises:
+        InputError: it can't be read, a column is missing or unknown, or a line is wrong, which is named.
+    """
+    try:
+        refuse_pointer(path)
+        if path.stat().st_size > LARGEST_TABLE:
+            raise InputError(f"{path}: has more than {LARGEST_TABLE >> 20} MB, too many for landmarks; take a part of them")
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is no text in UTF-8; save it as CSV in UTF-8") from error
+    except OSError as error:
+        raise InputError(f"{path}: can't be read ({error.strerror or error}); check its permissions") from error
+    head, _, _ = text.partition("\n")
+    reader = csv.reader(io.StringIO(text), delimiter=max(DELIMITERS, key=head.count))
+    try:
+        names = [name.strip().lower() for name in next(reader, [])]
+        _check_names(path, names)
+        numbered = [(reader.line_num, row) for row in reader if any(map(str.strip, row))]
+    except csv.Error as error:
+        raise InputError(f"{path}, line {reader.line_num}: is no line of a table ({error}); save it as CSV again") from error
+    if len(numbered) > MOST_LANDMARKS:
+        raise InputError(f"{path}: has {len(numbered):,} landmarks, more than {MOST_LANDMARKS:,}; take a part of them")
+    for line, row in numbered:
+        if len(row) != len(names):
+            raise InputError(f"{path}, line {line}: has {len(row)} columns, not {len(names)} as the first line; correct it")
+    lines, rows = [line for line, _ in numbered], [row for _, row in numbered]
+    columns = dict(zip(names, zip(*rows, strict=True), strict=True)) if rows else {}
+    return _build_table(path, lines, columns)
+
+
+def _check_names(path: Path, names: Sequence[str]) -> None:
+    known = f"the columns are {', '.join(COLUMNS)}"
+    wrong = [name for name in names if name not in COLUMNS or names.count(name) > 1]
+    if wrong:
+        raise InputError(f"{path}, line 1: {wrong[0][:40]!r} is no column, or is there twice; {known}")
+    if not {"kind", "value"} <= set(names):
+        raise InputError(f"{path}, line 1: kind and value must be among the columns; {known}")
+
+
+def _build_table(path: Path, lines: Sequence[int], columns: Mapping[str, Sequence[str]]) -> Landmarks:
+    count = len(lines)
+    table = np.zeros(count, LANDMARK_DTYPE)
+    numbers = {name: _parse_reals(path, lines, name, columns.get(name, ())) for name in (*REAL, "confidence", *WHOLE)}
+    kinds = [kind.strip().lower() for kind in columns.get("kind", ())]
+    numbered = {kind: k for k, kind in enumerate(LANDMARK_KINDS)}
+    _require(
+        path, lines, np.array([kind in numbered for kind in kinds], bool), f"kind must be one of {', '.join(LANDMARK_KINDS)}"
+    )
+    table["kind"] = [numbered[kind] for kind in kinds]
+    values = [value.strip() for value in columns.get("value", ())]
+    bare = np.isin(table["kind"], [numbered["pressure"]]) | np.array([bool(value) for value in values], bool)
+    _require(path, lines, bare, "value is empty; write the text, the tag, the address, the class or the name")
+    position = np.column_stack([numbers[name] for name in "xyz"])
+    known = np.isfinite(position)
+    _require(path, lines, known.all(axis=1) | ~known.any(axis=1), "x, y and z belong together; give all of them, or none")
+    confidence = np.where(np.isnan(numbers["confidence"]), 1.0, numbers["confidence"])
+    _require(path, lines, (confidence >= 0) & (confidence <= 1), "confidence must be 0 to 1")
+    _require(path, lines, ~(numbers["sigma"] < 0), "sigma must not be below 0")
+    table["position"], table["confidence"] = position, confidence
+    for name in ("sigma", "number", "time"):
+        table[name] = numbers[name]
+    for name in WHOLE:
+        whole = np.where(np.isnan(numbers[name]), -1, numbers[name])
+        _require(path, lines, (whole >= -1) & (whole <= MOST_WHOLE) & (whole == np.rint(whole)), f"{name} must be 0, 1, 2 …")
+        table[name] = whole
+    strings = {value: k for k, value in enumerate(dict.fromkeys(values))}
+    table["value"] = [strings[value] for value in values]
+    return clean_landmarks(Landmarks(table, tuple(strings), (path.name,)))
+
+
+def _parse_reals(path: Path, lines: Sequence[int], name: str, texts: Sequence[str]) -> Array:
+    """(n,) float64, nan where nothing stands."""
+    if not texts:
+        return np.full(len(lines), np.nan)
+    stripped = [text.strip() for text in texts]
+    try:
+        numbers = np.array([float(text) if text else math.nan for text in stripped])
+    except ValueError:
+        numbers = np.array([_parse_real(text) for text in stripped])
+    empty = np.array([not text for text in stripped], bool)
+    _require(path, lines, np.isfinite(numbers) | empty, f"{name} is no finite number; write it as 12.5, or leave it empty")
+    return numbers
+
+
+def _parse_real(text: str) -> float:
+    try:
+        return float(text) if text else math.nan
+    except ValueError:
+        return math.inf
+
+
+def _require(path: Path, lines: Sequence[int], holds: Array, advice: str) -> None:
+    """Refuse the first line for which something does not hold."""
+    if not holds.all():
+        raise InputError(f"{path}, line {lines[int(np.argmin(holds))]}: {advice}")
+
+
+def format_landmark_table(landmarks: Landmarks) -> str:
+    """Format landmarks as a table that `read_landmark_file` reads."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for row in serialise_landmarks(landmarks):
+        x, y, z = row["position"] or (None, None, None)
+        cells = {**row, "x": x, "y": y, "z": z}
+        writer.writerow(["" if cells[name] is None else cells[name] for name in COLUMNS])
+    return out.getvalue()
+
+
+def serialise_landmarks(landmarks: Landmarks) -> list[dict[str, Any]]:
+    """Serialise landmarks as rows of plain values; what is not known is None. `parse_landmarks` reads them."""
+    table = landmarks.table
+    reals = {name: _list_known(table[name], np.isfinite(table[name])) for name in ("sigma", "number", "time")}
+    whole = {name: _list_known(table[name], table[name] >= 0) for name in WHOLE}
+    position = _list_known(table["position"], np.isfinite(table["position"]).all(axis=1))
+    return [
+        {
+            "kind": LANDMARK_KINDS[table["kind"][k]],
+            "value": landmarks.values[table["value"][k]],
+            "position": position[k],
+            **{name: column[k] for name, column in (whole | reals).items()},
+            "confidence": float(table["confidence"][k]),
+            "source": landmarks.sources[table["source"][k]],
+        }
+        for k in range(len(table))
+    ]
+
+
+def _list_known(values: Array, known: Array) -> list[Any]:
+    return [value if there else None for value, there in zip(values.tolist(), known.tolist(), strict=True)]
+
+
+def parse_landmarks(rows: Iterable[Mapping[str, Any]], source: str) -> Landmarks:
+    """Parse rows of `serialise_landmarks`; what they leave out is not known, and the source is `source`.
+
+    Raises:
+        InputError: a row is no landmark; the line names `source`.
+    """
+    columns: dict[str, list[Any]] = {name: [] for name in LANDMARK_DTYPE.names or ()}
+    values: dict[str, int] = {}
+    sources: dict[str, int] = {}
+    try:
+        for row in rows:
+            columns["kind"].append(LANDMARK_KINDS.index(row["kind"]))
+            columns["value"].append(values.setdefault(str(row["value"]), len(values)))
+            columns["source"].append(sources.setdefault(str(row.get("source") or source), len(sources)))
+            columns["position"].append([np.nan] * 3 if row.get("position") is None else [float(v) for v in row["position"]])
+            columns["confidence"].append(1.0 if row.get("confidence") is None else float(row["confidence"]))
+            for name in WHOLE:
+                columns[name].append(-1 if row.get(name) is None else int(row[name]))
+            for name in ("sigma", "number", "time"):
+                columns[name].append(np.nan if row.get(name) is None else float(row[name]))
+        table = np.zeros(len(columns["kind"]), LANDMARK_DTYPE)
+        for name, column in columns.items():
+            if column:
+                table[name] = column
+    except InputError:  # of what makes the rows
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        reason = " ".join(str(error).split())[:100]
+        raise InputError(f"{source}: landmark {len(columns['kind'])} is damaged ({reason}); write it again") from error
+    return clean_landmarks(Landmarks(table, tuple(values), tuple(sources)))
