@@ -8,6 +8,7 @@ import shutil
 import tarfile
 import tempfile
 from collections.abc import Callable
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -64,6 +65,20 @@ def read_bag(path: Path) -> int:
     from topomerge.io import bag
 
     bag.read_in_subprocess = lambda _module, _kind, path, options, **_: bag.read_in_process(path, options)
+    return read_cloud(path)
+
+
+def read_plan(path: Path) -> int:
+    """Read a plan in this process, a page without the network."""
+    from tests.io.cad_plans import parse_dark_lines
+    from topomerge.io import drawing, dxf, pdf, svg
+
+    drawing.parse_drawing = parse_dark_lines
+    drawing.has_text_reader = lambda: False
+    for module in (dxf, pdf, svg):
+        module.read_in_subprocess = lambda name, _kind, path, options, *_: import_module(f"topomerge.io.{name}").read_in_process(
+            path, options
+        )
     return read_cloud(path)
 
 
@@ -138,6 +153,7 @@ READERS: dict[str, Callable[[Path], int]] = {  # by name or suffix; all others a
     ".laz": read_las,
     ".tmap": read_map,
     **dict.fromkeys((".bag", ".db3", ".mcap"), read_bag),
+    **dict.fromkeys((".dxf", ".pdf", ".svg"), read_plan),
 }
 
 
@@ -217,6 +233,13 @@ def write_plans(folder: Path) -> dict[str, Path]:
     plan_files.campus(found["plan.xml"])
     plan_files.rmf(found["plan.building.yaml"])
     plan_files.amrl(found["plan.vectormap.json"])
+    if all(find_spec(name) for name in ("ezdxf", "pypdfium2", "resvg_py")):
+        from tests.io import cad_plans
+        from tests.io import test_read_pages as pages
+
+        found["flat.dxf"] = cad_plans.write_flat(folder / "flat.dxf")
+        found["flat.pdf"] = pages.write_pdf(folder / "flat.pdf", [pages.draw_flat(pages.AREAS)])
+        found["flat.svg"] = pages.write_svg(folder / "flat.svg")
     with tarfile.open(found["plans.tar.xz"], "w:xz") as archive:
         archive.add(plan_files.r2v(folder / "flat.txt"), "flat.txt")
     return found

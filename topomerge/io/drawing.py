@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from scipy import ndimage
 from topomerge.errors import InputError
 from topomerge.networks.drawing import DOOR, FLOOR, PAGE, WALL, WINDOW, compute_drawing_probabilities
 from topomerge.networks.network import Run
-from topomerge.types import Array
+from topomerge.types import Array, Landmarks, build_landmarks
 
 FINEST, COARSEST = 0.03, 0.12  # m a pixel: what the network was trained on lies between 0.02 and 0.125
 LONGEST_SIDE = 900  # px at which a picture of unknown scale is looked at
@@ -28,6 +29,7 @@ FOOT, INCH = 0.3048, 0.0254  # m
 PLAUSIBLE_AREA, PLAUSIBLE_SIDE = (0.8, 3000.0), (0.6, 100.0)  # m2, m
 FEWEST_PIXELS = 30  # of a room that gives a scale
 AGREEING = 0.12  # of the logarithm of the scale: texts that differ more from the median are not of their room
+NAME_HEIGHT = 1.2  # m above the floor at which the name of a room is placed
 DOOR_WIDTH, DOOR_SPREAD = 0.82, 0.12  # m, usual clear width of drawn doors, and its spread as a logarithm
 
 NUMBER = r"(\d{1,5}(?:[.,]\d{1,3})?)"
@@ -35,6 +37,7 @@ AREA = re.compile(NUMBER + r"\s*(m²|m2|m\^2|qm|sqm|sq\.?\s*m\.?|kvm|㎡|sq\.?\s
 SIDES = re.compile(NUMBER + r"\s*(mm|cm|m)?\s*[x×X*]\s*" + NUMBER + r"\s*(mm|cm|m)?(?![\d'\"′])")
 SIDE_IN_FEET = r"(\d{1,3})\s*['’′]\s*(?:(\d{1,2})\s*(?:[\"”″]|'')?)?"
 FEET = re.compile(SIDE_IN_FEET + r"\s*[x×X*]\s*" + SIDE_IN_FEET)
+STATED_SCALE = re.compile(r"(?<![\d:.,])1\s?:\s?([1-9]\d{1,3})(?![\d:.,])")
 WORD = re.compile(r"[^\W\d_]{2,}")
 
 
@@ -254,6 +257,81 @@ def _estimate_scale_by_doors(drawing: ParsedDrawing) -> DrawingScale | None:
     width = float(np.median(widths))
     spread = float(np.hypot(DOOR_SPREAD, 0.3 / np.sqrt(len(widths))))
     return DrawingScale(DOOR_WIDTH / width * drawing.zoom, spread, (f"{count} doors of usual width",), written=False)
+
+
+@dataclass(frozen=True, eq=False)
+class TracedDrawing:
+    """A drawing with its scale: `resolution` (m) is that of its own pixels; `texts` are in them, too; `warnings` say why."""
+
+    drawing: ParsedDrawing
+    resolution: float
+    texts: tuple[PictureText, ...]
+    warnings: tuple[str, ...]
+
+
+def trace_drawing(
+    path: Path, picture: Array, resolution: float | None, texts: Sequence[PictureText] = (), page: float | None = None
+) -> TracedDrawing:
+    """Find walls and floor of a drawing, and how large it is.
+
+    Args:
+        path: for messages.
+        picture: (h, w, 3) uint8.
+        resolution: m a pixel; None: by what is written on it, or by its doors.
+        texts: of the picture, if they are known; else they are read where a reader is installed.
+        page: m of paper a pixel, where the file says so: "1:100" is a scale then.
+
+    Raises:
+        InputError: it shows no room, or nothing says how large it is.
+    """
+    stated = None if page is None else find_stated_scale(texts)
+    known = resolution if resolution is not None or stated is None or page is None else page * stated
+    drawing = parse_drawing(picture, known)
+    if not drawing.free.any():
+        raise InputError(f"{path}: no walls around a room were found in it; if it is a robot's grid, give --no-drawing")
+    said = [f"{path.name}: was read as a drawn plan, without its page, texts and furniture"]
+    if resolution is None:
+        texts = texts or (read_texts(picture) if has_text_reader() else ())
+        scale = estimate_scale(drawing, texts)
+        if known is not None and not (scale and scale.written and abs(np.log(scale.resolution / known)) > AGREEING):
+            scale = DrawingScale(known, 0.0, (f"1:{stated:g}",))
+        if scale is None:
+            more = "" if has_text_reader() else " (pip install topomerge[text] reads what is written on it)"
+            raise InputError(f"{path}: an image does not say how large a pixel is; give --resolution in metres a pixel{more}")
+        known = scale.resolution
+        why = ", ".join(repr(reason) if scale.written else reason for reason in scale.reasons[:3])
+        said.append(f"{path.name}: {known:.4g} m a pixel, give or take {scale.spread:.0%}, by {why}; --resolution sets it")
+        if scale.is_coarse(drawing.zoom):
+            drawing = parse_drawing(picture, known)
+    assert known is not None
+    zoom = drawing.zoom
+    placed = [PictureText(t.text, (t.place[0] * zoom, t.place[1] * zoom), t.height * zoom, t.confidence) for t in texts]
+    return TracedDrawing(drawing, known / zoom, tuple(placed), tuple(said))
+
+
+def find_stated_scale(texts: Sequence[PictureText]) -> float | None:
+    """Find the one scale of a page that its texts state ("1:100" is 100); None where they state none, or several."""
+    found = {float(match) for text in texts for match in STATED_SCALE.findall(text.text)}
+    return found.pop() if len(found) == 1 else None
+
+
+def build_name_landmarks(
+    texts: Sequence[PictureText], free: Array, resolution: float, corner: tuple[float, float], height: float, source: str
+) -> Landmarks:
+    """Build landmarks of the names of rooms among texts.
+
+    Args:
+        texts: in pixels of the floor.
+        free: (h, w) bool, floor; only what lies on it, or in a hole of it that a text made, is the name of a room.
+        resolution: of a pixel; corner: x and y of the lower left one; height: of the names, all in the unit of the file.
+        source: the name of the file.
+    """
+    rooms = free.astype(np.uint8)
+    near = [t for t in texts if 0 <= t.place[0] < free.shape[1] and 0 <= t.place[1] < free.shape[0]]
+    kept = [(name, t.place) for t in near if (name := find_name(t.text)) and _find_room(rooms, t, 1.0)]
+    columns, rows = np.array([place for _, place in kept]).reshape(-1, 2).T
+    x, y = corner[0] + columns * resolution, corner[1] + (len(free) - rows) * resolution
+    return build_landmarks("name", [name for name, _ in kept], source, np.stack([x, y, np.full(len(x), height)], axis=1))
 
 
 def read_texts(picture: Array) -> tuple[PictureText, ...]:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.errors import InputError
-from topomerge.io.drawing import estimate_scale, has_text_reader, is_drawing, parse_drawing, read_texts
+from topomerge.io.drawing import NAME_HEIGHT, TracedDrawing, build_name_landmarks, is_drawing, trace_drawing
 from topomerge.io.piece import (
     BLOCK_POINTS,
     MOST_POINTS,
@@ -218,8 +218,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
             raise InputError(f"{path}: states its own resolution of {plan.resolution:g} m; leave --resolution out")
         occupied, free, doubts = read_pixels(path, plan)
     elif options.drawing and is_drawing(*read_image(path)):
-        plan, occupied, free = read_drawing(path, options.resolution)
-        doubts = ()
+        yield from build_drawn_pieces(path, trace_drawing(path, read_picture(path), options.resolution), options)
+        return
     elif options.resolution is None:
         beside = next((b for b in (path.with_suffix(".yaml"), path.with_suffix(".yml")) if b.is_file()), None)
         hint = f", or read {beside.name} instead" if beside else ""
@@ -232,31 +232,13 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     yield from extrude(path, occupied, free, plan, options)
 
 
-def read_drawing(path: Path, resolution: float | None) -> tuple[Plan, Array, Array]:
-    """Read the walls and the floor of a drawing on a page: (h, w) bool, and the plan whose pixels they are.
-
-    Args:
-        resolution: m a pixel; None: by what is written on it, or by its doors.
-
-    Raises:
-        InputError: it shows no room, or nothing says how large it is.
-    """
-    picture = read_picture(path)
-    drawing = parse_drawing(picture, resolution)
-    if not drawing.free.any():
-        raise InputError(f"{path}: no walls around a room were found in it; if it is a robot's grid, give --no-drawing")
-    said: tuple[str, ...] = (f"{path.name}: was read as a drawn plan, without its page, texts and furniture",)
-    if resolution is None:
-        scale = estimate_scale(drawing, read_texts(picture) if has_text_reader() else ())
-        if scale is None:
-            more = "" if has_text_reader() else " (pip install topomerge[text] reads what is written on it)"
-            raise InputError(f"{path}: an image does not say how large a pixel is; give --resolution in metres a pixel{more}")
-        resolution = scale.resolution
-        why = ", ".join(repr(reason) if scale.written else reason for reason in scale.reasons[:3])
-        said += (f"{path.name}: {resolution:.4g} m a pixel, give or take {scale.spread:.0%}, by {why}; --resolution sets it",)
-        if scale.is_coarse(drawing.zoom):
-            drawing = parse_drawing(picture, resolution)
-    return Plan(path, resolution / drawing.zoom, warnings=said), drawing.occupied, drawing.free
+def build_drawn_pieces(path: Path, traced: TracedDrawing, options: ReadOptions) -> Iterator[Piece]:
+    """Yield the floor and the walls of a drawing, and the names of its rooms."""
+    drawing, plan = traced.drawing, Plan(path, traced.resolution)
+    height = NAME_HEIGHT / options.factor
+    names = build_name_landmarks(traced.texts, drawing.free, plan.resolution, (0.0, 0.0), height, path.name)
+    yield Piece(np.empty((0, 3)), warnings=traced.warnings, done=0.1, landmarks=names)
+    yield from extrude(path, drawing.occupied, drawing.free, plan, options)
 
 
 def read_picture(path: Path) -> Array:
