@@ -8,7 +8,6 @@ import shutil
 import tarfile
 import tempfile
 from collections.abc import Callable
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -75,10 +74,9 @@ def read_plan(path: Path) -> int:
 
     drawing.parse_drawing = parse_dark_lines
     drawing.has_text_reader = lambda: False
-    for module in (dxf, pdf, svg):
-        module.read_in_subprocess = lambda name, _kind, path, options, *_: import_module(f"topomerge.io.{name}").read_in_process(
-            path, options
-        )
+    here = {"dxf": dxf, "pdf": pdf, "svg": svg}
+    for module in here.values():
+        module.read_in_subprocess = lambda name, _kind, path, options, *_: here[name].read_in_process(path, options)
     return read_cloud(path)
 
 

@@ -63,7 +63,7 @@ def draw_flat(texts: list[str], scale: str = "") -> str:
     parts = [f"{HALL[0]} {HALL[1]} {OUTER[0] * k:.3f} {OUTER[1] * k:.3f} re"]
     parts += [f"{HALL[0] + x * k:.3f} {HALL[1] + y * k:.3f} {w * k:.3f} {h * k:.3f} re" for x, y, w, h in ROOMS.values()]
     parts.append("f*")  # holes are rooms
-    for (name, (x, y, w, h)), text in zip(ROOMS.items(), texts, strict=True):
+    for (name, (x, y, _, h)), text in zip(ROOMS.items(), texts, strict=True):
         left, middle = HALL[0] + (x + 0.3) * k, HALL[1] + (y + h / 2) * k
         parts.append(f"BT /F 8 Tf {left:.2f} {middle:.2f} Td ({name}) Tj 0 -12 Td ({text}) Tj ET")
     return "\n".join([*parts, f"BT /F 9 Tf 600 40 Td ({scale}) Tj ET" if scale else ""])
@@ -147,10 +147,12 @@ def write_svg(
     """Write the flat 1:100 in centimetres of paper, y down."""
     rooms = "".join(f"M{x + 1} {20 - y}h{w}v{-h}h{-w}z" for x, y, w, h in [*ROOMS.values(), (0, 0, *OUTER)])
     texts = "".join(
-        f'<text x="{x + 1.3}" y="{20 - y - h / 2}" style="font-size:0.3px">{name}<tspan x="{x + 1.3}" dy="0.4">{w * h:.2f} m²</tspan></text>'
+        f'<text x="{x + 1.3}" y="{20 - y - h / 2}" style="font-size:0.3px">{name}'
+        f'<tspan x="{x + 1.3}" dy="0.4">{w * h:.2f} m²</tspan></text>'
         for name, (x, y, w, h) in ROOMS.items()
     )
-    plan = f'<g transform="translate(3,2) scale(2) translate(-1.5 -1) scale(.5,0.5)"><path fill-rule="evenodd" d="{rooms}"/>{texts}</g>'
+    same = "translate(3,2) scale(2) translate(-1.5 -1) scale(.5,0.5)"
+    plan = f'<g transform="{same}"><path fill-rule="evenodd" d="{rooms}"/>{texts}</g>'
     links = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
     path.write_text(f'<?xml version="1.0"?>{head}<svg {links} {size}>{plan}{body}</svg>', encoding="utf-8")
     return path

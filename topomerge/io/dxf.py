@@ -42,11 +42,11 @@ USUAL_SWING, USUAL_EXTENT = 0.85, 20.0  # m, of a door and of a building, by whi
 
 # Parts of names of layers and blocks, without accents; "^" begins and "$" ends a word of letters.
 WORDS = {
-    "other": "furn dim$ ^dims ^dimen bemass vermass ^cota ^quote ^cote mass$ text anno beschrift schrift ^txt note patt schraff hatch "
-    "tratteg sanit plumb ^elec ^elek light hvac defpoints ^grid axis achse ^axe ^axes frame rahmen title border vport viewport "
-    "mobel moebel mobili meuble mueble arredo inred moblering stair trepp escal scala ^trap ceil roof dach ^site land tree "
-    "baum ^car$ kitch kuche kueche ^equip applian symbol north nord$ sofa chair stuhl ^table tisch ^bed$ ^bett ^wc$ toilet sink "
-    "^area$ ^rooms$ raumnummer stempel ^flor ^floor ^boden ^tile",
+    "other": "furn dim$ ^dims ^dimen bemass vermass ^cota ^quote ^cote mass$ text anno beschrift schrift ^txt note patt schraff "
+    "hatch tratteg sanit plumb ^elec ^elek light hvac defpoints ^grid axis achse ^axe ^axes frame rahmen title border "
+    "vport viewport mobel moebel mobili meuble mueble arredo inred moblering stair trepp escal scala ^trap ceil roof "
+    "dach ^site land tree baum ^car$ kitch kuche kueche ^equip applian symbol north nord$ sofa chair stuhl ^table tisch "
+    "^bed$ ^bett ^wc$ toilet sink ^area$ ^rooms$ raumnummer stempel ^flor ^floor ^boden ^tile",
     "window": "window ^win$ ^wind$ fenst fenet ventan finest fonster vindu vindue ikkun glaz okno ^raam janela",
     "door": "door ^tur$ ^turen$ tuer innentur haustur aussentur ^porte$ ^portes$ puerta ^porta$ ^dorr dorr$ ^dor$ ^dore deur "
     "^ovi$ drzwi",
@@ -102,12 +102,13 @@ def place_text(text: PictureText, corner: tuple[float, float], pixel: float, row
 
 @dataclass
 class Content:
-    """What a drawing holds, in its units: lines, swings of doors, texts at their middle, and the names of its layers."""
+    """What a drawing holds, in its units: lines, swings of doors, texts at their middle, layers, and the unit it states."""
 
     lines: list[Line] = field(default_factory=list)
     swings: list[Swing] = field(default_factory=list)
     texts: list[PictureText] = field(default_factory=list)
     layers: set[str] = field(default_factory=set)
+    unit: str | None = None
 
     def measure_box(self) -> Array:
         """(2, 2) lowest and highest x and y of all lines."""
@@ -130,10 +131,8 @@ def choose_unit(content: Content, options: ReadOptions) -> tuple[str, list[str]]
     """Choose the unit of a drawing: what the user says, else what the file says, else by the size of its doors or its extent."""
     if options.unit is not None:
         return options.unit, []
-    stated = next((name for name in content.layers if name.startswith("$INSUNITS ")), None)
-    content.layers.discard(stated or "")
-    if stated:
-        return stated.split()[1], []
+    if content.unit is not None:
+        return content.unit, []
     swings = [float(np.linalg.norm(s.ends[0] - s.hinge)) for s in content.swings if s.named]
     if swings:
         length, usual, reason = float(np.median(swings)), USUAL_SWING, "the size of its doors"
@@ -187,8 +186,7 @@ def collect_content(path: Path) -> Content:
         content.lines = [line for line in content.lines if not (line.filled and line.kind == "")]
         content.lines = drop_frames(content.lines)
         content.lines = [Line(line.points, line.kind or "wall", line.width, line.filled, line.block) for line in content.lines]
-    unit = UNITS_OF_DXF.get(int(document.header.get("$INSUNITS", 0)))
-    content.layers |= {f"$INSUNITS {unit}"} if unit else set()
+    content.unit = UNITS_OF_DXF.get(int(document.header.get("$INSUNITS", 0)))
     return content
 
 

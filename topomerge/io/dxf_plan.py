@@ -30,8 +30,8 @@ TOTAL_FILL = 60  # times the raster: area of all filled polygons together
 class Line:
     """Points (n, 2) of a line, what it is ("wall", "window", "door" or ""), and its width.
 
-    `filled`: the number of the polygon that it is an edge of, of which inner ones are holes; `block`: that of the block that it is
-    part of; 0: of none.
+    `filled`: the number of the polygon that it is an edge of, of which inner ones are holes; `block`: that of the block that it
+    is part of; 0: of none.
     """
 
     points: Array
@@ -93,7 +93,7 @@ class _Raster:
             pen.line([tuple(p) for p in self.place(points).tolist()], 1, max(round(width / self.pixel), 1))
         return np.array(image)
 
-    def fill(self, mask: Array, polygons: list[Array]) -> int:
+    def fill(self, mask: Array, polygons: list[Array], value: bool = True) -> int:
         """Fill polygons, one in another a hole; return the pixels of their box."""
         from PIL import Image, ImageDraw
 
@@ -108,7 +108,7 @@ class _Raster:
             image = Image.new("L", part.shape[::-1])
             ImageDraw.Draw(image).polygon([tuple(p) for p in (polygon - low).tolist()], 1, 1)
             part ^= np.asarray(image) > 0
-        mask[low[1] : high[1], low[0] : high[0]] |= part
+        mask[low[1] : high[1], low[0] : high[0]][part] = value
         return part.size
 
     def sample(self, mask: Array, points: Array) -> Array:
@@ -191,18 +191,25 @@ def _fill_narrow(drawn: Array, pixel: float) -> Array:
 def find_gaps(raster: _Raster, occupied: Array, swings: list[Swing], leaves: list[Line]) -> list[Array]:
     """Find the (2, 2) ends of the gap of each door: of its arc, else of its block."""
     gaps = []
+    boxes = np.array([[*line.points.min(axis=0), *line.points.max(axis=0)] for line in leaves]).reshape(-1, 4)
     for swing in swings:
+        near = ((boxes[:, :2] <= swing.hinge + LEAF_THICKNESS) & (boxes[:, 2:] >= swing.hinge - LEAF_THICKNESS)).all(axis=1)
         scores = []
         for end in swing.ends:
-            leaf = any(_runs_along(line.points, swing.hinge, end) for line in leaves)
+            leaf = any(_runs_along(leaves[k].points, swing.hinge, end) for k in np.flatnonzero(near))
             scores.append(_score_gap(raster, occupied, np.stack([swing.hinge, end])) - leaf)
         best = int(np.argmax(scores))
         if swing.named or scores[best] >= 1:
             gaps.append(np.stack([swing.hinge, swing.ends[best]]))
-    for number in {line.block for line in leaves if line.block}:
-        points = np.concatenate([line.points for line in leaves if line.block == number])
-        box = [points.min(axis=0) - 0.2, points.max(axis=0) + 0.2]
-        if not any(((box[0] <= s.hinge) & (s.hinge <= box[1])).all() for s in swings):
+    blocks: dict[int, list[Array]] = {}
+    for line in leaves:
+        if line.block:
+            blocks.setdefault(line.block, []).append(line.points)
+    hinges = np.array([s.hinge for s in swings]).reshape(-1, 2)
+    for parts in blocks.values():
+        points = np.concatenate(parts)
+        low, high = points.min(axis=0) - 0.2, points.max(axis=0) + 0.2
+        if not ((low <= hinges) & (hinges <= high)).all(axis=1).any():
             gaps += _find_block_gap(raster, occupied, points)
     return gaps
 
@@ -250,9 +257,7 @@ def _erase_gap(raster: _Raster, occupied: Array, ends: Array) -> None:
     inner = _lengthen(ends, -2 * raster.pixel)
     along = (inner[1] - inner[0]) / np.linalg.norm(inner[1] - inner[0])
     aside = np.array([-along[1], along[0]]) * ERASED
-    erased = np.zeros(raster.shape, bool)
-    raster.fill(erased, [np.stack([inner[0] - aside, inner[1] - aside, inner[1] + aside, inner[0] + aside])])
-    occupied[erased] = False
+    raster.fill(occupied, [np.stack([inner[0] - aside, inner[1] - aside, inner[1] + aside, inner[0] + aside])], False)
 
 
 def _fill_floor(raster: _Raster, occupied: Array, seals: Array) -> PlanMasks:
