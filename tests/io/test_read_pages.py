@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -251,3 +252,11 @@ def test_in_a_process_of_its_own(tmp_path: Path) -> None:
         tm.read_points(tmp_path / "a.svg", page=2)
     with pytest.raises(InputError, match="--page 0 can't be used"):
         tm.read_points(tmp_path / "a.pdf", page=0)
+
+
+@pytest.mark.parametrize(("library", "extra"), [("ezdxf", "dxf"), ("pypdfium2", "pdf"), ("resvg_py", "svg")])
+def test_a_missing_library_names_the_extra(tmp_path: Path, library: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / f"a.{extra}").write_text("x")
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(InputError, match=rf"needs {library}: pip install topomerge\[{extra}\]"):
+        tm.read_points(tmp_path / f"a.{extra}")
