@@ -45,7 +45,7 @@ RANKS = {
 }
 HEAVY = ("torch", "torch_geometric", "lightning_fabric", "hydra", "omegaconf", "open3d", "laspy", "pye57", "ifcopenshell")
 HEAVY += ("onnxruntime", "onnx")
-HEAVY += ("trimesh", "rosbags", "rapidocr_onnxruntime", "pupil_apriltags", "cv2")
+HEAVY += ("trimesh", "rosbags", "rapidocr_onnxruntime", "pupil_apriltags", "cv2", "ezdxf", "pypdfium2", "resvg_py")
 
 
 def sources() -> list[tuple[str, str, Path]]:

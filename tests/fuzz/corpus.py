@@ -68,6 +68,19 @@ def read_bag(path: Path) -> int:
     return read_cloud(path)
 
 
+def read_plan(path: Path) -> int:
+    """Read a plan in this process, a page without the network."""
+    from tests.io.cad_plans import parse_dark_lines
+    from topomerge.io import drawing, dxf, pdf, svg
+
+    drawing.parse_drawing = parse_dark_lines
+    drawing.load_text_reader = lambda: None
+    here = {"dxf": dxf, "pdf": pdf, "svg": svg}
+    for module in here.values():
+        module.read_in_subprocess = lambda name, _kind, path, options, *_: here[name].read_in_process(path, options)
+    return read_cloud(path)
+
+
 def read_map(path: Path) -> int:
     """Read a map, what `topomerge info` prints of it, and how the maps that it was joined of were bent."""
     from topomerge.fusion.result import read_bends
@@ -139,6 +152,7 @@ READERS: dict[str, Callable[[Path], int]] = {  # by name or suffix; all others a
     ".laz": read_las,
     ".tmap": read_map,
     **dict.fromkeys((".bag", ".db3", ".mcap"), read_bag),
+    **dict.fromkeys((".dxf", ".pdf", ".svg"), read_plan),
 }
 
 
@@ -224,6 +238,13 @@ def write_plans(folder: Path) -> dict[str, Path]:
     plan_files.campus(found["plan.xml"])
     plan_files.rmf(found["plan.building.yaml"])
     plan_files.amrl(found["plan.vectormap.json"])
+    if all(find_spec(name) for name in ("ezdxf", "pypdfium2", "resvg_py")):
+        from tests.io import cad_plans
+        from tests.io import test_read_pages as pages
+
+        found["flat.dxf"] = cad_plans.write_flat(folder / "flat.dxf")
+        found["flat.pdf"] = pages.write_pdf(folder / "flat.pdf", [pages.draw_flat(pages.AREAS)])
+        found["flat.svg"] = pages.write_svg(folder / "flat.svg")
     with tarfile.open(found["plans.tar.xz"], "w:xz") as archive:
         archive.add(plan_files.r2v(folder / "flat.txt"), "flat.txt")
     return found

@@ -36,6 +36,7 @@ from topomerge.cli.options import (
     build_quiet_option,
     check_descriptor,
     collect_given,
+    parse_count,
     parse_positive,
 )
 from topomerge.errors import InputError
@@ -55,7 +56,7 @@ def run_extract(args: argparse.Namespace) -> int:
         from topomerge.io.points import read_chunks
 
         lengths = ("scale", "resolution", "extrude", "spacing")
-        others = ("up", "unit", "drawing", "ceiling", "doors", "poses", "topic", "one_frame", "text")
+        others = ("up", "unit", "drawing", "ceiling", "doors", "poses", "topic", "one_frame", "text", "page")
         reading = collect_given(args, *lengths, *others)
         chunks = read_chunks(args.input, **reading, progress=bars.start_task("read"))
         choices = collect_given(args, "voxel_size", "preset")
@@ -110,6 +111,7 @@ EXTRACT = Command(
             const=False,
             help="dark pixels of a plain image are walls, also where it is a page with a drawn plan",
         ),
+        build_option("--page", type=parse_count, metavar="N", help="page of a PDF, from 1 (default: the only one with content)"),
         build_option("--extrude", type=parse_positive, metavar="H", help="m of wall height for 2D maps (default 2.5)"),
         build_option("--ceiling", action="store_true", help="close 2D maps with a ceiling"),
         build_option(

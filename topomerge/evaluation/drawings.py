@@ -109,7 +109,7 @@ def measure_page(page: Page, texts: bool) -> Row:
     drawing = draw_page(page)
     resolution = 1 / drawing.scale
     row: Row = {"spoilt": page.spoilt, "source": page.shapes.name.split("/")[0]}
-    row["building"] = find_physical_building(row["source"], page.shapes.name.partition("/")[2])
+    row["place"] = find_physical_building(row["source"], page.shapes.name.partition("/")[2])
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plan.png"
         Image.fromarray(drawing.picture).save(path)

@@ -6,10 +6,12 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
 
+from topomerge.errors import InputError
 from topomerge.io.pictures import load_text_reader
 from topomerge.io.sightings import clean_text
 from topomerge.networks.drawing import DOOR, FLOOR, PAGE, WALL, WINDOW, compute_drawing_probabilities
@@ -28,6 +30,7 @@ FOOT, INCH = 0.3048, 0.0254  # m
 PLAUSIBLE_AREA, PLAUSIBLE_SIDE = (0.8, 3000.0), (0.6, 100.0)  # m2, m
 FEWEST_PIXELS = 30  # of a room that gives a scale
 AGREEING = 0.12  # of the logarithm of the scale: texts that differ more from the median are not of their room
+NAME_HEIGHT = 1.2  # m above the floor at which the name of a room is placed
 DOOR_WIDTH, DOOR_SPREAD = 0.82, 0.12  # m, usual clear width of drawn doors, and its spread as a logarithm
 
 NUMBER = r"(\d{1,5}(?:[.,]\d{1,3})?)"
@@ -37,6 +40,7 @@ SIDE_IN_FEET = r"(\d{1,3})\s*['’′]\s*(?:(\d{1,2})\s*(?:[\"”″]|'')?)?"
 FEET = re.compile(SIDE_IN_FEET + r"\s*[x×X*]\s*" + SIDE_IN_FEET)
 NUMBERED = re.compile(r"[A-Za-z]{0,3}[-. ]?\d{1,3}(?:[.\-]\d{1,4}){0,2}[a-z]?(?<=..)")
 NAME_SIGMA = 1.0  # m, of where a name stands in its room
+STATED_SCALE = re.compile(r"(?<![\d:.,])1\s?:\s?([1-9]\d{1,3})(?![\d:.,])")
 WORD = re.compile(r"[^\W\d_]{2,}")
 
 
@@ -199,22 +203,6 @@ def find_name(text: str) -> str:
     return left if WORD.search(left) or NUMBERED.fullmatch(left) else ""
 
 
-def find_names(texts: Sequence[PictureText], source: str, resolution: float, height: int) -> Landmarks:
-    """Find names and numbers of rooms among texts; numbers are what signs at doors show.
-
-    Args:
-        source: the picture; resolution: m a pixel of it; height: px.
-    """
-    parts = []
-    for kind in ("name", "text"):
-        found = [(name, t) for t in texts if (name := find_name(t.text)) and (kind == "text") == bool(NUMBERED.fullmatch(name))]
-        places = np.array([t.place for _, t in found]).reshape(-1, 2)
-        position = np.column_stack([places[:, 0], height - places[:, 1], np.zeros(len(places))]) * resolution
-        confidence = np.array([t.confidence for _, t in found])
-        parts.append(build_landmarks(kind, [n for n, _ in found], source, position, sigma=NAME_SIGMA, confidence=confidence))
-    return join_landmarks(parts)
-
-
 def estimate_scale(drawing: ParsedDrawing, texts: Sequence[PictureText]) -> DrawingScale | None:
     """Estimate the size of a pixel by the areas and sides that are written in rooms; else by the width of doors.
 
@@ -277,6 +265,93 @@ def _estimate_scale_by_doors(drawing: ParsedDrawing) -> DrawingScale | None:
     width = float(np.median(widths))
     spread = float(np.hypot(DOOR_SPREAD, 0.3 / np.sqrt(len(widths))))
     return DrawingScale(DOOR_WIDTH / width * drawing.zoom, spread, (f"{count} doors of usual width",), written=False)
+
+
+@dataclass(frozen=True, eq=False)
+class TracedDrawing:
+    """A drawing with its scale: `resolution` (m) is that of its own pixels; `texts` are in them, too; `warnings` say why."""
+
+    drawing: ParsedDrawing
+    resolution: float
+    texts: tuple[PictureText, ...]
+    warnings: tuple[str, ...]
+
+
+def trace_drawing(
+    path: Path,
+    picture: Array,
+    resolution: float | None,
+    texts: Sequence[PictureText] | None = None,
+    page: float | None = None,
+    text: bool | None = None,
+) -> TracedDrawing:
+    """Find walls and floor of a drawing, and how large it is.
+
+    Args:
+        path: for messages.
+        picture: (h, w, 3) uint8.
+        resolution: m a pixel; None: by what is written on it, or by its doors.
+        texts: of the picture, if they are known; None: they are read where a reader is installed, unless `text` is False.
+        page: m of paper a pixel, where the file says so: "1:100" is a scale then.
+
+    Raises:
+        InputError: it shows no room, or nothing says how large it is.
+    """
+    if texts is None:
+        texts = read_texts(picture) if text is not False else ()
+    stated = None if page is None else find_stated_scale(texts or ())
+    known = resolution if resolution is not None or stated is None or page is None else page * stated
+    drawing = parse_drawing(picture, known)
+    if not drawing.free.any():
+        raise InputError(f"{path}: no walls around a room were found in it; if it is a robot's grid, give --no-drawing")
+    said = [f"{path.name}: was read as a drawn plan, without its page, texts and furniture"]
+    if resolution is None:
+        scale = estimate_scale(drawing, texts or ())
+        if known is not None and not (scale and scale.written and abs(np.log(scale.resolution / known)) > AGREEING):
+            scale = DrawingScale(known, 0.0, (f"1:{stated:g}",))
+        if scale is None:
+            more = "" if texts is not None else " (pip install topomerge[text] reads what is written on it)"
+            raise InputError(f"{path}: an image does not say how large a pixel is; give --resolution in metres a pixel{more}")
+        known = scale.resolution
+        why = ", ".join(repr(reason) if scale.written else reason for reason in scale.reasons[:3])
+        said.append(f"{path.name}: {known:.4g} m a pixel, give or take {scale.spread:.0%}, by {why}; --resolution sets it")
+        if not np.isclose(choose_zoom(picture.shape[:2], known), drawing.zoom, rtol=0.1):
+            drawing = parse_drawing(picture, known)
+    assert known is not None
+    zoom = drawing.zoom
+    placed = [PictureText(t.text, (t.place[0] * zoom, t.place[1] * zoom), t.height * zoom, t.confidence) for t in texts or ()]
+    return TracedDrawing(drawing, known / zoom, tuple(placed), tuple(said))
+
+
+def find_stated_scale(texts: Sequence[PictureText]) -> float | None:
+    """Find the one scale of a page that its texts state ("1:100" is 100); None where they state none, or several."""
+    found = {float(match) for text in texts for match in STATED_SCALE.findall(text.text)}
+    return found.pop() if len(found) == 1 else None
+
+
+def build_name_landmarks(
+    texts: Sequence[PictureText], free: Array, resolution: float, corner: tuple[float, float], height: float, source: str
+) -> Landmarks:
+    """Build landmarks of the names of rooms among texts; numbers of rooms are texts, as signs at doors show them.
+
+    Args:
+        texts: in pixels of the floor.
+        free: (h, w) bool, floor; only what lies on it, or in a hole of it that a text made, is the name of a room.
+        resolution: of a pixel; corner: x and y of the lower left one; height: of the names, all in the unit of the file.
+        source: the name of the file.
+    """
+    rooms = free.astype(np.uint8)
+    near = [t for t in texts if 0 <= t.place[0] < free.shape[1] and 0 <= t.place[1] < free.shape[0]]
+    kept = [(name, t) for t in near if (name := find_name(t.text)) and _find_room(rooms, t, 1.0)]
+    parts = []
+    for kind in ("name", "text"):
+        some = [(name, t) for name, t in kept if bool(NUMBERED.fullmatch(name)) == (kind == "text")]
+        columns, rows = np.array([t.place for _, t in some]).reshape(-1, 2).T
+        x, y = corner[0] + columns * resolution, corner[1] + (len(free) - rows) * resolution
+        places = np.stack([x, y, np.full(len(x), height)], axis=1)
+        confidence = np.array([t.confidence for _, t in some])
+        parts.append(build_landmarks(kind, [name for name, _ in some], source, places, sigma=NAME_SIGMA, confidence=confidence))
+    return join_landmarks(parts)
 
 
 def read_texts(picture: Array) -> tuple[PictureText, ...] | None:

@@ -15,8 +15,22 @@ from scipy import ndimage
 
 from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError
-from topomerge.io.drawing import ParsedDrawing, choose_zoom, estimate_scale, find_names, is_drawing, parse_drawing, read_texts
-from topomerge.io.piece import BLOCK_POINTS, MOST_POINTS, PIXELS, Piece, ReadOptions, build_count_error, build_damage_error
+from topomerge.io.drawing import (
+    NAME_HEIGHT,
+    TracedDrawing,
+    build_name_landmarks,
+    is_drawing,
+    trace_drawing,
+)
+from topomerge.io.piece import (
+    BLOCK_POINTS,
+    MOST_POINTS,
+    PIXELS,
+    Piece,
+    ReadOptions,
+    build_count_error,
+    build_damage_error,
+)
 from topomerge.types import Array, Landmarks
 
 JUDGED_FLOOR = 4.0  # m2 of floor below which nothing is judged
@@ -211,8 +225,10 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
             raise InputError(f"{path}: states its own resolution of {plan.resolution:g} m; leave --resolution out")
         occupied, free, doubts = read_pixels(path, plan)
     elif options.drawing and is_drawing(*read_image(path)):
-        plan, drawing, names = read_drawing(path, options.resolution, options.text)
-        occupied, free, doubts = drawing.occupied, drawing.free, ()
+        yield from build_drawn_pieces(
+            path, trace_drawing(path, read_picture(path), options.resolution, text=options.text), options
+        )
+        return
     elif options.resolution is None:
         beside = next((b for b in (path.with_suffix(".yaml"), path.with_suffix(".yml")) if b.is_file()), None)
         hint = f", or read {beside.name} instead" if beside else ""
@@ -225,32 +241,13 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     yield from extrude(path, occupied, free, plan, options)
 
 
-def read_drawing(path: Path, resolution: float | None, text: bool | None = None) -> tuple[Plan, ParsedDrawing, Landmarks]:
-    """Read the walls and the floor of a drawing on a page, the plan whose pixels they are, and the names of rooms on it.
-
-    Args:
-        resolution: m a pixel; None: by what is written on it, or by its doors. text: as of `ReadOptions`.
-
-    Raises:
-        InputError: it shows no room, or nothing says how large it is.
-    """
-    drawing = parse_drawing(picture := read_picture(path), resolution)
-    if not drawing.free.any():
-        raise InputError(f"{path}: no walls around a room were found in it; if it is a robot's grid, give --no-drawing")
-    found = read_texts(picture) if text is not False else ()
-    said: tuple[str, ...] = (f"{path.name}: was read as a drawn plan, without its page, texts and furniture",)
-    if resolution is None:
-        scale = estimate_scale(drawing, found or ())
-        if scale is None:
-            more = "" if found is not None else " (pip install topomerge[text] reads what is written on it)"
-            raise InputError(f"{path}: an image does not say how large a pixel is; give --resolution in metres a pixel{more}")
-        resolution = scale.resolution
-        why = ", ".join(repr(reason) if scale.written else reason for reason in scale.reasons[:3])
-        said += (f"{path.name}: {resolution:.4g} m a pixel, give or take {scale.spread:.0%}, by {why}; --resolution sets it",)
-        if not np.isclose(choose_zoom(picture.shape[:2], resolution), drawing.zoom, rtol=0.1):
-            drawing = parse_drawing(picture, resolution)
-    plan = Plan(path, resolution / drawing.zoom, warnings=said)
-    return plan, drawing, find_names(found or (), path.name, resolution, picture.shape[0])
+def build_drawn_pieces(path: Path, traced: TracedDrawing, options: ReadOptions) -> Iterator[Piece]:
+    """Yield the floor and the walls of a drawing, and the names of its rooms."""
+    drawing, plan = traced.drawing, Plan(path, traced.resolution)
+    height = NAME_HEIGHT / options.factor
+    names = build_name_landmarks(traced.texts, drawing.free, plan.resolution, (0.0, 0.0), height, path.name)
+    yield Piece(np.empty((0, 3)), warnings=traced.warnings, done=0.1, landmarks=names)
+    yield from extrude(path, drawing.occupied, drawing.free, plan, options)
 
 
 def read_picture(path: Path) -> Array:

@@ -130,6 +130,7 @@ class ReadOptions:
             of a topic with poses. None: what lies beside the scans, or what the bag holds.
         one_frame: read all files of a folder as parts of one cloud, whose points lie in one frame.
         topic: of a bag, where it has several with points or maps.
+        page: of a PDF file, from 1; None: the only one that holds anything.
         text: read signs and tags on pictures. True: must; None: where the packages for that are installed; False: don't.
     """
 
@@ -145,6 +146,7 @@ class ReadOptions:
     poses: str | None = None
     topic: str | None = None
     one_frame: bool = False
+    page: int | None = None
     text: bool | None = None
 
     @property
@@ -174,6 +176,8 @@ def read_options(path: Path, values: Mapping[str, Any]) -> ReadOptions:
     for name in ("poses", "topic"):
         if getattr(options, name) is not None and not str(getattr(options, name)).strip():
             raise InputError(f"{path}: --{name} is empty; give a name")
+    if options.page is not None and not (isinstance(options.page, int) and options.page >= 1):
+        raise InputError(f"{path}: --page {options.page!r} can't be used; give a whole number from 1 on")
     for name in LENGTH_NAMES:
         value = getattr(options, name)
         if value is not None and not (isinstance(value, Real) and math.isfinite(value) and float(value) > 0):

@@ -24,9 +24,8 @@ from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError, is_memory_short
 from topomerge.io import frame
 from topomerge.io.frame import get_axis_rotation
-from topomerge.io.landmarks import find_landmark_file, read_landmark_file
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_options
-from topomerge.io.radio_csv import find_radio_file, read_radio_beside
+from topomerge.io.radio_csv import read_tables_beside
 from topomerge.io.sightings import ObjectFinder
 from topomerge.types import (
     Array,
@@ -313,6 +312,9 @@ FORMATS = (
     Format("a map in JSON", "json_map", (".json",), fixed=True, takes=DRAWN),
     Format("an RTAB-Map database", "rtabmap", (".db",)),
     Format("a ScanNet recording", "sens", (".sens",)),
+    Format("a DXF drawing", "dxf", (".dxf",), extra="dxf", takes=("extrude", "ceiling")),
+    Format("a PDF drawing", "pdf", (".pdf",), fixed=True, extra="pdf", takes=(*DRAWN, "page")),
+    Format("an SVG drawing", "svg", (".svg",), fixed=True, extra="svg", takes=DRAWN),
     Format("a floor plan", "grid", (".yaml", ".yml", *PICTURES), fixed=True, takes=DRAWN),
 )
 SCAN_FOLDER = Format("a folder of scans", "scan_folder", (), takes=("poses",))
@@ -340,7 +342,7 @@ def read_points(path: str | Path, *, progress: Progress | None = None, **options
         progress: called now and then with the share done and a text.
         options: those of `topomerge.io.piece.ReadOptions`: ``up``, ``unit``, ``scale`` of the coordinates; ``resolution``,
             ``extrude``, ``ceiling`` of floor plans; ``spacing`` of points on surfaces; ``doors`` of building models; ``poses``
-            and ``topic`` of scans; ``one_frame`` of a folder whose files are parts of one cloud; ``text`` of pictures.
+            and ``topic`` of scans; ``one_frame`` of a folder of parts of one cloud; ``text`` of pictures; ``page`` of a PDF.
 
     Raises:
         InputError: anything that keeps the file from being read, or a wrong option, in one line.
@@ -369,7 +371,7 @@ def read_chunks(
         file_format = TILES_FOLDER
     if chunk < 1:
         raise InputError(f"{path}: a chunk of {chunk} points can't be read; give 1 or more")
-    for name in ("poses", "topic", "doors", "one_frame", *DRAWN):
+    for name in ("poses", "topic", "doors", "one_frame", "page", *DRAWN):
         if options.get(name) not in (None, False) and name not in file_format.takes:
             able = ", ".join(f.name for f in (*FORMATS, SCAN_FOLDER, TILES_FOLDER, RGBD_FOLDER) if name in f.takes)
             raise InputError(
@@ -382,10 +384,8 @@ def read_chunks(
     up = None if file_format.fixed else reading.up or file_format.up
     gatherer = Gatherer(str(path), up, reading.factor, chunk, warnings)
     pieces = _iter_pieces(path, file_format, reading)
-    if (beside := find_landmark_file(path)) is not None:
-        pieces = itertools.chain([Piece(np.empty((0, 3)), landmarks=read_landmark_file(beside))], pieces)
-    if (radio := find_radio_file(path)) is not None:
-        pieces = itertools.chain([Piece(np.empty((0, 3)), landmarks=read_radio_beside(radio, path, reading.poses))], pieces)
+    beside = [Piece(np.empty((0, 3)), landmarks=found) for found in read_tables_beside(path, reading.poses)]
+    pieces = itertools.chain(beside, pieces)
     return _iter_chunks(path, pieces, gatherer, progress)
 
 

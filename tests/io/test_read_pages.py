@@ -1,0 +1,262 @@
+"""PDF and SVG plans: a page as a picture, its texts as they are, its scale; hostile files. No network parses the picture here."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pypdfium2")
+pytest.importorskip("resvg_py")
+
+import topomerge as tm
+from tests.io.cad_plans import OUTER, ROOMS, parse_dark_lines
+from topomerge.errors import InputError
+from topomerge.io import drawing, pdf, svg
+from topomerge.io.drawing import ParsedDrawing, PictureText, find_stated_scale
+from topomerge.io.piece import ReadOptions
+from topomerge.types import Landmarks
+
+POINTS_A_METRE = 72 / 0.0254 / 100  # of a drawing 1:100
+HALL = (20.0, 30.0)  # points, where the lower left corner of the flat lies on the page
+A4 = (842.0, 595.0)
+
+
+@pytest.fixture(autouse=True)
+def parser(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
+    """Dark pixels are walls and what they enclose is floor; the list takes the pictures that are parsed."""
+    seen: list[np.ndarray] = []
+
+    def parse(picture: np.ndarray, resolution: float | None = None) -> ParsedDrawing:
+        seen.append(picture)
+        return parse_dark_lines(picture)
+
+    monkeypatch.setattr(drawing, "parse_drawing", parse)
+    monkeypatch.setattr(drawing, "load_text_reader", lambda: None)
+    return seen
+
+
+def write_pdf(path: Path, pages: list[str], kids: int = 1, more: str = "", size: tuple[float, float] = A4) -> Path:
+    """Write a PDF file of pages with these contents; `kids`: how often each is listed; `more`: entries of each page."""
+    listed = " ".join(f"{4 + 2 * k} 0 R" for k in range(len(pages)) for _ in range(kids))
+    objects = ["<</Type/Catalog/Pages 2 0 R>>", f"<</Type/Pages/Kids[{listed}]/Count {len(pages) * kids}>>"]
+    objects.append("<</Type/Font/Subtype/Type1/BaseFont/Helvetica>>")
+    for k, content in enumerate(pages):
+        box = f"/MediaBox[0 0 {size[0]:g} {size[1]:g}]/Resources<</Font<</F 3 0 R>>>>"
+        objects.append(f"<</Type/Page/Parent 2 0 R{box}/Contents {5 + 2 * k} 0 R{more}>>")
+        objects.append(f"<</Length {len(content)}>>stream\n{content}\nendstream")
+    out, starts = b"%PDF-1.4\n", []
+    for number, text in enumerate(objects, 1):
+        starts.append(len(out))
+        out += f"{number} 0 obj\n{text}\nendobj\n".encode()
+    table = "".join(f"{start:010} 00000 n \n" for start in starts)
+    tail = f"xref\n0 {len(objects) + 1}\n0000000000 65535 f \n{table}trailer<</Size {len(objects) + 1}/Root 1 0 R>>\n"
+    path.write_bytes(out + f"{tail}startxref\n{len(out)}\n%%EOF\n".encode())
+    return path
+
+
+def draw_flat(texts: list[str], scale: str = "") -> str:
+    """The contents of a page with the flat 1:100, its rooms without doors, each with its name and one of the texts."""
+    k = POINTS_A_METRE
+    parts = [f"{HALL[0]} {HALL[1]} {OUTER[0] * k:.3f} {OUTER[1] * k:.3f} re"]
+    parts += [f"{HALL[0] + x * k:.3f} {HALL[1] + y * k:.3f} {w * k:.3f} {h * k:.3f} re" for x, y, w, h in ROOMS.values()]
+    parts.append("f*")  # holes are rooms
+    for (name, (x, y, _, h)), text in zip(ROOMS.items(), texts, strict=True):
+        left, middle = HALL[0] + (x + 0.3) * k, HALL[1] + (y + h / 2) * k
+        parts.append(f"BT /F 8 Tf {left:.2f} {middle:.2f} Td ({name}) Tj 0 -12 Td ({text}) Tj ET")
+    return "\n".join([*parts, f"BT /F 9 Tf 600 40 Td ({scale}) Tj ET" if scale else ""])
+
+
+AREAS = [f"{w * h:.2f} m2" for _, _, w, h in ROOMS.values()]
+
+
+def read(module: ModuleType, path: Path, **options: object) -> tuple[np.ndarray, Landmarks, tuple[str, ...]]:
+    """(n, 2) points of the floor, m, landmarks and warnings."""
+    first, floor, *_ = module.read_in_process(path, ReadOptions(**options))  # type: ignore[arg-type]
+    return floor.points[:, :2], first.landmarks, first.warnings
+
+
+@pytest.mark.parametrize("turned", [0, 90])
+@pytest.mark.parametrize(
+    ("texts", "scale"), [(AREAS, ""), (["-"] * 4, "Plan 1:100"), (AREAS, "1 : 50")], ids=["areas", "scale", "both"]
+)
+def test_a_page_with_a_plan(tmp_path: Path, texts: list[str], scale: str, turned: int, parser: list[np.ndarray]) -> None:
+    """The scale is what is written in rooms or beside the plan; where both disagree (a plan printed smaller), the rooms'."""
+    path = write_pdf(tmp_path / "a.pdf", [draw_flat(texts, scale)], more=f"/Rotate {turned}")
+    floor, names, warnings = read(pdf, path)
+    extent = np.ptp(floor, axis=0)[:: -1 if turned else 1]
+    np.testing.assert_allclose(extent, np.array(OUTER) - 0.4, rtol=0.02)
+    assert sorted(names.get_values()) == sorted(ROOMS)
+    middle = {name: (x + 0.8, y + h / 2) for name, (x, y, w, h) in ROOMS.items()}
+    true = np.array([middle[name] for name in names.get_values()])
+    places = names.table["position"][:, :2] - floor.min(axis=0) + 0.2
+    if turned:  # clockwise: what was the lower left is the upper left
+        places = np.stack([OUTER[0] - places[:, 1], places[:, 0]], axis=1)
+    np.testing.assert_allclose(places, true, atol=0.6)
+    assert any(("'1:100'" if scale.endswith("100") else "m2") in warning for warning in warnings)
+    assert max(parser[0].shape) < pdf.LONGEST_SIDE and (parser[0].mean(axis=2)[-400:, -600:] == 255).all()  # no letters on it
+
+
+def test_resolution_is_what_the_user_says(tmp_path: Path) -> None:
+    path = write_pdf(tmp_path / "a.pdf", [draw_flat(AREAS)])
+    floor, _, _ = read(pdf, path, resolution=0.1)
+    pixels = (np.array(OUTER) - 0.4) * POINTS_A_METRE * pdf.FINEST_DOTS / 72
+    np.testing.assert_allclose(np.ptp(floor, axis=0), pixels * 0.1, rtol=0.02)
+
+
+def test_pages(tmp_path: Path) -> None:
+    plan = draw_flat(AREAS)
+    two = write_pdf(tmp_path / "two.pdf", ["", plan, plan])
+    for number in (2, 3):
+        assert len(read(pdf, two, page=number)[0]) > 1000
+    cases = {
+        (two, None): "has 3 pages; name the one with the plan by --page, such as --page 2",
+        (two, 1): "there is nothing on page 1",
+        (two, 4): "--page 4 is none of them",
+        (write_pdf(tmp_path / "empty.pdf", [""]), None): "there is nothing in it",
+        (write_pdf(tmp_path / "many.pdf", [""], kids=100_000), None): "nothing on its first 100 pages",
+        (write_pdf(tmp_path / "huge.pdf", ["0 0 5 5 re f"], size=(1.0, 1.0)), None): "has a size of 1 x 1 points",
+        (write_pdf(tmp_path / "cat.pdf", ["300 300 50 50 re f"]), None): "no walls around a room",
+    }
+    for (path, number), says in cases.items():
+        with pytest.raises(InputError, match=says) as refusal:
+            read(pdf, path, page=number)
+        assert path.name in str(refusal.value) and "\n" not in str(refusal.value)
+    assert len(read(pdf, write_pdf(tmp_path / "one.pdf", ["", plan, ""]))[0]) > 1000
+
+
+def test_a_huge_page_has_bounded_pixels(tmp_path: Path, parser: list[np.ndarray]) -> None:
+    path = write_pdf(tmp_path / "a.pdf", [draw_flat(AREAS)], size=(14_400.0, 10_000.0))
+    read(pdf, path)
+    assert max(parser[0].shape) == pdf.LONGEST_SIDE
+
+
+def test_scales_that_are_stated() -> None:
+    def state(*texts: str) -> float | None:
+        return find_stated_scale([PictureText(text, (0, 0), 1, 1) for text in texts])
+
+    assert state("M 1:100", "1 : 100 (A3)") == 100 and state("scale 1:50") == 50
+    assert state("1:100", "1:20") is None and state("at 11:45", "1:5", "1:1:100", "3 m") is None
+
+
+def write_svg(
+    path: Path, body: str = "", head: str = "", size: str = 'width="297mm" height="210mm" viewBox="0 0 29.7 21"'
+) -> Path:
+    """Write the flat 1:100 in centimetres of paper, y down."""
+    rooms = "".join(f"M{x + 1} {20 - y}h{w}v{-h}h{-w}z" for x, y, w, h in [*ROOMS.values(), (0, 0, *OUTER)])
+    texts = "".join(
+        f'<text x="{x + 1.3}" y="{20 - y - h / 2}" style="font-size:0.3px">{name}'
+        f'<tspan x="{x + 1.3}" dy="0.4">{w * h:.2f} m²</tspan></text>'
+        for name, (x, y, w, h) in ROOMS.items()
+    )
+    same = "translate(3,2) scale(2) translate(-1.5 -1) scale(.5,0.5)"
+    plan = f'<g transform="{same}"><path fill-rule="evenodd" d="{rooms}"/>{texts}</g>'
+    links = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
+    path.write_text(f'<?xml version="1.0"?>{head}<svg {links} {size}>{plan}{body}</svg>', encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    "size",
+    [
+        'width="297mm" height="210mm" viewBox="0 0 29.7 21"',
+        'viewBox="0 0 29.7 21"',
+        'width="600" height="900" viewBox="0 0 29.7 21"',
+    ],
+)
+def test_a_drawing_in_svg(tmp_path: Path, size: str, parser: list[np.ndarray]) -> None:
+    floor, names, warnings = read(svg, write_svg(tmp_path / "a.svg", size=size))
+    np.testing.assert_allclose(np.ptp(floor, axis=0), np.array(OUTER) - 0.4, rtol=0.02)
+    assert sorted(names.get_values()) == sorted(ROOMS)
+    true = np.array([(x + 0.7, y + h / 2) for x, y, w, h in (ROOMS[name] for name in names.get_values())])
+    np.testing.assert_allclose(names.table["position"][:, :2] - floor.min(axis=0) + 0.2, true, atol=0.4)
+    assert any("m²" in warning for warning in warnings) and max(parser[0].shape) >= svg.SHORTEST_SIDE - 1
+
+
+def test_svg_states_its_scale(tmp_path: Path) -> None:
+    path = write_svg(tmp_path / "a.svg", '<text x="20" y="20">1:100</text>')
+    path.write_text(path.read_text(encoding="utf-8").replace(" m²", ""), encoding="utf-8")
+    floor, _, warnings = read(svg, path)
+    np.testing.assert_allclose(np.ptp(floor, axis=0), np.array(OUTER) - 0.4, rtol=0.01)
+    assert any("'1:100'" in warning for warning in warnings)
+
+
+def test_what_lies_outside_of_an_svg_is_not_read(tmp_path: Path, parser: list[np.ndarray]) -> None:
+    from PIL import Image
+
+    Image.new("L", (50, 50)).save(tmp_path / "black.png")
+    plain = write_svg(tmp_path / "a.svg")
+    read(svg, plain)
+    for address in (tmp_path / "black.png", (tmp_path / "black.png").as_uri(), "http://127.0.0.1:9/x.png", "black.png"):
+        for name in ("href", "xlink:href"):
+            body = f'<image {name}="{address}" x="0" y="0" width="10" height="10"/><use {name}="{address}#a"/>'
+            head = f'<?xml-stylesheet href="{address}"?>'
+            read(svg, write_svg(tmp_path / "b.svg", body + f"<style>@import url({address});</style>", head))
+            np.testing.assert_array_equal(parser[-1], parser[0])
+
+
+LAUGHS = (
+    '<!DOCTYPE svg [<!ENTITY a "ha">'
+    + "".join(f'<!ENTITY {b} "{f"&{a};" * 10}">' for a, b in zip("abcdefghi", "bcdefghij", strict=True))
+    + "]>"
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (f'{LAUGHS}<svg xmlns="http://www.w3.org/2000/svg" width="9" height="9">&j;</svg>', "declares entities"),
+        ('<!DOCTYPE svg SYSTEM ">" [<!ENTITY a SYSTEM "file:///etc/passwd">]><svg>&a;</svg>', "declares entities"),
+        ("<svg" + "><g" * 5000 + "/>" + "</g>" * 4999 + "</svg>", "deep in each other"),
+        ("<html></html>", "is XML, but no SVG"),
+        ("<svg", "damaged, or not an SVG file"),
+        ('<svg xmlns="http://www.w3.org/2000/svg"><path d="M0 0h9"/></svg>', "neither width and height nor a viewBox"),
+        ('<svg xmlns="http://www.w3.org/2000/svg" width="1e6" height="1"/>', "has a size of"),
+        ('<svg xmlns="http://www.w3.org/2000/svg" width="90" height="90"/>', "there is nothing in it"),
+        ('<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 9 9"><path d="M1 1h2v2z"/></svg>', "no walls around a room"),
+    ],
+)  # fmt: skip
+def test_what_is_no_plan_in_svg(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "a.svg"
+    for encoding in ("utf-8", "utf-16"):
+        path.write_bytes(text.encode(encoding))
+        with pytest.raises(InputError, match=says) as refusal:
+            read(svg, path)
+        assert "a.svg" in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+def test_a_bomb_of_uses(tmp_path: Path) -> None:
+    """10^9 copies of one line: the process that draws them comes to an end, or never starts with them."""
+    groups = "".join(f'<g id="g{k + 1}">' + f'<use href="#g{k}"/>' * 10 + "</g>" for k in range(9))
+    path = tmp_path / "a.svg"
+    path.write_text(f'<svg xmlns="http://www.w3.org/2000/svg" width="90" height="90"><path id="g0" d="M0 0h9"/>{groups}</svg>')
+    with pytest.raises(InputError) as refusal:
+        tm.read_points(path)
+    assert "a.svg" in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+def test_in_a_process_of_its_own(tmp_path: Path) -> None:
+    """What the child refuses is told in one line by the parent."""
+    write_pdf(tmp_path / "a.pdf", [""])
+    (tmp_path / "a.svg").write_text('<svg xmlns="http://www.w3.org/2000/svg" width="90" height="90"/>')
+    for name in ("a.pdf", "a.svg"):
+        with pytest.raises(InputError, match="there is nothing in it"):
+            tm.read_points(tmp_path / name)
+    (tmp_path / "b.pdf").write_bytes(b"%PDF-1.4\nbut nothing more")
+    with pytest.raises(InputError, match="damaged, or not a PDF"):
+        tm.read_points(tmp_path / "b.pdf")
+    with pytest.raises(InputError, match="--page is of no use to an SVG drawing"):
+        tm.read_points(tmp_path / "a.svg", page=2)
+    with pytest.raises(InputError, match="--page 0 can't be used"):
+        tm.read_points(tmp_path / "a.pdf", page=0)
+
+
+@pytest.mark.parametrize(("library", "extra"), [("ezdxf", "dxf"), ("pypdfium2", "pdf"), ("resvg_py", "svg")])
+def test_a_missing_library_names_the_extra(tmp_path: Path, library: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / f"a.{extra}").write_text("x")
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(InputError, match=rf"needs {library}: pip install topomerge\[{extra}\]"):
+        tm.read_points(tmp_path / f"a.{extra}")
