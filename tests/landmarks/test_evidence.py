@@ -8,17 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.scenes_map import building
-from topomerge.landmarks.evidence import (
-    ALTERNATIVES,
-    KINDS,
-    MOST_FAR,
-    NEAR,
-    READERS,
-    RENEWED,
-    SIDE_BY_SIDE,
-    LandmarkEvidence,
-    score_landmarks,
-)
+from topomerge.landmarks.evidence import MOST_FAR, LandmarkEvidence, score_landmarks
+from topomerge.landmarks.likelihood import ALTERNATIVES, KINDS, NEAR, READERS, RENEWED, SIDE_BY_SIDE
 from topomerge.landmarks.sightings import MOST_SIGHTINGS, build_sightings
 from topomerge.registration.posterior import POSTERIOR
 from topomerge.types import Landmarks, Sim3, build_landmarks, join_landmarks, move_landmarks
@@ -184,6 +175,14 @@ def test_a_million_landmarks_are_bounded_work():
     hostile = replace(HALL, landmarks=Landmarks(table, many.values, many.sources))
     assert len(build_sightings(hostile, ("text",))) <= MOST_SIGHTINGS
     assert np.isfinite(list(score_landmarks(hostile, hostile, Sim3()).factors["text"].values())).all()
+
+
+def test_another_pose_that_signs_speak_for_as_much_is_a_rival():
+    good, none = score(NUMBERS, NUMBERS), LandmarkEvidence()
+    even = {**dict.fromkeys(ALTERNATIVES, 0.0), "here": 0.5, "elsewhere": 0.5}
+    assert good.apply(even, [(1.0, none)])["here"] > 0.95
+    assert good.apply(even, [(1.0, good)])["here"] == pytest.approx(2 / 3, abs=0.01)  # half of elsewhere is that pose
+    assert good.apply(even, [(0.001, good), (0.999, none)])["here"] > 0.95
 
 
 TEXTS = st.lists(st.sampled_from([*NUMBERS, "3.113", "EXIT", "WC", "101", "Z.1l3", "Dr. Meier", ""]), min_size=1, max_size=6)

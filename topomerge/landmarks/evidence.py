@@ -1,22 +1,10 @@
-"""What landmarks of two maps say of a pose: a likelihood of each named alternative (issue 51).
+"""What landmarks of two maps say of a pose: one factor a kind over the named alternatives, and which landmarks testify.
 
-Generative assumptions. Each is a number below, stated and not fitted.
+Where both maps read something at one place, `likelihood` weighs it. Besides:
 
-- *Here* (the pose is right): where both maps read a sign at one place, both are readings of one string (`text.score_reading`),
-  unless the sign was changed in between (`Kind.changed`) or they are two signs side by side. As a whole, the signs of a building
-  are all new with `RENEWED`.
-- *Any alternative*: a sign at the same place bears a string drawn as often as it stands in these maps and in buildings at large
-  (`text.estimate_share`), or a number near the other one. As a whole, the other place repeats all strings of this one with
-  `Kind.repeats` (wings that are numbered alike, tags printed from one sheet), or all of its numbers differ by one shift, as
-  storeys and wings do.
-- How well the readers read is not known, and shared by all signs of the pair: `READERS`.
 - A rare string that both maps read at two places far from each other under the pose speaks for another pose, unless it points
   there (`POINTS_THERE`).
 - A sign that the other map could have seen and did not read says little (`READS`).
-
-So that no single landmark carries a merge, one agreeing landmark counts `Kind.most` times at most, and all together no more than
-one in `Kind.repeats`. The same holds in the limit for robust mixtures in SLAM (Olson and Agarwal 2013, "Inference on networks of
-mixtures for robust robot mapping").
 """
 
 from __future__ import annotations
@@ -29,73 +17,30 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from topomerge.landmarks.sightings import Sightings, build_sightings
-from topomerge.landmarks.text import (
-    Shift,
-    find_shifts,
-    is_common,
-    quote_text,
-    score_neighbour,
-    score_reading,
-    score_shifted,
+from topomerge.landmarks.likelihood import (
+    ALTERNATIVES,
+    GATE,
+    KINDS,
+    READERS,
+    Associated,
+    Kind,
+    associate_sightings,
+    compute_factors,
+    compute_shares,
+    pick_partners,
+    score_pair,
 )
+from topomerge.landmarks.sightings import Sightings, build_sightings
+from topomerge.landmarks.text import quote_text
 from topomerge.types import Array, Deformation, Sim3, TopometricMap
 
-ALTERNATIVES = ("here", "elsewhere", "storey", "half", "wing", "building", "outside")
-READERS = ((0.002, 0.4), (0.02, 0.3), (0.08, 0.2), (0.2, 0.1))  # error of a character, and how many readers err so
-RENEWED = 0.003
-SHIFTS = 30.0  # ways in which numbers may be shifted
-SHIFTED = {"elsewhere": 0.4, "storey": 0.7, "half": 0.5, "wing": 0.6, "building": 0.2, "outside": 0.2}  # share of such places
-NEAR = {"elsewhere": 0.5, "storey": 0.8, "half": 0.5, "wing": 0.6, "building": 0.3, "outside": 0.3}  # numbers near the other's
 READS = 0.6  # probability that a map that reads as many signs as the other one reads a sign that it could have seen
 MOST_MISSED = 1.0  # log odds that unread signs may cost in all
-WORDS_CHANGED = 0.2  # probability that a sign without a number was changed: notices, names of people
-TURNED_BY, TURNED = np.radians(60.0), 0.1  # rad by which two headings of one landmark do not differ; times as likely if they do
 POINTS_THERE = 0.1  # probability that a rare string far from its place points there, or was put in a wrong place
 FAR, MOST_FAR = 6.0, 6.0  # m beyond which two places are two, and log odds that such strings may give in all
 RARE = 0.01  # share of the signs, below which a string names one place
-PRIOR_SIGNS = 2.0  # signs that weigh as much as what is known of buildings at large
-POSE_SIGMA, DRIFT_SIGMA = 0.3, 0.4  # m
-GATE = 2.5  # standard deviations within which two signs may be one
-STOREY_GATE = 1.9  # m of height
-SIDE_BY_SIDE = (0.05, 0.5)  # probability that two signs are two, of which each map missed one: at one point, and at the gate
-MOST_PAIRS = 4000  # of landmarks that are compared under a pose
 SEEN_WITHIN = 0.6  # m from an occupied cell of the other map: the place is seen
-DOUBTED = 0.5  # of what a reader is unsure of, that is nothing like what stands there
-
-
-@dataclass(frozen=True)
-class Kind:
-    """What is assumed of landmarks of a kind.
-
-    Args:
-        kinds: of both maps that are compared.
-        changed: probability that one was changed between two visits.
-        repeats: probability that all landmarks of an alternative say what those here say.
-        most: times that one landmark may count.
-        surest: m, sigma up to which a place is sure enough that another landmark at it contradicts.
-        words: one of them, in words.
-    """
-
-    kinds: tuple[str, ...]
-    changed: float
-    repeats: Mapping[str, float]
-    most: float
-    surest: float
-    words: str
-    least: float = -np.inf  # log odds that all may cost
-
-
-def _repeats(elsewhere: float, storey: float, half: float, wing: float, building: float, outside: float) -> dict[str, float]:
-    return dict(zip(ALTERNATIVES[1:], (elsewhere, storey, half, wing, building, outside), strict=True))
-
-
-KINDS = {
-    "text": Kind(("text", "name"), 0.02, _repeats(0.005, 0.02, 0.01, 0.02, 0.02, 0.005), 50.0, 1.5, "sign"),
-    "tag": Kind(("tag",), 0.02, _repeats(0.002, 0.003, 0.003, 0.003, 0.02, 0.003), 500.0, 1.5, "tag"),
-    "name": Kind(("name",), 0.2, _repeats(0.02, 0.1, 0.1, 0.1, 0.05, 0.02), 8.0, 4.0, "room name", -2.0),
-    "object": Kind(("object",), 0.5, _repeats(0.1, 0.2, 0.2, 0.2, 0.1, 0.1), 3.0, 1.0, "object", -2.0),
-}
+Bends = tuple[Deformation | None, Deformation | None]
 
 
 @dataclass(frozen=True)
@@ -142,9 +87,17 @@ class LandmarkEvidence:
         """Log-likelihood ratio of each alternative against this place, of all kinds."""
         return {name: sum(f[name] - f["here"] for f in self.factors.values()) for name in ALTERNATIVES}
 
-    def apply(self, posterior: Mapping[str, float]) -> dict[str, float]:
-        """Return the posterior over `ALTERNATIVES` after what landmarks say, one factor a kind."""
+    def apply(self, posterior: Mapping[str, float], rivals: Sequence[tuple[float, LandmarkEvidence]] = ()) -> dict[str, float]:
+        """Return the posterior over `ALTERNATIVES` after what landmarks say, one factor a kind.
+
+        Args:
+            rivals: other poses, each with its share among them and what landmarks say of it: what "elsewhere" may be.
+        """
         ratios = self.compute_likelihoods()
+        own = sum(f["here"] for f in self.factors.values())
+        named = [float(np.log(share / 2)) + sum(f["here"] for f in e.factors.values()) - own for share, e in rivals if share > 0]
+        if named:
+            ratios["elsewhere"] = float(np.logaddexp(ratios["elsewhere"] - np.log(2), max(named)))
         highest = max((ratios[name] for name in ALTERNATIVES if posterior[name] > 0), default=0.0)
         weight = {name: posterior[name] * float(np.exp(ratios[name] - highest)) for name in ALTERNATIVES}
         total = sum(weight.values())
@@ -198,28 +151,6 @@ def describe_witnesses(kind: str, witnesses: Sequence[Witness], shown: int = 3) 
     return "; ".join(parts)
 
 
-@dataclass(frozen=True, eq=False)
-class _Associated:
-    """Sightings of both maps at one place.
-
-    Args:
-        pairs: (p, 2) their numbers.
-        apart: (p,) how far apart, as a share of the gate.
-        crowd: (p,) how many could be it.
-        turned: (p,) bool: they face ways that differ.
-    """
-
-    pairs: Array
-    apart: Array
-    crowd: Array
-    turned: Array
-
-    def select(self, rows: Array) -> _Associated:
-        """Return some of the pairs, by their numbers."""
-        chosen = np.asarray(rows, np.int64)
-        return _Associated(self.pairs[chosen], self.apart[chosen], self.crowd[chosen], self.turned[chosen])
-
-
 class LandmarkScorer:
     """Scores poses of two maps by their landmarks; what is the same under each pose is computed once."""
 
@@ -243,7 +174,7 @@ class LandmarkScorer:
         grids = [m.grid.compute_centroids() for m in (self.a, self.b)]
         return tuple(cKDTree(c[:: max(len(c) // 100_000, 1)]) for c in grids)  # type: ignore[return-value]
 
-    def score(self, pose: Sim3, bends: tuple[Deformation | None, Deformation | None] = (None, None)) -> LandmarkEvidence:
+    def score(self, pose: Sim3, bends: Bends = (None, None)) -> LandmarkEvidence:
         """Return what landmarks say of T_ab, of maps that are bent first."""
         factors, witnesses = {}, []
         for kind in self.kinds:
@@ -258,7 +189,7 @@ def score_landmarks(
     a: TopometricMap,
     b: TopometricMap,
     pose_b_to_a: Sim3,
-    bends: tuple[Deformation | None, Deformation | None] = (None, None),
+    bends: Bends = (None, None),
 ) -> LandmarkEvidence:
     """Return what the landmarks of two maps say of where map b lies in map a.
 
@@ -270,9 +201,7 @@ def score_landmarks(
     return LandmarkScorer(a, b).score(pose_b_to_a, bends)
 
 
-def score_sightings(
-    scorer: LandmarkScorer, pose: Sim3, bends: tuple[Deformation | None, Deformation | None], kind: str
-) -> tuple[dict[str, float], list[Witness]]:
+def score_sightings(scorer: LandmarkScorer, pose: Sim3, bends: Bends, kind: str) -> tuple[dict[str, float], list[Witness]]:
     """Score landmarks that stand somewhere and say something: signs, tags, names and objects."""
     a, b = scorer.sightings[kind]
     rules = KINDS[kind]
@@ -301,128 +230,7 @@ def _bend(bend: Deformation, position: Array) -> Array:
     return moved
 
 
-def associate_sightings(a: Sightings, b: Sightings, at: Sequence[Array], pose: Sim3, kind: str) -> _Associated:
-    """Find sightings of both maps that may be one: within `GATE` of their uncertainty, and on one storey.
-
-    Args:
-        at: positions (n, 3) and (m, 3) of both, in one frame.
-    """
-    sigma = np.sqrt(a.sigma[:, None] ** 2 + (pose.scale * b.sigma[None]) ** 2 + POSE_SIGMA**2 + DRIFT_SIGMA**2)
-    apart = np.hypot(at[0][:, None, 0] - at[1][None, :, 0], at[0][:, None, 1] - at[1][None, :, 1]) / (GATE * sigma)
-    level = np.abs(at[0][:, None, 2] - at[1][None, :, 2])
-    near = (apart <= 1.0) & ~(level > STOREY_GATE)
-    if kind in ("text", "name"):  # of two names, those with numbers are read as signs are
-        rooms = a.named[:, None] & b.named[None] & ~(a.numbered[:, None] & b.numbered[None])
-        near &= rooms if kind == "name" else ~rooms
-    pairs = np.argwhere(near)
-    crowd = np.maximum(near.sum(axis=1)[pairs[:, 0]], near.sum(axis=0)[pairs[:, 1]])
-    turn = a.heading[pairs[:, 0]] - b.heading[pairs[:, 1]] - pose.yaw
-    with np.errstate(invalid="ignore"):
-        turned = np.abs(np.angle(np.exp(1j * turn))) > TURNED_BY
-    return _Associated(pairs, apart[near], crowd, turned & (kind in ("text", "tag")))
-
-
-def pick_partners(a: Sightings, b: Sightings, met: _Associated, rules: Kind, kind: str) -> _Associated:
-    """Pick of the sightings that may be one a partner of each, the likeliest first; those without one of a like kind drop out."""
-    if len(met.pairs) > MOST_PAIRS:
-        met = met.select(np.argsort(met.apart, kind="stable")[:MOST_PAIRS])
-    middle = READERS[2][0]
-    reading = np.array([score_pair(a.keys[i], b.keys[j], middle, kind) for i, j in met.pairs.tolist()])
-    same = reading * (1 - met.apart / 4)
-    keys = [sorted((a.keys[i], b.keys[j])) for i, j in met.pairs.tolist()]
-    order = sorted(range(len(keys)), key=lambda k: (-same[k], met.apart[k], keys[k]))
-    taken: tuple[set[int], set[int]] = set(), set()
-    chosen = []
-    for k in order:
-        i, j = met.pairs[k].tolist()
-        alike = reading[k] > 1e-3
-        sure = max(a.sigma[i], b.sigma[j]) <= rules.surest and (kind != "text" or a.numbered[i] == b.numbered[j])
-        if i in taken[0] or j in taken[1] or not (alike or sure):
-            continue
-        taken[0].add(i)
-        taken[1].add(j)
-        chosen.append(k)
-    return met.select(np.array(chosen))
-
-
-def score_pair(one: str, other: str, error: float, kind: str) -> float:
-    """Return the probability that one landmark, given as `one`, is given as `other` by another reader; in any order."""
-    if kind in ("text", "name"):
-        return score_reading(one, other, error)
-    return 0.9 if one == other else 1e-4 if kind == "tag" else 0.01
-
-
-def compute_shares(a: Sightings, b: Sightings, pairs: Array) -> Array:
-    """Return (p,) how often the strings of pairs stand in these maps, but for the pair itself, and in buildings at large."""
-    count: dict[str, int] = {}
-    for key in (*a.keys, *b.keys):
-        count[key] = count.get(key, 0) + 1
-    total = len(a) + len(b) - 2
-    out = []
-    for i, j in pairs.tolist():
-        here = [(a.share[i], a.keys[i]), (b.share[j], b.keys[j])]
-        own = 2 if here[0][1] == here[1][1] else 1
-        out.append(max((PRIOR_SIGNS * share + count[key] - own) / (PRIOR_SIGNS + total) for share, key in here))
-        out[-1] = max(out[-1], min(here[0][0], here[1][0]) / 4)
-    return np.minimum(np.array(out, float), 1.0)
-
-
-def compute_factors(a: Sightings, b: Sightings, met: _Associated, rules: Kind, kind: str) -> dict[str, float]:
-    """Compute the log-likelihood of each alternative by sightings at one place, against that of strings drawn by chance."""
-    if not len(met.pairs):
-        return dict.fromkeys(ALTERNATIVES, 0.0)
-    i, j = met.pairs.T
-    keys = [(a.keys[p], b.keys[q]) for p, q in met.pairs.tolist()]
-    share = compute_shares(a, b, met.pairs)
-    sure = 1 - DOUBTED * (1 - a.confidence[i] * b.confidence[j])
-    beside = SIDE_BY_SIDE[0] + (SIDE_BY_SIDE[1] - SIDE_BY_SIDE[0]) * met.apart**2
-    numbers = a.numbered[i] & b.numbered[j]
-    changed = np.where(numbers | (kind != "text"), rules.changed, max(rules.changed, WORDS_CHANGED))
-    stays = (1 - changed) * (1 - beside) * sure
-
-    def read(reading: Sequence[float]) -> float:
-        times = np.where(met.turned, TURNED, np.minimum(np.array(reading) / (share * met.crowd), rules.most))
-        return float(np.log(stays * times + 1 - stays).sum())
-
-    alike = np.minimum(compute_chances(a, b, met.pairs, keys, numbers) / share, rules.most)
-    equal = np.array([one == other for one, other in keys])
-    shifts = _count_shifts(keys, numbers)
-    parts: dict[str, list[float]] = {name: [] for name in ALTERNATIVES}
-    for error, weight in READERS:
-        same = read([score_pair(s, t, error, kind) for s, t in keys])
-        moved = [read([score_shifted(s, t, shift, error) for s, t in keys]) for shift in shifts]
-        chance = {name: float(np.log(1 - near + near * np.maximum(alike, equal)).sum()) for name, near in NEAR.items()}
-        parts["here"].append(np.log(weight) + np.logaddexp(np.log1p(-RENEWED) + same, np.log(RENEWED) + chance["wing"]))
-        for name in ALTERNATIVES[1:]:
-            repeats, shifted = rules.repeats[name], SHIFTED[name] if shifts else 0.0
-            terms = [np.log(1 - repeats - shifted * (1 - repeats)) + chance[name], np.log(repeats) + same]
-            terms += [np.log(shifted * (1 - repeats) / SHIFTS) + m for m in moved]
-            parts[name].append(np.log(weight) + float(np.logaddexp.reduce(terms)))
-    return {name: float(np.logaddexp.reduce(values)) for name, values in parts.items()}
-
-
-def compute_chances(a: Sightings, b: Sightings, pairs: Array, keys: Sequence[tuple[str, str]], numbers: Array) -> Array:
-    """Return (p,) the probability that a place that looks like this one has the string of b where this one has that of a.
-
-    It is a number near it, or the same word where the word stands in every building.
-    """
-    out = []
-    for (i, j), (one, other), number in zip(pairs.tolist(), keys, numbers.tolist(), strict=True):
-        common = one == other and not number and (is_common(a.values[i]) or is_common(b.values[j]))
-        out.append(score_neighbour(one, other) if number else float(common))
-    return np.array(out, float)
-
-
-def _count_shifts(keys: Sequence[tuple[str, str]], numbers: Array, most: int = 3) -> list[Shift]:
-    """The shifts that turn most numbers of a into those of b."""
-    count: dict[Shift, int] = {}
-    for (one, other), number in zip(keys, numbers.tolist(), strict=True):
-        for shift in find_shifts(one, other) if number else ():
-            count[shift] = count.get(shift, 0) + 1
-    return sorted(count, key=lambda s: (-count[s], s[0], abs(s[1]), sorted(s[2])))[:most]
-
-
-def find_far_partners(a: Sightings, b: Sightings, at: Sequence[Array], met: _Associated, kind: str) -> list[tuple[int, int]]:
+def find_far_partners(a: Sightings, b: Sightings, at: Sequence[Array], met: Associated, kind: str) -> list[tuple[int, int]]:
     """Find rare strings that stand once in each map, at places that are far from each other under the pose."""
     if kind not in ("text", "tag"):
         return []
@@ -443,7 +251,7 @@ def find_far_partners(a: Sightings, b: Sightings, at: Sequence[Array], met: _Ass
 
 
 def count_missed(
-    scorer: LandmarkScorer, at: Sequence[Array], met: _Associated, pose: Sim3, sightings: tuple[Sightings, Sightings]
+    scorer: LandmarkScorer, at: Sequence[Array], met: Associated, pose: Sim3, sightings: tuple[Sightings, Sightings]
 ) -> float:
     """Return the log odds for a place that has nothing to do with this one of signs that one map read and the other one could
     have seen and did not, as `READS` has it of maps that read equally many signs on equally large a map."""
@@ -462,7 +270,7 @@ def count_missed(
 
 
 def _list_witnesses(
-    a: Sightings, b: Sightings, met: _Associated, far: Sequence[tuple[int, int]], rules: Kind, kind: str
+    a: Sightings, b: Sightings, met: Associated, far: Sequence[tuple[int, int]], rules: Kind, kind: str
 ) -> list[Witness]:
     share = compute_shares(a, b, met.pairs)
     out = []
@@ -482,7 +290,7 @@ def _build_witness(a: Sightings, b: Sightings, i: int, j: int, kind: str, verdic
     return Witness(kind, (a.values[i], b.values[j]), (int(a.rows[i]), int(b.rows[j])), at, verdict)
 
 
-Score = Callable[[LandmarkScorer, Sim3, tuple[Deformation | None, Deformation | None]], tuple[dict[str, float], list[Witness]]]
+Score = Callable[[LandmarkScorer, Sim3, Bends], tuple[dict[str, float], list[Witness]]]
 
 
 @dataclass(frozen=True)
@@ -499,9 +307,7 @@ class Testimony:
 
 
 def _build_testimony(kind: str) -> Testimony:
-    def score(
-        scorer: LandmarkScorer, pose: Sim3, bends: tuple[Deformation | None, Deformation | None]
-    ) -> tuple[dict[str, float], list[Witness]]:
+    def score(scorer: LandmarkScorer, pose: Sim3, bends: Bends) -> tuple[dict[str, float], list[Witness]]:
         return score_sightings(scorer, pose, bends, kind)
 
     return Testimony(lambda map: bool(map.landmarks.is_kind(*KINDS[kind].kinds).any()), score)
