@@ -45,6 +45,7 @@ MODULES = {
     "bending": "bending",
     "atlases": "atlases",
     "retrieval": "retrieval",
+    "landmarks": "landmarks",
 }
 
 
