@@ -1,7 +1,7 @@
 """Signs of a building, and what a reader makes of them: numbers beside doors, exit signs, names of rooms, tags.
 
-Numbers follow schemes that people use: the storey, then a running number along the corridor, odd ones on one side and even ones on
-the other, a letter for the wing. Readers miss signs, take one character for another, cut strings off and put signs in wrong
+Numbers follow schemes that people use: the storey, then a running number along the corridor, odd ones on one side and even ones
+on the other, a letter for the wing. Readers miss signs, take one character for another, cut strings off and put signs in wrong
 places. Their confusions (`TAKEN_FOR`) are those of printed characters in general and not the classes that
 `topomerge.landmarks.text` knows of: half of what they confuse is not among these.
 """

@@ -51,7 +51,7 @@ def test_one_sign_each_by_hand():
     evidence = score(["2.113"], ["2.113"])
     stays = (1 - KINDS["text"].changed) * (1 - SIDE_BY_SIDE[0])
     times = stays * KINDS["text"].most + 1 - stays  # 600 times rarer than by chance, whoever reads: capped
-    here = np.log((1 - RENEWED) * times + RENEWED)
+    here = np.log((1 - RENEWED) * times + RENEWED / 2)
     repeats = KINDS["text"].repeats["storey"]
     storey = np.log(1 - repeats + repeats * times)
     assert evidence.factors["text"]["here"] == pytest.approx(here)
@@ -64,7 +64,7 @@ def test_another_number_at_the_place_contradicts_by_hand():
     stays = (1 - KINDS["text"].changed) * (1 - SIDE_BY_SIDE[0])
     misread = sum(w * 600 * (1 - 2 * e) ** 0 * (2 * e * 0.7 / 15) ** 4 for e, w in READERS)
     assert evidence.factors["text"]["here"] == pytest.approx(
-        np.log((1 - RENEWED) * (1 - stays + stays * misread) + RENEWED * (1 - NEAR["wing"])), abs=1e-6
+        np.log((1 - RENEWED) * (1 - stays + stays * misread) + RENEWED / 2 * (1 - NEAR["wing"])), abs=1e-6
     )
     assert evidence.factors["text"]["here"] < np.log(0.1) and min(lead(evidence).values()) < -1.5
     assert evidence.list_sentences() == ["signs contradict: 2.113 against 4.870"]

@@ -4,7 +4,7 @@ Generative assumptions. Each is a number below, stated and not fitted.
 
 - *Here* (the pose is right): where both maps read a sign at one place, both are readings of one string (`text.score_reading`),
   unless the sign was changed in between (`Kind.changed`) or they are two signs side by side. As a whole, the signs of a building
-  are all new with `RENEWED`.
+  are all new, or all numbers shifted, with `RENEWED`.
 - *Any alternative*: a sign at the same place bears a string drawn as often as it stands in these maps and in buildings at large
   (`text.estimate_share`), or a number near the other one. As a whole, the other place repeats all strings of this one with
   `Kind.repeats` (wings that are numbered alike, tags printed from one sheet), or all of its numbers differ by one shift, as
@@ -198,7 +198,9 @@ def compute_factors(a: Sightings, b: Sightings, met: Associated, rules: Kind, ki
         same = read([score_pair(s, t, error, kind) for s, t in keys])
         moved = [read([score_shifted(s, t, shift, error) for s, t in keys]) for shift in shifts]
         chance = {name: float(np.log(1 - near + near * np.maximum(alike, equal)).sum()) for name, near in NEAR.items()}
-        parts["here"].append(np.log(weight) + np.logaddexp(np.log1p(-RENEWED) + same, np.log(RENEWED) + chance["wing"]))
+        kept = [np.log1p(-RENEWED) + same, np.log(RENEWED / 2) + chance["wing"]]
+        kept += [np.log(RENEWED / 2 / SHIFTS) + m for m in moved]
+        parts["here"].append(np.log(weight) + float(np.logaddexp.reduce(kept)))
         for name in ALTERNATIVES[1:]:
             repeats, shifted = rules.repeats[name], SHIFTED[name] if shifts else 0.0
             terms = [np.log(1 - repeats - shifted * (1 - repeats)) + chance[name], np.log(repeats) + same]

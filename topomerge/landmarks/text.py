@@ -20,6 +20,7 @@ CUT_OFF = 0.02  # probability that a string lost an end of half its length at mo
 WORD_ODDS = {0: 0.3, 1: 0.05, 2: 0.02, 3: 0.005}  # share of the signs that bear a given string of so many characters
 NUMBER_ODDS = {1: 1 / 8, 2: 1 / 25, 3: 1 / 120}  # the same of digits: of a storey's rooms, hundreds are few
 RAREST = 1 / 1500
+MOST_SHIFTED = 100  # numbers by which the rooms of another part of a building count on
 COMMON = 0.02  # share of the signs from which on a string stands in every building
 LETTER_ODDS = 1 / 5  # that a number bears this letter
 # Words that stand in every building: (pattern of the whole string, share of all signs). Sources: ISO 7010 and EN 17210 signs, and
@@ -150,8 +151,9 @@ def find_shifts(one: str, other: str) -> list[Shift]:
         if len(differ) == 1:
             shifts.append(("change", differ[0], f"{one[differ[0]]}>{other[differ[0]]}"))
     tails = [re.search(r"\d{1,6}$", text) for text in (one, other)]
-    if tails[0] and tails[1] and one[: tails[0].start()] == other[: tails[1].start()] and one != other:
-        shifts.append(("count", int(tails[1][0]) - int(tails[0][0]), ""))
+    if tails[0] and tails[1] and one[: tails[0].start()] == other[: tails[1].start()]:
+        amount = int(tails[1][0]) - int(tails[0][0])
+        shifts += [("count", amount, "")] if 0 < abs(amount) <= MOST_SHIFTED else []
     return shifts
 
 
