@@ -2,8 +2,9 @@
 
 ``python evaluate.py task=landmarks data=test pairs=12 again=6 write=docs/results/landmarks.md``. So many pairs of each kind of
 places made to be alike (`datasets.pairs.lookalikes`), and so many of the first place visited twice, which belong together. Each
-pair is registered without landmarks, with half of the door signs read with a fifth of their characters wrong, with signs read well, and
-with tags (`READINGS`). Signs are drawn beside the maps: these are those of the other tables. Right: within 0.5 m and 5 degrees.
+pair is registered without landmarks, with half of the door signs read with a fifth of their characters wrong, with signs read
+well, and with tags (`READINGS`). Signs are drawn beside the maps: these are those of the other tables. Right: within 0.5 m and
+5 degrees.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ from topomerge.landmarks.likelihood import (
     pick_partners,
     score_pair,
 )
-from topomerge.landmarks.sightings import Sightings, build_sightings
+from topomerge.landmarks.sightings import Sightings, build_sightings, transform_places
 from topomerge.landmarks.text import quote_text
 from topomerge.types import Array, Deformation, Sim3, TopometricMap
 
@@ -207,8 +207,8 @@ def score_sightings(scorer: LandmarkScorer, pose: Sim3, bends: Bends, kind: str)
     rules = KINDS[kind]
     if not len(a) or not len(b):
         return dict.fromkeys(ALTERNATIVES, 0.0), []
-    at = [s.position if bend is None else _bend(bend, s.position) for s, bend in zip((a, b), bends, strict=True)]
-    at[1] = pose.apply(at[1])
+    at = [s.position if bend is None else transform_places(bend.apply, s.position) for s, bend in zip((a, b), bends, strict=True)]
+    at[1] = transform_places(pose.apply, at[1])
     met = associate_sightings(a, b, at, pose, kind)
     met = pick_partners(a, b, met, rules, kind)
     factors = compute_factors(a, b, met, rules, kind)
@@ -220,14 +220,6 @@ def score_sightings(scorer: LandmarkScorer, pose: Sim3, bends: Bends, kind: str)
     if rules.least > -np.inf:
         factors["here"] = max(factors["here"], rules.least)
     return factors, _list_witnesses(a, b, met, far, rules, kind)
-
-
-def _bend(bend: Deformation, position: Array) -> Array:
-    flat = np.isnan(position[:, 2])
-    known = np.where(np.isnan(position), 0.0, position)
-    moved = bend.apply(known)
-    moved[flat, 2] = np.nan
-    return moved
 
 
 def find_far_partners(a: Sightings, b: Sightings, at: Sequence[Array], met: Associated, kind: str) -> list[tuple[int, int]]:

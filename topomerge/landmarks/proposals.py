@@ -13,7 +13,7 @@ import numpy as np
 
 from topomerge.landmarks.evidence import LandmarkScorer
 from topomerge.landmarks.likelihood import DRIFT_SIGMA
-from topomerge.landmarks.sightings import Sightings
+from topomerge.landmarks.sightings import Sightings, transform_places
 from topomerge.types import Array, Sim3
 
 PROPOSING = ("tag", "text")  # kinds, the surest first
@@ -91,7 +91,7 @@ def _propose_by_two(a: Sightings, b: Sightings, matches: Array, scaled: bool) ->
     for k in np.flatnonzero(fits).tolist():
         pair = np.array([first[k], second[k]])
         pose = _fit_pose(p[pair], q[pair], float(ratio[k]) if scaled else 1.0)
-        away = np.hypot(*(p - pose.apply(np.nan_to_num(q)))[:, :2].T)
+        away = np.hypot(*(p - transform_places(pose.apply, q))[:, :2].T)
         near = away < 2.5 * sigma + STRETCHED * float(np.median(apart[0]))
         chosen = _fit_pose(p[near], q[near], pose.scale) if near.sum() > 2 else pose
         scored.append((-int(near.sum()), float(np.median(away[near])) if near.any() else np.inf, k, chosen))
@@ -117,7 +117,7 @@ def _propose_by_one(a: Sightings, b: Sightings, matches: Array, yaws: Sequence[f
         faced = float(a.heading[i] - b.heading[j])
         for yaw in [faced] if np.isfinite(faced) else yaws[:WAYS_TRIED]:
             turn = Sim3(float(np.angle(np.exp(1j * yaw))))
-            x, y, z = (a.position[i] - turn.apply(b.position[j][None])[0]).tolist()
+            x, y, z = (a.position[i] - transform_places(turn.apply, b.position[j][None])[0]).tolist()
             poses.append(Sim3(turn.yaw, (x, y, z if np.isfinite(z) else UNKNOWN)))
     return poses
 

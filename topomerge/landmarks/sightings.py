@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,6 +88,13 @@ def locate_landmarks(map: TopometricMap, table: Array) -> tuple[Array, Array]:
     flat &= ~known
     position[flat, 2] = map.storeys["floor"][0] if len(map.storeys) == 1 else np.nan
     return position, sigma
+
+
+def transform_places(move: Callable[[Array], Array], places: Array) -> Array:
+    """Move places (n, 3) of which some have no height, which they keep."""
+    flat = np.isnan(places[:, 2])
+    moved = move(np.where(flat[:, None] & (np.arange(3) == 2), 0.0, places))
+    return np.where(flat[:, None] & (np.arange(3) == 2), np.nan, moved)
 
 
 def build_sightings(map: TopometricMap, kinds: Sequence[str]) -> Sightings:

@@ -127,12 +127,14 @@ def _summarise_map(map: TopometricMap) -> MapSummary:
 
 
 def hash_map(map: TopometricMap) -> str:
-    """16 hexadecimal digits of a hash of cells, rooms and free space."""
+    """16 hexadecimal digits of a hash of cells, rooms, free space and landmarks."""
     digest = hashlib.sha256()
     for grid in (map.grid, map.navigable, map.free):
         if grid is not None:
             digest.update(np.ascontiguousarray(grid.cells).tobytes() + grid.origin.tobytes() + np.float64(grid.edge).tobytes())
     digest.update(map.room.tobytes() + map.navigable_room.tobytes() + map.rooms.tobytes())
+    if len(map.landmarks):
+        digest.update(map.landmarks.table.tobytes() + repr(map.landmarks.values).encode())
     return digest.hexdigest()[:16]
 
 
