@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from topomerge.datasets.core.builder import limit_threads
-from topomerge.datasets.pairs.grid_pairs import load_grids
+from topomerge.datasets.pairs.grid_pairs import GridPair, load_grids
 from topomerge.datasets.pairs.lookalikes import (
     LOOKALIKES,
     LookalikeItem,
@@ -86,16 +86,16 @@ def measure(settings: Settings, log_line: LogFn) -> list[Row]:
     recipe = make_recipe(settings)
     sharing = _Sharing(settings.cache, settings.jobs)
     files = {path.stem: path for path in build_lookalikes(recipe, sharing, log_line)[0]}
-    names = [list(READINGS)[k] for k in settings.readings]
+    names = tuple(list(READINGS)[k] for k in settings.readings)
     items = {
-        f"{item.kind}-{item.number}{'-again' if item.again else ''} {name}": (files[item.name], item, name)
+        f"{item.kind}-{item.number}{'-again' if item.again else ''}": (files[item.name], item, names)
         for item in draw_lookalike_items(recipe)
-        for name in names
         if item.name in files
     }
     path = Path(settings.cache) / "evaluation" / f"{recipe.name}.jsonl"
     items = {k: v for k, v in items.items() if settings.data.only in k}
-    return measure_missing(path, items, measure_pair, log_line, settings)
+    rows = measure_missing(path, items, measure_pair, log_line, settings)
+    return [{**row, **of} for row in rows for of in row["readings"]]
 
 
 @dataclass(frozen=True)
@@ -118,25 +118,32 @@ def build_bare_map(grid: VoxelGrid, free: VoxelGrid | None, landmarks: Landmarks
     )
 
 
-def measure_pair(file: Path, item: LookalikeItem, reading: str) -> Row:
-    """Register a pair with what a reader gives of its signs."""
-    pair, reader = load_grids(file), READINGS[reading]
-    told = (Landmarks(), Landmarks()) if reader is None else read_lookalike_signs(item, reader)
+def measure_pair(file: Path, item: LookalikeItem, readings: Sequence[str]) -> Row:
+    """Register a pair with what readers give of its signs; where one map has none, the verdict is that without landmarks."""
+    pair = load_grids(file)
+    outcomes: list[Row] = []
+    for name in readings:
+        reader = READINGS[name]
+        told = (Landmarks(), Landmarks()) if reader is None else read_lookalike_signs(item, reader)
+        some = min(map(len, told)) > 0
+        alone = next((row for row in outcomes if not min(row["landmarks"])), None)
+        found = alone if alone is not None and not some else _register_pair(pair, told)
+        outcomes.append({**found, "reading": name, "landmarks": [len(t) for t in told]})
+    return {"kind": item.kind, "again": item.again, "tellable": pair.about.get("tellable"), "readings": outcomes}
+
+
+def _register_pair(pair: GridPair, told: tuple[Landmarks, Landmarks]) -> Row:
     a, b = (build_bare_map(g, f, t) for g, f, t in zip((pair.a, pair.b), pair.free, told, strict=True))
     with limit_threads():
         registration = register(a, b)
-    pose, sensors = registration.transform, pair.about["sensors"]
+    pose: Any = registration.transform
+    sensors: Any = pair.about["sensors"]
     error = None if pose is None else compute_pose_error(pose, pair)
     return {
-        "kind": item.kind,
-        "again": item.again,
-        "reading": reading,
-        "landmarks": [len(t) for t in told],
         "probability": registration.probability,
         "walls": registration.walls,
         "believed": registration.accepted,
-        "right": is_hypothesis_right(error, sensors),  # type: ignore[arg-type]
-        "tellable": pair.about.get("tellable"),
+        "right": is_hypothesis_right(error, sensors),
         "said": registration.landmarks.list_sentences(),
         "factors": {k: dict(f) for k, f in registration.landmarks.factors.items()},
     }

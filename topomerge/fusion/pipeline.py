@@ -60,10 +60,9 @@ def explain_verdict(registration: Registration, threshold: float, force: bool = 
     words.append(f"{f['walls']:.0f} m2 of walls agree, {f['free']:.0f} m2 of free floor seen by both")
     words.append(f"{100 * f['conflict_share']:.1f} % of the walls stand on free floor of the other map")
     words += registration.landmarks.list_sentences()
-    if registration.walls >= threshold > registration.probability:
-        words.append(f"the walls alone would be believed ({format_probability(registration.walls)})")
-    elif registration.walls < threshold <= registration.probability:
-        words.append(f"the walls alone would not be believed ({format_probability(registration.walls)})")
+    if registration.landmarks.factors and believed != (registration.walls >= threshold):
+        alone = f"the walls alone would {'not ' * believed}be believed ({format_probability(registration.walls)})"
+        words.append(alone)
     if not believed:
         if compute_evidence_limit(f) < 1:
             words.append("the maps share too little area for a verdict")

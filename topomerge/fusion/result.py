@@ -263,10 +263,10 @@ def serialise_merge(result: MergeResult) -> dict[str, Any]:
         "seconds": {step: round(float(result.seconds.get(step, 0.0)), 4) for step in MERGE_STEPS},
         "points": {str(k): name for k, name in sorted(result.points.items())},
         "alternatives": {name: round(p, 6) for name, p in registration.posterior.items()} if registration else {},
-        "evidence": {"landmarks": (registration.landmarks if registration else LandmarkEvidence()).serialise()},
-        "settle": [{**o.serialise(), "words": o.describe([m.title for m in result.maps])} for o in result.settle],
         "places": serialise_places(registration.places) if registration and registration.places else [],
         "contradictions": [serialise_contradiction(c) for c in result.atlas.contradictions] if result.atlas else [],
+        "evidence": {"landmarks": (registration.landmarks if registration else LandmarkEvidence()).serialise()},
+        "settle": [{**o.serialise(), "words": o.describe([m.title for m in result.maps])} for o in result.settle],
     }
     plain_listing: dict[str, Any] = convert_to_plain(listing)
     return plain_listing

@@ -26,6 +26,7 @@ from topomerge.landmarks.likelihood import (
     Kind,
     associate_sightings,
     compute_factors,
+    compute_prefix_factors,
     compute_shares,
     pick_partners,
     score_pair,
@@ -212,6 +213,9 @@ def score_sightings(scorer: LandmarkScorer, pose: Sim3, bends: Bends, kind: str)
     met = associate_sightings(a, b, at, pose, kind)
     met = pick_partners(a, b, met, rules, kind)
     factors = compute_factors(a, b, met, rules, kind)
+    if kind == "text":
+        prefixes = compute_prefix_factors(a, b, met, at)
+        factors = {name: v + prefixes[name] for name, v in factors.items()}
     far = find_far_partners(a, b, at, met, kind)
     factors["elsewhere"] += min(len(far) * float(-np.log(POINTS_THERE)), MOST_FAR)
     missed = count_missed(scorer, at, met, pose, (a, b)) if kind == "text" else 0.0

@@ -47,6 +47,9 @@ POSE_SIGMA, DRIFT_SIGMA = 0.3, 0.4  # m
 GATE = 2.5  # standard deviations within which two signs may be one
 STOREY_GATE = 1.9  # m of height
 SIDE_BY_SIDE = (0.05, 0.5)  # probability that two signs are two, of which each map missed one: at one point, and at the gate
+SAME_PREFIX = {"here": 0.95, "elsewhere": 0.9, "storey": 0.05, "half": 0.9, "wing": 0.6, "building": 0.3, "outside": 0.5}
+ONE_STYLE, PREFIX_READ, LONG_NUMBER = 0.8, 0.8, 3  # share of buildings with such numbers, that a character is right, characters
+MOST_PREFIXES = 100  # numbers of a map that are asked how they begin
 MOST_PAIRS = 4000  # of landmarks that are compared under a pose
 DOUBTED = 0.5  # of what a reader is unsure of, that is nothing like what stands there
 
@@ -207,6 +210,31 @@ def compute_factors(a: Sightings, b: Sightings, met: Associated, rules: Kind, ki
             terms += [np.log(shifted * (1 - repeats) / SHIFTS) + m for m in moved]
             parts[name].append(np.log(weight) + float(np.logaddexp.reduce(terms)))
     return {name: float(np.logaddexp.reduce(values)) for name, values in parts.items()}
+
+
+def compute_prefix_factors(a: Sightings, b: Sightings, met: Associated, at: Sequence[Array]) -> dict[str, float]:
+    """Compute the log-likelihood of each alternative by how the numbers begin that only one map read.
+
+    Numbers of one storey begin with its digit or the wing's letter (`ONE_STYLE`), and of two storeys with two (`SAME_PREFIX`).
+    Nothing is said of maps whose signs lie on several storeys.
+    """
+    first: list[list[str]] = []
+    heights: list[float] = []
+    for side, own in enumerate((a, b)):
+        free = np.setdiff1d(np.flatnonzero(own.numbered & np.isfinite(at[side][:, 2])), met.pairs[:, side]).tolist()
+        free = [k for k in free if len(own.keys[k]) >= LONG_NUMBER][:MOST_PREFIXES]
+        first.append([own.keys[k][0] for k in free])
+        heights += at[side][free, 2].tolist()
+    if not all(first) or np.ptp(heights) > STOREY_GATE:
+        return dict.fromkeys(ALTERNATIVES, 0.0)
+    letters = sorted({*"0123456789", *first[0], *first[1]})
+    wrong = (1 - PREFIX_READ) / (len(letters) - 1)
+    fits = [np.array([np.prod([PREFIX_READ if c == p else wrong for c in of]) for p in letters]) for of in first]
+    same = float((fits[0] * fits[1]).mean())
+    other = (float(fits[0].mean() * fits[1].mean()) * len(letters) - same) / (len(letters) - 1)
+    drawn = (1 - ONE_STYLE) * len(letters) ** -float(len(heights))
+    parts = {name: np.log(ONE_STYLE * (share * same + (1 - share) * other) + drawn) for name, share in SAME_PREFIX.items()}
+    return {name: float(part - parts["outside"]) for name, part in parts.items()}
 
 
 def compute_chances(a: Sightings, b: Sightings, pairs: Array, keys: Sequence[tuple[str, str]], numbers: Array) -> Array:

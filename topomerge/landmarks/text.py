@@ -140,16 +140,16 @@ Shift = tuple[str, int, str]
 
 
 def find_shifts(one: str, other: str) -> list[Shift]:
-    """Find what turns one number into another.
+    """Find what may turn one number into another, but for what a reader got wrong.
 
     Returns:
-        ("change", place, "from>to") of a character, ("count", amount, "") by which the last digits count on; both, one or none.
+        ("change", place, "from>to") of a character, ("count", amount, "") by which the last digits count on; some or none.
     """
     shifts: list[Shift] = []
     if len(one) == len(other):
         differ = [k for k, (c, d) in enumerate(zip(one, other, strict=True)) if c != d]
-        if len(differ) == 1:
-            shifts.append(("change", differ[0], f"{one[differ[0]]}>{other[differ[0]]}"))
+        if len(differ) <= 2:  # with the noise of a reader
+            shifts += [("change", k, f"{one[k]}>{other[k]}") for k in differ]
     tails = [re.search(r"\d{1,6}$", text) for text in (one, other)]
     if tails[0] and tails[1] and one[: tails[0].start()] == other[: tails[1].start()]:
         amount = int(tails[1][0]) - int(tails[0][0])
@@ -174,9 +174,8 @@ def score_shifted(one: str, other: str, shift: Shift, error: float) -> float:
     how, amount, change = shift
     back = (how, amount, ">".join(change.split(">")[::-1])) if how == "change" else (how, -amount, "")
     there, here = apply_shift(one, shift), apply_shift(other, back)
-    if there is None or here is None:
-        return 0.0
-    return max(score_reading(there, other, error), score_reading(one, here, error))
+    ahead = 0.0 if there is None else score_reading(there, other, error)
+    return max(ahead, 0.0 if here is None else score_reading(one, here, error))
 
 
 def quote_text(text: str, longest: int = 24) -> str:
