@@ -25,6 +25,7 @@ from topomerge.landmarks.likelihood import (
     Associated,
     Kind,
     associate_sightings,
+    compute_chances,
     compute_factors,
     compute_prefix_factors,
     compute_shares,
@@ -268,16 +269,17 @@ def count_missed(
 def _list_witnesses(
     a: Sightings, b: Sightings, met: Associated, far: Sequence[tuple[int, int]], rules: Kind, kind: str
 ) -> list[Witness]:
-    share = compute_shares(a, b, met.pairs)
+    share, keys = compute_shares(a, b, met.pairs), [(a.keys[i], b.keys[j]) for i, j in met.pairs.tolist()]
+    numbers = a.numbered[met.pairs[:, 0]] & b.numbered[met.pairs[:, 1]]
+    chance = np.clip(compute_chances(a, b, met.pairs, keys, numbers) / share, 1.0, rules.most)
     out = []
-    for k, ((i, j), rarity) in enumerate(zip(met.pairs.tolist(), share.tolist(), strict=True)):
-        times = [score_pair(a.keys[i], b.keys[j], error, kind) / rarity for error, _ in READERS]
-        if met.turned[k]:
+    for k, (i, j) in enumerate(met.pairs.tolist()):
+        times = sum(weight * score_pair(*keys[k], error, kind) / share[k] for error, weight in READERS)
+        sure = max(a.sigma[i], b.sigma[j]) <= rules.surest
+        if met.turned[k] or (sure and times < chance[k] / 2):
             out.append(_build_witness(a, b, i, j, kind, "contradicts"))
-        elif max(times) > 2.0 and (a.keys[i] == b.keys[j] or times[2] > 2.0):
+        elif times > 2 * (1.0 if keys[k][0] == keys[k][1] else chance[k]):
             out.append(_build_witness(a, b, i, j, kind, "agrees"))
-        elif max(times[:3]) < 0.5 and max(a.sigma[i], b.sigma[j]) <= rules.surest:
-            out.append(_build_witness(a, b, i, j, kind, "contradicts"))
     return out + [_build_witness(a, b, i, j, kind, "elsewhere") for i, j in far]
 
 
