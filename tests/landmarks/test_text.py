@@ -5,6 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from topomerge.landmarks.text import (
+    ALIKE_CHARACTERS,
+    ALIKE_SHARE,
     ALPHABET,
     RAREST,
     SUBSTITUTED,
@@ -35,7 +37,14 @@ def test_other_characters_are_not():
 
 
 @pytest.mark.parametrize(
-    ("one", "other", "edits"), [("2113", "2113", (0, 0)), ("2113", "2173", (1, 0)), ("2113", "213", (0, 1)), ("", "abc", (0, 3))]
+    ("one", "other", "edits"),
+    [
+        ("2113", "2113", (0, 0, 0)),
+        ("2113", "2173", (1, 0, 0)),
+        ("2113", "2153", (0, 1, 0)),
+        ("2113", "213", (0, 0, 1)),
+        ("", "abc", (0, 0, 3)),
+    ],
 )
 def test_edits_by_hand(one, other, edits):
     assert count_edits(one, other) == edits
@@ -43,7 +52,8 @@ def test_edits_by_hand(one, other, edits):
 
 def test_reading_by_hand():
     assert score_reading("2113", "2113", 0.05) == pytest.approx(0.9**4)
-    assert score_reading("2113", "2173", 0.05) == pytest.approx(0.9**3 * 0.1 * SUBSTITUTED / ALPHABET)
+    assert score_reading("2113", "2153", 0.05) == pytest.approx(0.9**3 * 0.1 * SUBSTITUTED * (1 - ALIKE_SHARE) / ALPHABET)
+    assert score_reading("2113", "2173", 0.05) == pytest.approx(0.9**3 * 0.1 * SUBSTITUTED * ALIKE_SHARE / ALIKE_CHARACTERS)
     assert score_reading("2113", "113", 0.0) == pytest.approx(0.02)  # cut off
 
 
@@ -65,7 +75,7 @@ def test_what_stands_everywhere_is_common_and_numbers_are_rare():
 
 def test_numbers_are_told_from_words():
     assert all(is_number(t) for t in ("2.113", "A-113", "101", "IOI", "Z.1l3", "12b"))
-    assert not any(is_number(t) for t in ("EXIT", "Kitchen", "", "--", "Dr. Meier"))
+    assert not any(is_number(t) for t in ("EXIT", "Kitchen", "", "--", "Dr. Meier", "Sali0a", "BKI7"))
 
 
 @pytest.mark.parametrize(

@@ -28,6 +28,7 @@ from topomerge.landmarks.text import (
     Shift,
     find_shifts,
     is_common,
+    is_leading,
     score_neighbour,
     score_reading,
     score_shifted,
@@ -37,7 +38,10 @@ from topomerge.types import Array, Sim3
 ALTERNATIVES = ("here", "elsewhere", "storey", "half", "wing", "building", "outside")
 READERS = ((0.002, 0.4), (0.02, 0.3), (0.08, 0.2), (0.2, 0.1))  # error of a character, and how many readers err so
 RENEWED = 0.003
-SHIFTS = 30.0  # ways in which numbers may be shifted
+# Share of the shifted numbers that are shifted just so: a character that tells the storey or the wing, the count, anything else.
+LEADING = {"storey": 0.1, "wing": 0.06}
+COUNTED = {"elsewhere": 0.04, "half": 0.04, "wing": 0.04}
+OTHERWISE = 0.01
 SHIFTED = {"elsewhere": 0.4, "storey": 0.7, "half": 0.5, "wing": 0.6, "building": 0.2, "outside": 0.2}  # share of such places
 NEAR = {"elsewhere": 0.5, "storey": 0.8, "half": 0.5, "wing": 0.6, "building": 0.3, "outside": 0.3}  # numbers near the other's
 WORDS_CHANGED = 0.2  # probability that a sign without a number was changed: notices, names of people
@@ -202,12 +206,13 @@ def compute_factors(a: Sightings, b: Sightings, met: Associated, rules: Kind, ki
         moved = [read([score_shifted(s, t, shift, error) for s, t in keys]) for shift in shifts]
         chance = {name: float(np.log(1 - near + near * np.maximum(alike, equal)).sum()) for name, near in NEAR.items()}
         kept = [np.log1p(-RENEWED) + same, np.log(RENEWED / 2) + chance["wing"]]
-        kept += [np.log(RENEWED / 2 / SHIFTS) + m for m in moved]
+        kept += [np.log(RENEWED / 2 * OTHERWISE) + m for m in moved]
         parts["here"].append(np.log(weight) + float(np.logaddexp.reduce(kept)))
         for name in ALTERNATIVES[1:]:
             repeats, shifted = rules.repeats[name], SHIFTED[name] if shifts else 0.0
             terms = [np.log(1 - repeats - shifted * (1 - repeats)) + chance[name], np.log(repeats) + same]
-            terms += [np.log(shifted * (1 - repeats) / SHIFTS) + m for m in moved]
+            ways = [(LEADING if is_leading(s) else COUNTED if s[0] == "count" else {}).get(name, OTHERWISE) for s in shifts]
+            terms += [np.log(shifted * (1 - repeats) * way) + m for way, m in zip(ways, moved, strict=True)]
             parts[name].append(np.log(weight) + float(np.logaddexp.reduce(terms)))
     return {name: float(np.logaddexp.reduce(values)) for name, values in parts.items()}
 

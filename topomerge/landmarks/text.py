@@ -1,9 +1,9 @@
 """Text on signs: what readers take for one another, and how much a string tells of a place.
 
-Assumptions, stated as numbers and not fitted: a reader errs on each character independently; half of its errors stay within a
-class of shapes (O and 0, 1 and I and l; Smith 2007, "An overview of the Tesseract OCR engine") and cost nothing here, as both
-strings are folded to one character a class; the others are one of `ALPHABET` characters. Punctuation, case and accents are
-dropped. A string may be cut off at an end, as signs are seen from the side.
+Assumptions, stated as numbers and not fitted: a reader errs on each character independently; what it confuses within a class of
+shapes (O and 0, 1 and I and l) costs nothing here, as both strings are folded to one character a class; most of its other errors
+are pairs that look alike (`ALIKE`), and the rest is one of `ALPHABET` characters. Punctuation, case and accents are dropped. A
+string may be cut off at an end, as signs are seen from the side.
 """
 
 from __future__ import annotations
@@ -16,6 +16,12 @@ SHAPES = str.maketrans({"o": "0", "q": "0", "d": "0", "i": "1", "l": "1", "j": "
 LONGEST = 32  # characters that are compared
 ALPHABET = 15.0  # characters that an error may give
 SUBSTITUTED, SHIFTED = 0.7, 0.15  # of the errors: another character; one too many, and as many one too few
+# Characters of two classes that look alike in print, so that readers commonly take them for each other.
+ALIKE = frozenset(
+    frozenset(pair)
+    for pair in "17 27 06 08 69 68 56 38 35 49 4a 0c 9c ce hn mn uv vy kx ef 1t 7t rn 8r ar 6b 0a".split()  # after folding
+)
+ALIKE_SHARE, ALIKE_CHARACTERS = 0.6, 4.0  # of the wrong characters: those that look alike; and how many these are for each
 CUT_OFF = 0.02  # probability that a string lost an end of half its length at most
 WORD_ODDS = {0: 0.3, 1: 0.05, 2: 0.02, 3: 0.005}  # share of the signs that bear a given string of so many characters
 NUMBER_ODDS = {1: 1 / 8, 2: 1 / 25, 3: 1 / 120}  # the same of digits: of a storey's rooms, hundreds are few
@@ -23,8 +29,7 @@ RAREST = 1 / 1500
 MOST_SHIFTED = 100  # numbers by which the rooms of another part of a building count on
 COMMON = 0.02  # share of the signs from which on a string stands in every building
 LETTER_ODDS = 1 / 5  # that a number bears this letter
-# Words that stand in every building: (pattern of the whole string, share of all signs). Sources: ISO 7010 and EN 17210 signs, and
-# the labels of rooms in the CubiCasa5k and Rent3D plans, in the languages of the data that we have.
+# Words that stand in every building, in languages of our data: (pattern of the whole string, share of all signs, by guess).
 EVERYWHERE = tuple(
     (re.compile(pattern), share)
     for share, pattern in (
@@ -69,7 +74,8 @@ def fold_text(text: str) -> str:
 def is_number(text: str) -> bool:
     """Is a string a number of a room or the like, with letters perhaps, or read as one?"""
     folded = fold_text(text)
-    return bool(folded) and (folded.isdigit() or (any(c.isdigit() for c in text) and len(folded) <= 8))
+    digits = sum(c.isdigit() for c in text[: 4 * LONGEST])
+    return bool(folded) and len(folded) <= 8 and (folded.isdigit() or 2 * digits >= len(folded))
 
 
 @lru_cache(maxsize=65536)
@@ -93,17 +99,18 @@ def estimate_share(text: str) -> float:
 
 
 @lru_cache(maxsize=262144)
-def count_edits(one: str, other: str) -> tuple[int, int]:
-    """Count the characters that differ and those that are one too many or too few, in the alignment with the fewest of both."""
+def count_edits(one: str, other: str) -> tuple[int, int, int]:
+    """Count the edits of the alignment with the fewest: characters that look alike, that do not, and one too many or too few."""
     if one == other:
-        return 0, 0
-    row = [(k, 0, k) for k in range(len(other) + 1)]  # edits, substituted, shifted
+        return 0, 0, 0
+    row = [(k, k, 0, 0) for k in range(len(other) + 1)]  # edits, too many or few, unlike, alike
     for i, c in enumerate(one, 1):
-        last, row = row, [(i, 0, i)]
+        last, row = row, [(i, i, 0, 0)]
         for j, d in enumerate(other, 1):
-            steps = [(last[j - 1], (c != d), 0), (last[j], 0, 1), (row[j - 1], 0, 1)]
-            row.append(min((cell[0] + sub + gap, cell[1] + sub, cell[2] + gap) for cell, sub, gap in steps))
-    return row[-1][1], row[-1][2]
+            alike = c != d and frozenset((c, d)) in ALIKE
+            steps = [(last[j - 1], 0, int(c != d and not alike), int(alike)), (last[j], 1, 0, 0), (row[j - 1], 1, 0, 0)]
+            row.append(min((s[0] + gap + un + al, s[1] + gap, s[2] + un, s[3] + al) for s, gap, un, al in steps))
+    return row[-1][3], row[-1][2], row[-1][1]
 
 
 def score_reading(one: str, other: str, error: float) -> float:
@@ -114,10 +121,10 @@ def score_reading(one: str, other: str, error: float) -> float:
         error: of a character, by one reader, beyond its class of shapes.
     """
     wrong = min(2 * error, 0.9)
-    changed, shifted = count_edits(one, other)
-    length = max(len(one), len(other), 1)
-    same = max(length - changed - shifted, 0)
-    read = (1 - wrong) ** same * (wrong * SUBSTITUTED / ALPHABET) ** changed * (wrong * SHIFTED / ALPHABET**0.5) ** shifted
+    alike, changed, shifted = count_edits(one, other)
+    same = max(max(len(one), len(other), 1) - alike - changed - shifted, 0)
+    read = (1 - wrong) ** same * (wrong * SUBSTITUTED * ALIKE_SHARE / ALIKE_CHARACTERS) ** alike
+    read *= (wrong * SUBSTITUTED * (1 - ALIKE_SHARE) / ALPHABET) ** changed * (wrong * SHIFTED / ALPHABET**0.5) ** shifted
     short, long = sorted((one, other), key=len)
     if len(short) < len(long) <= 2 * len(short) and (long.startswith(short) or long.endswith(short)):
         read = max(read, CUT_OFF * (1 - wrong) ** len(short))
@@ -155,6 +162,11 @@ def find_shifts(one: str, other: str) -> list[Shift]:
         amount = int(tails[1][0]) - int(tails[0][0])
         shifts += [("count", amount, "")] if 0 < abs(amount) <= MOST_SHIFTED else []
     return shifts
+
+
+def is_leading(shift: Shift) -> bool:
+    """Does a shift change the character that tells the storey or the wing: one of the first two?"""
+    return shift[0] == "change" and shift[1] <= 1
 
 
 def apply_shift(text: str, shift: Shift) -> str | None:
