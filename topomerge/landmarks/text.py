@@ -17,10 +17,8 @@ LONGEST = 32  # characters that are compared
 ALPHABET = 15.0  # characters that an error may give
 SUBSTITUTED, SHIFTED = 0.7, 0.15  # of the errors: another character; one too many, and as many one too few
 # Characters of two classes that look alike in print, so that readers commonly take them for each other.
-ALIKE = frozenset(
-    frozenset(pair)
-    for pair in "17 27 06 08 69 68 56 38 35 49 4a 0c 9c ce hn mn uv vy kx ef 1t 7t rn 8r ar 6b 0a".split()  # after folding
-)
+_PAIRS = "172706086968563835494a0c9ccehnmnuvvykxef1t7trn8rar6b0a"
+ALIKE = frozenset(frozenset(pair) for pair in zip(_PAIRS[::2], _PAIRS[1::2], strict=True))
 ALIKE_SHARE, ALIKE_CHARACTERS = 0.6, 4.0  # of the wrong characters: those that look alike; and how many these are for each
 CUT_OFF = 0.02  # probability that a string lost an end of half its length at most
 WORD_ODDS = {0: 0.3, 1: 0.05, 2: 0.02, 3: 0.005}  # share of the signs that bear a given string of so many characters
