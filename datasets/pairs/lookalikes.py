@@ -23,9 +23,17 @@ from topomerge.datasets.simulation.floor_truth import fill
 from topomerge.datasets.simulation.scanner import scan_building
 from topomerge.datasets.simulation.sensors import get_sensor
 from topomerge.datasets.simulation.session import simulate_session
+from topomerge.datasets.simulation.signs import (
+    Reader,
+    change_signs,
+    draw_numbering,
+    draw_other_numbering,
+    place_signs,
+    read_signs,
+)
 
 from topomerge.errors import InputError
-from topomerge.types import Array, LogFn, Sim3, VoxelGrid
+from topomerge.types import Array, Landmarks, LogFn, Sim3, VoxelGrid
 
 RULE_CELL = 0.1  # m
 WALL_INSIDE, THING_APART = 0.3, 0.3  # m
@@ -307,6 +315,41 @@ def build_lookalike_arrays(item: LookalikeItem) -> dict[str, Array]:
     about |= {"lookalike": item.kind, "furniture": item.furniture, "scaled": item.scaled, "file": f"{item.name}.npz"}
     arrays["about"] = np.frombuffer(json.dumps(about, sort_keys=True).encode(), np.uint8)
     return arrays
+
+
+RELATION_OF = {
+    "storeys": ("storey",),
+    "hotel-corridors": ("storey", "wing"),
+    "same-room": ("row",),
+    "mirror": ("wing", "building"),
+}
+NUMBERED_ALIKE = 0.03  # of the places that are two: they bear the same numbers
+
+
+def read_lookalike_signs(item: LookalikeItem, reader: Reader) -> tuple[Landmarks, Landmarks]:
+    """Read the signs of the places of an item by two visitors, each in the frame of its map (`build_lookalike_arrays`).
+
+    They are a switch: the arrays of the item stay as they are. Places that are two are numbered as such; few of them alike.
+    """
+    places = sample_places(item.kind, item.furniture, item.seed)
+    buildings, visited = places.buildings, places.visited
+    frames = draw_frames(2, item.scaled, np.random.default_rng([item.seed, item.number, LOOKALIKES.index(item.kind)]))
+    rng = np.random.default_rng([item.seed, item.number, LOOKALIKES.index(item.kind), 51, int(item.again)])
+    numbering = draw_numbering(rng)
+    one = place_signs(buildings[0], numbering, rng)
+    if item.again:
+        visited, other = (visited[0], visited[0]), one
+    elif places.same:
+        other = one
+    else:
+        relation = str(rng.choice(RELATION_OF[item.kind]))
+        alike = rng.random() < NUMBERED_ALIKE
+        other = place_signs(buildings[1], numbering if alike else draw_other_numbering(numbering, relation, rng), rng)
+    read = [
+        read_signs(signs, rooms.tolist(), frame, reader, rng)
+        for signs, rooms, frame in zip((one, change_signs(other, rng)), visited, frames, strict=True)
+    ]
+    return read[0], read[1]
 
 
 def compute_seen_columns(grid: VoxelGrid, free: VoxelGrid | None, back: Sim3) -> Array:

@@ -198,6 +198,8 @@ def test_json_has_the_schema(merged, refused):
         "alternatives",
         "places",
         "contradictions",
+        "evidence",
+        "settle",
     ]
     assert listing["descriptor"] == "learned"
     assert listing["format"] == 1 and listing["status"] == "merged" and 0 <= listing["probability"] <= 1

@@ -84,3 +84,10 @@ def test_cleaned_landmarks_are_left_alone_where_they_are_clean():
     assert again.table.tobytes() == clean.table.tobytes() and (again.values, again.sources) == (clean.values, clean.sources)
     assert len(clean_landmarks(build_landmarks("text", [" ", ""], "x"))) == 0
     assert len(clean_landmarks(build_landmarks("pressure", [""], "x", number=1000.0))) == 1
+
+
+def test_a_landmark_without_a_height_keeps_its_place():
+    pose = Sim3(yaw=np.pi / 2, translation=(1.0, 2.0, 3.0))
+    flat = build_landmarks("text", ["1", "2"], "x", np.array([[1.0, 0.0, np.nan], [np.nan, 0.0, 1.0]]))
+    moved = move_landmarks(flat, pose).table["position"]
+    assert moved[0, :2] == pytest.approx([1.0, 3.0]) and np.isnan(moved[0, 2]) and np.isnan(moved[1, 0])

@@ -32,6 +32,7 @@ from topomerge.fusion.inputs import (
 )
 from topomerge.fusion.result import MERGE_STEPS, MergeResult, RoomMatch
 from topomerge.landmarks.fuse import CONTRADICTING
+from topomerge.landmarks.settle import Observation, find_observations
 from topomerge.matching.consistency import compute_match_probability
 from topomerge.matching.match import Matching, match
 from topomerge.matching.poses import PoseHypothesis
@@ -43,6 +44,7 @@ from topomerge.registration.surfaces import check_open3d, estimate_room_poses
 from topomerge.types import Deformation, Sim3, TopometricMap
 
 Row = tuple[str, str, str]  # evidence, value, meaning
+LEFT_OPEN = 0.15  # probability of another alternative, from which on it is told what would rule it out
 
 
 def explain_verdict(registration: Registration, threshold: float, force: bool = False) -> str:
@@ -58,6 +60,10 @@ def explain_verdict(registration: Registration, threshold: float, force: bool = 
     ]
     words.append(f"{f['walls']:.0f} m2 of walls agree, {f['free']:.0f} m2 of free floor seen by both")
     words.append(f"{100 * f['conflict_share']:.1f} % of the walls stand on free floor of the other map")
+    words += registration.landmarks.list_sentences()
+    if registration.landmarks.factors and believed != (registration.walls >= threshold):
+        alone = f"the walls alone would {'not ' * believed}be believed ({format_probability(registration.walls)})"
+        words.append(alone)
     if not believed:
         if compute_evidence_limit(f) < 1:
             words.append("the maps share too little area for a verdict")
@@ -111,6 +117,11 @@ def list_evidence(registration: Registration) -> list[Row]:
         odds = registration.places.log_odds
         words = f"{(odds > 0).sum()} look like the same place, {(odds <= 0).sum()} more like another one; coloured on the plan"
         rows.append(("places compared", f"{len(odds)}", words))
+    for kind, factor in registration.landmarks.factors.items():
+        ahead, nearest = min((factor["here"] - factor[name], name) for name in POSTERIOR if name != "here")
+        times = np.exp(min(abs(ahead), 15.0))
+        words = f"{times:,.0f} times as likely as of" if ahead > 0 else f"{times:,.0f} times less likely than of"
+        rows.append((f"landmarks: {kind}", f"{ahead:+.1f}", f"log odds: {words} {WORDS[nearest]}"))
     if len(registration.alternatives) > 1:
         times = np.exp(min(f["margin"], 15.0))
         words = f"{times:,.0f} times as probable" if times >= 1.5 else "about as probable"
@@ -248,7 +259,20 @@ def _place_pair(maps: Sequence[TopometricMap], config: MergeConfig) -> MergeResu
         maps=(a, b),
         registration=registration,
         warnings=(*iter_pair_warnings(a, b, config.scale), *_iter_rigid_reasons(registration)),
+        settle=tuple(_find_observations(a, b, registration, accepted)),
     )
+
+
+def _find_observations(a: TopometricMap, b: TopometricMap, registration: Registration, accepted: bool) -> list[Observation]:
+    """What would settle a merge that is refused, or of which another alternative is left."""
+    each = registration.posterior
+    left = max((p for name, p in each.items() if name != "here"), default=0.0)
+    if registration.transform is None or (accepted and left < LEFT_OPEN):
+        return []
+    if compute_registration_order(b) < compute_registration_order(a):  # as registration: nothing may depend on which comes first
+        turned = find_observations(b, a, registration.transform.inverse(), each, registration.landmarks.inverse().witnesses)
+        return [o.inverse() for o in turned]
+    return find_observations(a, b, registration.transform, each, registration.landmarks.witnesses)
 
 
 def _iter_rigid_reasons(registration: Registration) -> Iterator[str]:

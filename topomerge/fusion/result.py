@@ -13,6 +13,8 @@ from topomerge.archive import convert_to_plain
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.pairs import serialise_contradiction
 from topomerge.fusion.transfer import LANDMARK_PARAMETER
+from topomerge.landmarks.evidence import LandmarkEvidence
+from topomerge.landmarks.settle import Observation
 from topomerge.matching.match import describe_map
 from topomerge.registration.evidence.places import Places
 from topomerge.registration.pipeline import Registration
@@ -189,6 +191,7 @@ class MergeResult:
         descriptor: of the rooms, by which they were matched where walls were not believed.
         bends: k -> how map k is bent in its own frame, before its transform is applied; rigid ones are left out.
         points: k -> name of the file beside merge.json that holds the points of map k, of those that `merge --points` wrote.
+        settle: of two maps of which not everything is sure, what to look at next, the best first.
     """
 
     status: str
@@ -205,6 +208,7 @@ class MergeResult:
     descriptor: str = ""
     bends: Mapping[int, Deformation] = field(default_factory=dict)
     points: Mapping[int, str] = field(default_factory=dict)
+    settle: tuple[Observation, ...] = ()
 
     def __post_init__(self) -> None:
         if self.status not in ("merged", "abstained"):
@@ -262,6 +266,8 @@ def serialise_merge(result: MergeResult) -> dict[str, Any]:
         "alternatives": {name: round(p, 6) for name, p in registration.posterior.items()} if registration else {},
         "places": serialise_places(registration.places) if registration and registration.places else [],
         "contradictions": [serialise_contradiction(c) for c in result.atlas.contradictions] if result.atlas else [],
+        "evidence": {"landmarks": (registration.landmarks if registration else LandmarkEvidence()).serialise()},
+        "settle": [{**o.serialise(), "words": o.describe([m.title for m in result.maps])} for o in result.settle],
     }
     if result.map is not None and LANDMARK_PARAMETER in result.map.parameters:
         listing["landmarks"] = result.map.parameters[LANDMARK_PARAMETER]

@@ -15,6 +15,8 @@ import numpy as np
 from topomerge.blas import limit_blas_threads
 from topomerge.errors import InputError
 from topomerge.extraction.stopwatch import Stopwatch
+from topomerge.landmarks.evidence import LandmarkEvidence, LandmarkScorer
+from topomerge.landmarks.proposals import propose_poses
 from topomerge.matching.poses import PoseHypothesis, refine, select_distinct_hypotheses, wrap_yaw
 from topomerge.registration.bend.bend import Bend, bend
 from topomerge.registration.evidence.places import Places, score_places
@@ -22,7 +24,7 @@ from topomerge.registration.judge import Judge, compute_winner_features
 from topomerge.registration.posterior import check_same
 from topomerge.registration.prepared import Map, Prepared, prepare
 from topomerge.registration.refine import refine_pose
-from topomerge.registration.search import search, search_scaled
+from topomerge.registration.search import find_height_offsets, find_yaw_candidates, search, search_scaled
 from topomerge.registration.verify import (
     BASIN,
     MARGIN_CAP,
@@ -33,9 +35,10 @@ from topomerge.registration.verify import (
     rank,
     score_bent,
 )
-from topomerge.types import Sim3, VoxelGrid
+from topomerge.types import Sim3, TopometricMap, VoxelGrid
 
 AS_GOOD = 1.5  # log odds: less is no lead
+TESTIFIED = 3  # hypotheses that are bent, too, of those that landmarks speak for most
 CLOSELY = 3  # hypotheses that are bent at most, the best ones; and one more that no ratio speaks against
 RIGID_FEATURES = {"strain": 0.0, "bent": 0.0, "farthest": 0.0, "doubted": 0.0, "bent_pieces": 0.0, "rmse": float("nan")}
 log = logging.getLogger(__name__)
@@ -54,6 +57,7 @@ class Candidate:
         places: what both maps show, one place after another.
         features: of `Judge` and `Bend`, and of the places.
         score: log odds that it is right, seen by itself.
+        landmarks: what these say of it.
     """
 
     hypothesis: PoseHypothesis
@@ -62,6 +66,12 @@ class Candidate:
     places: Places
     features: dict[str, float]
     score: float
+    landmarks: LandmarkEvidence = field(default_factory=LandmarkEvidence)
+
+    @property
+    def odds(self) -> float:
+        """Log odds by which candidates are ranked: of walls and of landmarks."""
+        return self.score + self.landmarks.support
 
     def compute_all_features(self) -> dict[str, float]:
         """Compute all features, with those that only the best candidate needs (`compute_winner_features`)."""
@@ -73,14 +83,17 @@ def count_repeats(ranked: Sequence[PoseHypothesis]) -> int:
     return int((compute_quality_lag(ranked)[1:] < AS_GOOD).sum())
 
 
-def build_candidate(a: Prepared, b: Prepared, hypothesis: PoseHypothesis, scaled: bool) -> Candidate:
-    """Return both maps bent near the pose T_ab of a hypothesis, and what they show then."""
+def build_candidate(
+    a: Prepared, b: Prepared, hypothesis: PoseHypothesis, scaled: bool, scorer: LandmarkScorer | None = None
+) -> Candidate:
+    """Return both maps bent near the pose T_ab of a hypothesis, and what they and their landmarks (`scorer`) show then."""
     bent = bend(a, b, hypothesis.transform, scaled=scaled)
     storeys = bent.bend_storeys(b.storeys)
     judge = Judge(a.storeys, storeys)
     seen = score_places(a.storeys, storeys, bent.transform)
     features = {**judge(bent.transform), **RIGID_FEATURES, **bent.features, **seen.features}
-    return Candidate(hypothesis, bent, judge, seen, features, score_bent(features))
+    landmarks = scorer.score(bent.transform, bent.deformations) if scorer else LandmarkEvidence()
+    return Candidate(hypothesis, bent, judge, seen, features, score_bent(features), landmarks)
 
 
 def select_rivals(ranked: Sequence[PoseHypothesis]) -> list[int]:
@@ -92,18 +105,34 @@ def select_rivals(ranked: Sequence[PoseHypothesis]) -> list[int]:
     return near + sorted(rest, key=lambda k: lag[k])[:1]
 
 
+def select_testified(ranked: Sequence[PoseHypothesis], scorer: LandmarkScorer) -> list[int]:
+    """Which of ranked hypotheses landmarks speak for most, with what walls say of each."""
+    support = [scorer.score(h.transform).support for h in ranked]
+    odds = [h.score + s for h, s in zip(ranked, support, strict=True)]
+    return [k for k in sorted(range(len(ranked)), key=lambda k: -odds[k])[:TESTIFIED] if support[k] > 0]
+
+
 def build_candidates(
-    a: Prepared, b: Prepared, ranked: Sequence[PoseHypothesis], scaled: bool, bent: dict[int, Candidate] | None = None
+    a: Prepared,
+    b: Prepared,
+    ranked: Sequence[PoseHypothesis],
+    scaled: bool,
+    bent: dict[int, Candidate] | None = None,
+    scorer: LandmarkScorer | None = None,
 ) -> list[Candidate]:
     """Return the hypotheses worth it, each with the maps bent, best first; those that end in one pose once.
 
     Args:
         bent: id of a hypothesis -> what was made of it before; new ones are added.
+        scorer: of landmarks, where both maps have some.
     """
     bent = {} if bent is None else bent
-    near = [ranked[k] for k in select_rivals(ranked)]
-    bent |= {id(h): build_candidate(a, b, h, scaled) for h in near if id(h) not in bent}
-    looked = sorted((bent[id(h)] for h in near), key=lambda c: -c.score)
+    closely = select_rivals(ranked)
+    if scorer is not None:
+        closely += [k for k in select_testified(ranked, scorer) if k not in closely]
+    near = [ranked[k] for k in closely]
+    bent |= {id(h): build_candidate(a, b, h, scaled, scorer) for h in near if id(h) not in bent}
+    looked = sorted((bent[id(h)] for h in near), key=lambda c: -c.odds)
     looked[0].features["repeats"] = float(count_repeats(ranked))  # asked of the best one only
     moved = [replace(c.hypothesis, transform=c.bend.transform) for c in looked]
     single = {id(h) for h in select_distinct_hypotheses(moved, np.append(b.storeys[0].middle, 0.0), BASIN)}
@@ -138,6 +167,8 @@ class Registration:
         bend: how the maps are bent onto each other under the transform; None where a rigid pose was asked for.
         posterior: probability of this place and of each named alternative (`fusion.posterior`); they sum to 1.
         places: what both maps show of each place that they share under it, and how much that speaks for it.
+        landmarks: what signs, tags and the like say of it.
+        walls: the probability without landmarks.
     """
 
     transform: Sim3 | None
@@ -150,6 +181,8 @@ class Registration:
     bend: Bend | None = None
     places: Places | None = None
     posterior: dict[str, float] = field(default_factory=dict)
+    landmarks: LandmarkEvidence = field(default_factory=LandmarkEvidence)
+    walls: float = 0.0
 
 
 @limit_blas_threads
@@ -193,7 +226,7 @@ def register(
     pair = _Pair(a, b, scale == "free", clock)
     fallback, first = (proposed, ()) if isinstance(proposed, FallbackProposals) else (None, proposed)
     if searched:
-        pair.search(first)
+        pair.search([*first, *pair.propose_by_landmarks()])
     else:
         pair.add(first)
     chance = pair.score_candidates(same)
@@ -216,6 +249,20 @@ class _Pair:
         self.looked: list[Candidate] = []
         self.bent: dict[int, Candidate] = {}
         self.verdict: Verdict | None = None
+        self.scorer: LandmarkScorer | None = None
+        if a.has_landmarks and b.has_landmarks:
+            one, other = a.load(), b.load()
+            if isinstance(one, TopometricMap) and isinstance(other, TopometricMap):
+                self.scorer = LandmarkScorer(one, other)
+
+    def propose_by_landmarks(self) -> list[Sim3]:
+        """Return the poses T_ab that landmarks propose."""
+        if self.scorer is None:
+            return []
+        plans = self.a.storeys, self.b.storeys
+        yaws = find_yaw_candidates(plans[0][0].profile, plans[1][0].profile) if all(plans) else []
+        heights = find_height_offsets([v.plan for v in plans[0]], [w.plan for w in plans[1]])
+        return propose_poses(self.scorer, self.scaled, yaws, [] if self.scaled else heights)
 
     def search(self, poses: Sequence[Sim3]) -> None:
         """Add hypotheses of the correlation, and of given poses T_ab."""
@@ -236,8 +283,9 @@ class _Pair:
         """Look closely at the best hypotheses there are; the probability of the best one."""
         if not self.ranked:
             return 0.0
-        self.looked = build_candidates(self.a, self.b, self.ranked, self.scaled, self.bent)
-        self.verdict = compute_verdict([c.features for c in self.looked], self.looked[0].compute_all_features(), same)
+        self.looked = build_candidates(self.a, self.b, self.ranked, self.scaled, self.bent, self.scorer)
+        seen, told = [c.features for c in self.looked], [c.landmarks for c in self.looked]
+        self.verdict = compute_verdict(seen, self.looked[0].compute_all_features(), same, told)
         self.clock.lap("bend")
         return self.verdict.each[0]
 
@@ -271,7 +319,7 @@ def _refine_candidate(a: Prepared, b: Prepared, best: Candidate, scaled: bool, r
 def _build_registration(ranked: Sequence[PoseHypothesis], looked: Sequence[Candidate], said: Verdict) -> Registration:
     """The best of the candidates, with its probability and the reason in words."""
     best, chance = looked[0], said.each[0]
-    margin = min(best.score - looked[1].score, MARGIN_CAP) if len(looked) > 1 else MARGIN_CAP
+    margin = min(best.odds - looked[1].odds, MARGIN_CAP) if len(looked) > 1 else MARGIN_CAP
     features = {**said.features, "rigid_conflict_share": best.hypothesis.features["conflict_share"], "margin": margin}
     accepted = chance >= load_model()["threshold"]
     share = 100 * features["conflict_share"]
@@ -280,14 +328,15 @@ def _build_registration(ranked: Sequence[PoseHypothesis], looked: Sequence[Candi
         f"free floor seen by both, {share:.1f} % of the walls stand on free floor of the other map"
     )
     closely = {id(c.hypothesis) for c in looked}
-    others = [replace(c.hypothesis, score=c.score, probability=p) for c, p in zip(looked, said.each, strict=True)]
+    others = [replace(c.hypothesis, score=c.odds, probability=p) for c, p in zip(looked, said.each, strict=True)]
     last = others[-1].score  # of those that were not looked at closely, the lag behind the best one is all that is known
     for h in ranked:
         if id(h) not in closely:
-            lag = max(ranked[0].score - h.score, best.score - last)
-            others.append(replace(h, score=best.score - lag, probability=float(chance * np.exp(-lag))))
+            lag = max(ranked[0].score - h.score, best.odds - last)
+            others.append(replace(h, score=best.odds - lag, probability=float(chance * np.exp(-lag))))
     pose, alternatives = best.bend.transform, tuple(others[:ALTERNATIVES])
-    return Registration(pose, chance, accepted, features, alternatives, reason, places=best.places, posterior=said.posterior)
+    told = {"posterior": said.posterior, "landmarks": best.landmarks, "walls": said.walls}
+    return Registration(pose, chance, accepted, features, alternatives, reason, places=best.places, **told)  # type: ignore[arg-type]
 
 
 def refine_by_surfaces(a: Prepared, b: Prepared, start: Sim3, scaled: bool = False) -> tuple[Sim3, float]:
@@ -309,4 +358,5 @@ def _invert_registration(registration: Registration) -> Registration:
     seen = registration.places
     if seen is not None and registration.transform is not None:
         seen = seen.inverse(registration.transform)
-    return replace(registration, transform=transform, alternatives=others, bend=bent, places=seen)
+    told = registration.landmarks.inverse()
+    return replace(registration, transform=transform, alternatives=others, bend=bent, places=seen, landmarks=told)

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
+from topomerge.landmarks.evidence import LandmarkEvidence
+from topomerge.landmarks.likelihood import ALTERNATIVES as POSTERIOR
 from topomerge.types import Array
 
-WRONG = ("elsewhere", "storey", "half", "wing", "building", "outside")
-POSTERIOR = ("here", *WRONG)
+WRONG = POSTERIOR[1:]
 KINDS = ("elsewhere", "storey", "wing", "building", "outside")  # what the model of wrong poses tells apart
 SAME_PLAN = ("storey", "half")  # places whose walls agree by plan, told by furniture
 # Of the pairs that somebody would try, how many are of each kind, and (elsewhere) how often maps that do share a place are laid
@@ -36,6 +37,7 @@ WORDS = {
     "outside": "a place outside the other map",
 }
 COMMON_WALLS, COMMON_FLOOR = 1.0, 6.0  # m2 of wall columns that meet and of free floor that both saw: below, nothing can be sure
+MOST_BY_LANDMARKS = 0.95  # probability of a pose that walls alone do not carry and landmarks do
 FEW = 0.5  # probability that so little evidence can carry at most
 
 
@@ -80,6 +82,26 @@ def limit_posterior(each: Mapping[str, float], most: float) -> dict[str, float]:
 def compute_evidence_limit(features: Mapping[str, float]) -> float:
     """Return the most that a pose may be believed for how much both maps show at all."""
     return FEW if features["walls"] < COMMON_WALLS or features["free"] < COMMON_FLOOR else 1.0
+
+
+def update_posterior(
+    each: Mapping[str, float],
+    threshold: float,
+    landmarks: LandmarkEvidence,
+    rivals: Sequence[tuple[float, LandmarkEvidence]] = (),
+) -> dict[str, float]:
+    """Return a posterior after what landmarks say; what walls alone do not carry gets `MOST_BY_LANDMARKS` at most.
+
+    Args:
+        each: by walls and furniture.
+        threshold: from which these alone would be believed.
+        landmarks: under the pose.
+        rivals: other poses, each with its share by walls and what landmarks say of it.
+    """
+    if not landmarks.factors:
+        return dict(each)
+    updated = landmarks.apply(each, rivals)
+    return limit_posterior(updated, MOST_BY_LANDMARKS) if each["here"] < threshold else updated
 
 
 def find_threshold(risk: float, curve: Sequence[Sequence[float]]) -> float:

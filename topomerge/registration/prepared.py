@@ -31,6 +31,7 @@ class Prepared:
         middle: (3,) of its cells, m.
         sensor: what it was measured by, as far as one can say.
         make_surface: its points and normals, for the fine registration.
+        has_landmarks: does the map hold any?
     """
 
     load: Callable[[], Map]
@@ -39,6 +40,7 @@ class Prepared:
     middle: Array
     sensor: str
     make_surface: Callable[[], Surface]
+    has_landmarks: bool = False
 
     @property
     def surface(self) -> Surface:
@@ -87,6 +89,7 @@ def prepare(map: Map, free: VoxelGrid | None = None) -> Prepared:
         compute_cell_means(grid).mean(axis=0),
         detect_sensor(map),
         make_surface,
+        isinstance(map, TopometricMap) and len(map.landmarks) > 0,
     )
 
 

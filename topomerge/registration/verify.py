@@ -10,9 +10,10 @@ import numpy as np
 from scipy.special import betaln
 
 from topomerge.archive import read_weights_json
+from topomerge.landmarks.evidence import LandmarkEvidence
 from topomerge.matching.poses import PoseHypothesis, PoseTolerance, select_distinct_hypotheses
 from topomerge.registration.judge import Judge
-from topomerge.registration.posterior import compute_evidence_limit, compute_posterior, limit_posterior
+from topomerge.registration.posterior import compute_evidence_limit, compute_posterior, limit_posterior, update_posterior
 from topomerge.types import Array
 
 JUDGED_FULLY, GLANCE_STEP = 30, 7  # hypotheses that are judged by all columns; more of them by every seventh first
@@ -122,20 +123,25 @@ class Verdict:
     posterior: probability of each of `posterior.POSTERIOR`; they sum to 1.
     each: probability of each of the ranked poses, the first one that of this place (``here``).
     features: of the first pose, all that it was judged by.
+    walls: probability of this place without landmarks.
     """
 
     posterior: dict[str, float]
     each: list[float]
     features: dict[str, float]
+    walls: float
 
 
-def compute_verdict(rivals: Sequence[Features], winner: Features, same: str = "nothing") -> Verdict:
+def compute_verdict(
+    rivals: Sequence[Features], winner: Features, same: str = "nothing", landmarks: Sequence[LandmarkEvidence] = ()
+) -> Verdict:
     """Is the first of ranked poses right? At most its share of the odds of all, and at most what so much evidence can carry.
 
     Args:
         rivals: features of each pose once the maps are bent, best first.
         winner: features of the first one, with those of `compute_winner_features`.
         same: what the user knows the maps to be of, a key of `posterior.SAME`.
+        landmarks: what they say of each pose; none: nothing.
     """
     models = _select_models(rivals[0])
     scores = np.array([score_bent(f) for f in rivals])
@@ -148,7 +154,13 @@ def compute_verdict(rivals: Sequence[Features], winner: Features, same: str = "n
         compute_posterior(here, plan, models["kinds"], seen, same), min(leads[3], compute_evidence_limit(winner))
     )
     shares = np.exp(scores - scores[0])
-    return Verdict(every, (every["here"] * shares).tolist(), dict(winner))
+    if not any(e.factors for e in landmarks):
+        return Verdict(every, (every["here"] * shares).tolist(), dict(winner), every["here"])
+    others = [(float(share / max(shares[1:].sum(), 1e-12)), e) for share, e in zip(shares[1:], landmarks[1:], strict=True)]
+    told = update_posterior(every, load_model()["threshold"], landmarks[0], others)
+    ahead = np.array([e.support - landmarks[0].support for e in landmarks])
+    each = told["here"] * np.minimum(shares * np.exp(np.minimum(ahead, 30.0)), 1.0)
+    return Verdict(told, each.tolist(), dict(winner), every["here"])
 
 
 def compute_belief_vector(bent: Array, leads: Sequence[float], winner: Features) -> Array:

@@ -134,8 +134,12 @@ def transform_landmarks(
         scale: of the uncertainty of positions.
     """
     table = landmarks.table.copy()
-    known = np.isfinite(table["position"]).all(axis=1)
-    table["position"][known] = transform(table["position"][known])
+    known = np.isfinite(table["position"][:, :2]).all(axis=1)  # some readers know no heights: these stay unknown
+    flat = known & np.isnan(table["position"][:, 2])
+    places = table["position"].copy()
+    places[flat, 2] = 0.0
+    table["position"][known] = transform(places[known])
+    table["position"][flat, 2] = np.nan
     table["sigma"] *= scale
     turned = landmarks.is_kind("tag", "text")
     table["number"][turned] = (table["number"][turned] + yaw + np.pi) % (2 * np.pi) - np.pi

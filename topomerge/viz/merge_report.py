@@ -252,9 +252,17 @@ def _render_verdict(result: MergeResult) -> Markup:
     parts = result.reason.replace(" m2 ", " m² ").split(": ", 1)[-1].split("; ")
     items = build_element("ul", *(build_element("li", part) for part in parts))
     words = build_element("b", f"{head} · probability {format_probability(result.probability)}")
-    return join(
-        [build_element("div", words, items, class_="verdict" if result.merged else "verdict refused"), _render_figures(result)]
-    )
+    block = build_element("div", words, items, class_="verdict" if result.merged else "verdict refused")
+    return join([block, *_render_observations(result), _render_figures(result)])
+
+
+def _render_observations(result: MergeResult) -> list[Markup]:
+    """What would settle the merge, where anything would."""
+    if not result.settle:
+        return []
+    names = [m.title for m in result.maps]
+    items = [build_element("li", f"{o.describe(names)} ({100 * o.change:.0f} % expected change)") for o in result.settle]
+    return [render_section("What would settle it", build_element("ol", *items), "settle")]
 
 
 def _render_figures(result: MergeResult) -> Markup:

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from topomerge.fusion.atlas.maps import Maps
 from topomerge.kernels import registration as align
+from topomerge.landmarks.evidence import score_landmarks
 from topomerge.matching.match import match
 from topomerge.matching.poses import FREE_MARGIN, PlanFields, PoseHypothesis, pair_storeys, pose_difference, refine
 from topomerge.registration.judge import Judge
@@ -34,6 +35,7 @@ CONFLICT_ODDS = 30.0  # log odds against a pose, of each share of 1 above that
 # usual share, 2 have one, 13 have two, and half of them six or more.
 ONE_PLACE_ODDS, FURTHER_PLACE_ODDS = 0.6, 1.5
 MOST_AGAINST = 6.0  # log odds
+LANDMARKS_FOR = 3.0  # log odds that landmarks may say for a pose that other maps propose
 PLACE_HALF_WIDTH = 1.0  # m, of the place by which a pose is measured
 SAMPLED_COLUMNS = 4000
 T = TypeVar("T")
@@ -268,7 +270,15 @@ class Checks:
         if features["free"] < OVERLAP_FLOOR and features["walls"] < OVERLAP_WALLS:
             return Check(moved, 0.0, False, features)
         conflicts = find_conflicts(a, b, moved) if compute_excess_conflict(features) else ()
-        return Check(moved, score_pose(features, conflicts), True, features, conflicts)
+        told = self._score_landmarks(i, j, moved)
+        return Check(moved, score_pose(features, conflicts) + told, True, features, conflicts)
+
+    def _score_landmarks(self, i: int, j: int, pose: Sim3) -> float:
+        """Log odds of what landmarks say of T_ij, at most as much as walls may say."""
+        if not (self.maps.get_prepared(i).has_landmarks and self.maps.get_prepared(j).has_landmarks):
+            return 0.0
+        support = score_landmarks(self.maps[i], self.maps[j], pose).support
+        return float(np.clip(support, -MOST_AGAINST, LANDMARKS_FOR))
 
 
 def _get_or_compute(

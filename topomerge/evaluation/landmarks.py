@@ -1,0 +1,177 @@
+"""Merges of look-alikes with signs and tags: what is believed that must not be, and what is no longer.
+
+``python evaluate.py task=landmarks data=test pairs=12 again=6 write=docs/results/landmarks.md``. So many pairs of each kind of
+places made to be alike (`datasets.pairs.lookalikes`), and so many of the first place visited twice, which belong together. Each
+pair is registered without landmarks, with half of the door signs read with a fifth of their characters wrong, with signs read
+well, and with tags (`READINGS`). Signs are drawn beside the maps: these are those of the other tables. Right: within 0.5 m and
+5 degrees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from topomerge.datasets.core.builder import limit_threads
+from topomerge.datasets.pairs.grid_pairs import GridPair, load_grids
+from topomerge.datasets.pairs.lookalikes import (
+    LOOKALIKES,
+    LookalikeItem,
+    LookalikeRecipe,
+    build_lookalikes,
+    draw_lookalike_items,
+    read_lookalike_signs,
+)
+from topomerge.datasets.simulation.signs import Reader
+from topomerge.evaluation.documents import write_table
+from topomerge.evaluation.tasks import Row, TaskSettings, measure_missing
+from topomerge.registration.pipeline import register
+from topomerge.statistics import compute_exact_interval
+from topomerge.training.belief_hypotheses import compute_pose_error, is_hypothesis_right
+from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, Landmarks, LogFn, TopometricMap, VoxelGrid
+
+MAKERS = ("topomerge.registration.pipeline", "topomerge.landmarks.evidence", "topomerge.datasets.pairs.lookalikes")
+READINGS = {
+    "no landmarks": None,
+    "half of the signs, 20 % wrong": Reader(("text",), 0.5, 0.2),
+    "nine of ten signs, 2 % wrong": Reader(("text",), 0.9, 0.02),
+    "tags": Reader(("tag",), 0.9, 0.0),
+}
+HEADS = (
+    "landmarks",
+    "pairs",
+    "wrongly merged",
+    "95 %",
+    "of these, with landmarks",
+    "wrong",
+    "true pairs",
+    "right and believed",
+    "%",
+)
+
+
+@dataclass
+class Settings(TaskSettings):
+    """Settings of the task.
+
+    Args:
+        pairs: of each kind of look-alikes.
+        again: of each kind, places visited twice.
+        readings: numbers of `READINGS` that are measured.
+    """
+
+    pairs: int = 12
+    again: int = 6
+    readings: list[int] = field(default_factory=lambda: [0, 1, 2, 3])
+
+
+def make_recipe(settings: Settings) -> LookalikeRecipe:
+    """Return the recipe of the pairs."""
+    split, name = ("train", "signs_train") if settings.data.set == "train" else ("test", "signs_test")
+    pairs, again = (dict.fromkeys(LOOKALIKES, count) for count in (settings.pairs, settings.again))
+    return LookalikeRecipe(name=name, split=split, pairs=pairs, again=again, scaled=0.0)
+
+
+def list_inputs(settings: Settings) -> list[str]:
+    """Names of the pairs."""
+    return [item.name for item in draw_lookalike_items(make_recipe(settings))]
+
+
+def measure(settings: Settings, log_line: LogFn) -> list[Row]:
+    """Measure the pairs that are missing."""
+    recipe = make_recipe(settings)
+    sharing = _Sharing(settings.cache, settings.jobs)
+    files = {path.stem: path for path in build_lookalikes(recipe, sharing, log_line)[0]}
+    names = tuple(list(READINGS)[k] for k in settings.readings)
+    items = {
+        f"{item.kind}-{item.number}{'-again' if item.again else ''}": (files[item.name], item, names)
+        for item in draw_lookalike_items(recipe)
+        if item.name in files
+    }
+    path = Path(settings.cache) / "evaluation" / f"{recipe.name}.jsonl"
+    items = {k: v for k, v in items.items() if settings.data.only in k}
+    rows = measure_missing(path, items, measure_pair, log_line, settings)
+    return [{**row, **of} for row in rows for of in row["readings"]]
+
+
+@dataclass(frozen=True)
+class _Sharing:
+    """How the building of a set is shared out (`BuildSettings`)."""
+
+    cache: str
+    jobs: int
+    cluster: str | None = None
+    part: list[int] = field(default_factory=lambda: [1, 1])
+
+
+def build_bare_map(grid: VoxelGrid, free: VoxelGrid | None, landmarks: Landmarks) -> TopometricMap:
+    """Return the map of cells without rooms, with landmarks."""
+    none = np.zeros(0, np.int32)
+    rooms, edges, storeys = (np.zeros(0, dtype) for dtype in (ROOM_DTYPE, EDGE_DTYPE, STOREY_DTYPE))
+    labels = np.full(len(grid), -1, np.int32)
+    return TopometricMap(
+        grid, labels, grid.replace_cells(grid.cells[:0]), none, rooms, edges, storeys, free=free, landmarks=landmarks
+    )
+
+
+def measure_pair(file: Path, item: LookalikeItem, readings: Sequence[str]) -> Row:
+    """Register a pair with what readers give of its signs; where one map has none, the verdict is that without landmarks."""
+    pair = load_grids(file)
+    outcomes: list[Row] = []
+    for name in readings:
+        reader = READINGS[name]
+        told = (Landmarks(), Landmarks()) if reader is None else read_lookalike_signs(item, reader)
+        some = min(map(len, told)) > 0
+        alone = next((row for row in outcomes if not min(row["landmarks"])), None)
+        found = alone if alone is not None and not some else _register_pair(pair, told)
+        outcomes.append({**found, "reading": name, "landmarks": [len(t) for t in told]})
+    return {"kind": item.kind, "again": item.again, "tellable": pair.about.get("tellable"), "readings": outcomes}
+
+
+def _register_pair(pair: GridPair, told: tuple[Landmarks, Landmarks]) -> Row:
+    a, b = (build_bare_map(g, f, t) for g, f, t in zip((pair.a, pair.b), pair.free, told, strict=True))
+    with limit_threads():
+        registration = register(a, b)
+    pose: Any = registration.transform
+    sensors: Any = pair.about["sensors"]
+    error = None if pose is None else compute_pose_error(pose, pair)
+    return {
+        "probability": registration.probability,
+        "walls": registration.walls,
+        "believed": registration.accepted,
+        "right": is_hypothesis_right(error, sensors),
+        "said": registration.landmarks.list_sentences(),
+        "factors": {k: dict(f) for k, f in registration.landmarks.factors.items()},
+    }
+
+
+def is_false(row: Row) -> bool:
+    """Is a pair believed at a wrong pose?"""
+    return bool(row["believed"] and not row["right"])
+
+
+def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
+    """Tabulate what is wrongly merged and what is believed of true pairs, all and by kind, for each reading."""
+    out = [_format_line(name, [r for r in rows if r["reading"] == name]) for name in READINGS]
+    lines: list[list[object]] = []
+    for kind in LOOKALIKES:
+        for name in READINGS:
+            mine = [r for r in rows if r["kind"] == kind and r["reading"] == name]
+            lines += [[kind, *_format_line(name, mine)]] if mine else []
+    heads = ("kind", *HEADS)
+    return {"landmarks": write_table(HEADS, [line for line in out if line[1]]) + "\n" + write_table(heads, lines)}
+
+
+def _format_line(name: str, rows: Sequence[Row]) -> list[object]:
+    """A line under `HEADS`."""
+    apart, again = [r for r in rows if not r["again"]], [r for r in rows if r["again"]]
+    wrong, told = sum(map(is_false, apart)), [r for r in apart if min(r["landmarks"])]
+    low, high = compute_exact_interval(wrong, len(apart)) if apart else (0.0, 1.0)
+    good = sum(r["believed"] and r["right"] for r in again)
+    share: Any = f"{100 * good / len(again):.0f}" if again else "–"
+    interval = f"{100 * low:.1f} to {100 * high:.1f} %"
+    return [name, len(apart), wrong, interval, len(told), sum(map(is_false, told)), len(again), good, share]

@@ -1,0 +1,333 @@
+"""What landmarks of two maps say of a pose: one factor a kind over the named alternatives, and which landmarks testify.
+
+Where both maps read something at one place, `likelihood` weighs it. Besides:
+
+- A rare string that both maps read at two places far from each other under the pose speaks for another pose, unless it points
+  there (`POINTS_THERE`).
+- A sign that the other map could have seen and did not read says little (`READS`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from topomerge.landmarks.likelihood import (
+    ALTERNATIVES,
+    GATE,
+    KINDS,
+    READERS,
+    Associated,
+    Kind,
+    associate_sightings,
+    compute_chances,
+    compute_factors,
+    compute_prefix_factors,
+    compute_shares,
+    pick_partners,
+    score_pair,
+)
+from topomerge.landmarks.pressure import score_pressure
+from topomerge.landmarks.radio import score_radio
+from topomerge.landmarks.sightings import Sightings, build_sightings, transform_places
+from topomerge.landmarks.text import quote_text
+from topomerge.types import Array, Deformation, Sim3, TopometricMap
+
+READS = 0.6  # probability that a map that reads as many signs as the other one reads a sign that it could have seen
+MOST_MISSED = 1.0  # log odds that unread signs may cost in all
+POINTS_THERE = 0.1  # probability that a rare string far from its place points there, or was put in a wrong place
+FAR, MOST_FAR = 6.0, 6.0  # m beyond which two places are two, and log odds that such strings may give in all
+RARE = 0.01  # share of the signs, below which a string names one place
+SEEN_WITHIN = 0.6  # m from an occupied cell of the other map: the place is seen
+Bends = tuple[Deformation | None, Deformation | None]
+
+
+@dataclass(frozen=True)
+class Witness:
+    """Two landmarks that say something of a pose together.
+
+    Args:
+        kind: of `KINDS`.
+        values: what stands in map a and in map b.
+        rows: of the tables of both.
+        at: place in the frame of each map, m.
+        verdict: "agrees", "contradicts", or "elsewhere": the same string, far away.
+    """
+
+    kind: str
+    values: tuple[str, str]
+    rows: tuple[int, int]
+    at: tuple[tuple[float, ...], tuple[float, ...]]
+    verdict: str
+
+    def inverse(self) -> Witness:
+        """The same with the maps the other way round."""
+        return replace(self, values=self.values[::-1], rows=self.rows[::-1], at=self.at[::-1])
+
+
+@dataclass(frozen=True)
+class LandmarkEvidence:
+    """What landmarks say of a pose.
+
+    Args:
+        factors: kind -> alternative -> log of how many times as likely as by chance what was read is.
+        witnesses: landmarks that agree, contradict, or stand elsewhere.
+    """
+
+    factors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    witnesses: tuple[Witness, ...] = ()
+
+    @property
+    def support(self) -> float:
+        """Log odds of this place against one that has nothing to do with it."""
+        return sum(f["here"] - f["outside"] for f in self.factors.values())
+
+    def compute_likelihoods(self) -> dict[str, float]:
+        """Log-likelihood ratio of each alternative against this place, of all kinds."""
+        return {name: sum(f[name] - f["here"] for f in self.factors.values()) for name in ALTERNATIVES}
+
+    def apply(self, posterior: Mapping[str, float], rivals: Sequence[tuple[float, LandmarkEvidence]] = ()) -> dict[str, float]:
+        """Return the posterior over `ALTERNATIVES` after what landmarks say, one factor a kind.
+
+        Args:
+            rivals: other poses, each with its share among them and what landmarks say of it: what "elsewhere" may be.
+        """
+        ratios = self.compute_likelihoods()
+        own = sum(f["here"] for f in self.factors.values())
+        named = [float(np.log(share / 2)) + sum(f["here"] for f in e.factors.values()) - own for share, e in rivals if share > 0]
+        if named:
+            ratios["elsewhere"] = float(np.logaddexp(ratios["elsewhere"] - np.log(2), max(named)))
+        highest = max((ratios[name] for name in ALTERNATIVES if posterior[name] > 0), default=0.0)
+        weight = {name: posterior[name] * float(np.exp(ratios[name] - highest)) for name in ALTERNATIVES}
+        total = sum(weight.values())
+        return {name: w / total for name, w in weight.items()} if total > 0 else dict(posterior)
+
+    def inverse(self) -> LandmarkEvidence:
+        """The same with the maps the other way round."""
+        return replace(self, witnesses=tuple(w.inverse() for w in self.witnesses))
+
+    def list_sentences(self) -> list[str]:
+        """What agrees and what contradicts, a sentence a kind."""
+        return [s for kind in self.factors if (s := describe_witnesses(kind, [w for w in self.witnesses if w.kind == kind]))]
+
+    def serialise(self) -> dict[str, Any]:
+        """As plain values, for merge.json."""
+        return {
+            "factors": {kind: {name: round(v, 4) for name, v in f.items()} for kind, f in self.factors.items()},
+            "sentences": self.list_sentences(),
+            "witnesses": [
+                {"kind": w.kind, "verdict": w.verdict, "values": list(w.values), "rows": list(w.rows),
+                 "at": [[None if v != v else round(v, 2) for v in at] for at in w.at]}
+                for w in self.witnesses
+            ],
+        }  # fmt: skip
+
+
+def describe_witnesses(kind: str, witnesses: Sequence[Witness], shown: int = 3) -> str:
+    """Describe the landmarks of a kind: "signs 2.113 and 2.114 agree; nothing contradicts"; nothing where none testifies."""
+    words = KINDS[kind].words if kind in KINDS else kind
+    agree, against, away = ([w for w in witnesses if w.verdict == v] for v in ("agrees", "contradicts", "elsewhere"))
+    if not (agree or against or away):
+        return ""
+
+    def name(listed: Sequence[Witness]) -> str:
+        quoted = list(dict.fromkeys(quote_text(w.values[0]) for w in listed))
+        if len(quoted) > shown:
+            return f"{', '.join(quoted[:shown])} and {len(quoted) - shown} more"
+        return " and ".join(filter(None, [", ".join(quoted[:-1]), quoted[-1]]))
+
+    parts = []
+    if agree:
+        parts.append(f"{words}{'s' * (len(agree) > 1)} {name(agree)} agree{'s' * (len(agree) == 1)}")
+    if against:
+        pairs = ", ".join(f"{quote_text(w.values[0])} against {quote_text(w.values[1])}" for w in against[:shown])
+        more = f" and {len(against) - shown} more" if len(against) > shown else ""
+        parts.append(f"{words}s contradict: {pairs}{more}")
+    elif agree:
+        parts.append("nothing contradicts")
+    if away:
+        parts.append(f"{words}{'s' * (len(away) > 1)} {name(away)} stand{'s' * (len(away) == 1)} elsewhere in the other map")
+    return "; ".join(parts)
+
+
+class LandmarkScorer:
+    """Scores poses of two maps by their landmarks; what is the same under each pose is computed once."""
+
+    def __init__(self, a: TopometricMap, b: TopometricMap) -> None:
+        self.a, self.b = a, b
+
+    @cached_property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds that both maps have."""
+        return tuple(kind for kind in SCORES if all(SCORES[kind].asks(m) for m in (self.a, self.b)))
+
+    @cached_property
+    def sightings(self) -> dict[str, tuple[Sightings, Sightings]]:
+        """Of each kind of `KINDS` that both maps have."""
+        of = {k: KINDS[k].kinds for k in self.kinds if k in KINDS}
+        return {kind: (build_sightings(self.a, kinds), build_sightings(self.b, kinds)) for kind, kinds in of.items()}
+
+    @cached_property
+    def trees(self) -> tuple[cKDTree, cKDTree]:
+        """The occupied cells of both maps, to ask what each has seen; of large maps every so many."""
+        grids = [m.grid.compute_centroids() for m in (self.a, self.b)]
+        return tuple(cKDTree(c[:: max(len(c) // 100_000, 1)]) for c in grids)  # type: ignore[return-value]
+
+    def score(self, pose: Sim3, bends: Bends = (None, None)) -> LandmarkEvidence:
+        """Return what landmarks say of T_ab, of maps that are bent first."""
+        factors, witnesses = {}, []
+        for kind in self.kinds:
+            factor, seen = SCORES[kind].score(self, pose, bends)
+            if any(factor.values()):
+                factors[kind] = factor
+                witnesses += seen
+        return LandmarkEvidence(factors, tuple(witnesses))
+
+
+def score_landmarks(
+    a: TopometricMap,
+    b: TopometricMap,
+    pose_b_to_a: Sim3,
+    bends: Bends = (None, None),
+) -> LandmarkEvidence:
+    """Return what the landmarks of two maps say of where map b lies in map a.
+
+    Args:
+        a, b: maps with landmarks; of kinds that only one has nothing is said.
+        pose_b_to_a: T_ab.
+        bends: how each map is bent in its own frame before.
+    """
+    return LandmarkScorer(a, b).score(pose_b_to_a, bends)
+
+
+def score_sightings(scorer: LandmarkScorer, pose: Sim3, bends: Bends, kind: str) -> tuple[dict[str, float], list[Witness]]:
+    """Score landmarks that stand somewhere and say something: signs, tags, names and objects."""
+    a, b = scorer.sightings[kind]
+    rules = KINDS[kind]
+    if not len(a) or not len(b):
+        return dict.fromkeys(ALTERNATIVES, 0.0), []
+    at = [s.position if bend is None else transform_places(bend.apply, s.position) for s, bend in zip((a, b), bends, strict=True)]
+    at[1] = transform_places(pose.apply, at[1])
+    met = associate_sightings(a, b, at, pose, kind)
+    met = pick_partners(a, b, met, rules, kind)
+    factors = compute_factors(a, b, met, rules, kind)
+    if kind == "text":
+        prefixes = compute_prefix_factors(a, b, met, at)
+        factors = {name: v + prefixes[name] for name, v in factors.items()}
+    far = find_far_partners(a, b, at, met, kind)
+    factors["elsewhere"] += min(len(far) * float(-np.log(POINTS_THERE)), MOST_FAR)
+    missed = count_missed(scorer, at, met, pose, (a, b)) if kind == "text" else 0.0
+    for name in ("elsewhere", "building", "outside"):
+        factors[name] += missed
+    if rules.least > -np.inf:
+        factors["here"] = max(factors["here"], rules.least)
+    return factors, _list_witnesses(a, b, met, far, rules, kind)
+
+
+def find_far_partners(a: Sightings, b: Sightings, at: Sequence[Array], met: Associated, kind: str) -> list[tuple[int, int]]:
+    """Find rare strings that stand once in each map, at places that are far from each other under the pose."""
+    if kind not in ("text", "tag"):
+        return []
+    used = set(met.pairs[:, 0].tolist()), set(met.pairs[:, 1].tolist())
+    once = []
+    for s in (a, b):
+        count: dict[str, int] = {}
+        for key in s.keys:
+            count[key] = count.get(key, 0) + 1
+        once.append({key: k for k, key in enumerate(s.keys) if count[key] == 1 and (kind == "tag" or s.share[k] < RARE)})
+    far = []
+    for key in sorted(once[0].keys() & once[1].keys()):
+        i, j = once[0][key], once[1][key]
+        away = float(np.hypot(*(at[0][i] - at[1][j])[:2]))
+        if i not in used[0] and j not in used[1] and away > FAR + GATE * (a.sigma[i] + b.sigma[j]):
+            far.append((i, j))
+    return far
+
+
+def count_missed(
+    scorer: LandmarkScorer, at: Sequence[Array], met: Associated, pose: Sim3, sightings: tuple[Sightings, Sightings]
+) -> float:
+    """Return the log odds for a place that has nothing to do with this one of signs that one map read and the other one could
+    have seen and did not, as `READS` has it of maps that read equally many signs on equally large a map."""
+    density = [len(s) / max(len(m.grid), 1) for s, m in zip(sightings, (scorer.a, scorer.b), strict=True)]
+    back, total = pose.inverse(), 0.0
+    for side in (0, 1):
+        own, other = sightings[side], 1 - side
+        free = np.setdiff1d(np.flatnonzero((own.sigma <= 1.0) & ~own.named & np.isfinite(at[side][:, 2])), met.pairs[:, side])
+        if not len(free):
+            continue
+        places = at[side][free] if other == 0 else back.apply(at[side][free])
+        seen = float((scorer.trees[other].query(places)[0] <= SEEN_WITHIN).sum())
+        reads = READS * min(density[other] / density[side], 1.0)
+        total += seen * float(np.log((1 - reads / 3) / (1 - reads)))
+    return min(total, MOST_MISSED)
+
+
+def _list_witnesses(
+    a: Sightings, b: Sightings, met: Associated, far: Sequence[tuple[int, int]], rules: Kind, kind: str
+) -> list[Witness]:
+    share, keys = compute_shares(a, b, met.pairs), [(a.keys[i], b.keys[j]) for i, j in met.pairs.tolist()]
+    numbers = a.numbered[met.pairs[:, 0]] & b.numbered[met.pairs[:, 1]]
+    chance = np.clip(compute_chances(a, b, met.pairs, keys, numbers) / share, 1.0, rules.most)
+    out = []
+    for k, (i, j) in enumerate(met.pairs.tolist()):
+        times = sum(weight * score_pair(*keys[k], error, kind) / share[k] for error, weight in READERS)
+        sure = max(a.sigma[i], b.sigma[j]) <= rules.surest
+        if met.turned[k] or (sure and times < chance[k] / 2):
+            out.append(_build_witness(a, b, i, j, kind, "contradicts"))
+        elif times > 2 * (1.0 if keys[k][0] == keys[k][1] else chance[k]):
+            out.append(_build_witness(a, b, i, j, kind, "agrees"))
+    return out + [_build_witness(a, b, i, j, kind, "elsewhere") for i, j in far]
+
+
+def _build_witness(a: Sightings, b: Sightings, i: int, j: int, kind: str, verdict: str) -> Witness:
+    at = tuple(a.position[i].tolist()), tuple(b.position[j].tolist())
+    return Witness(kind, (a.values[i], b.values[j]), (int(a.rows[i]), int(b.rows[j])), at, verdict)
+
+
+Score = Callable[[LandmarkScorer, Sim3, Bends], tuple[dict[str, float], list[Witness]]]
+
+
+@dataclass(frozen=True)
+class Testimony:
+    """How landmarks of a kind are scored.
+
+    Args:
+        asks: has a map any of the kind?
+        score: scorer, T_ab and how the maps are bent -> log-likelihood of each alternative, and the landmarks that testify.
+    """
+
+    asks: Callable[[TopometricMap], bool]
+    score: Score
+
+
+def _build_testimony(kind: str) -> Testimony:
+    def score(scorer: LandmarkScorer, pose: Sim3, bends: Bends) -> tuple[dict[str, float], list[Witness]]:
+        return score_sightings(scorer, pose, bends, kind)
+
+    return Testimony(lambda map: bool(map.landmarks.is_kind(*KINDS[kind].kinds).any()), score)
+
+
+def score_radio_testimony(scorer: LandmarkScorer, pose: Sim3, bends: Bends) -> tuple[dict[str, float], list[Witness]]:
+    """Score readings of radio, against another building's, which say the same under every pose."""
+    return _compare_with_building(score_radio(scorer.a, scorer.b, pose)), []
+
+
+def score_pressure_testimony(scorer: LandmarkScorer, pose: Sim3, bends: Bends) -> tuple[dict[str, float], list[Witness]]:
+    """Score readings of air pressure."""
+    return _compare_with_building(score_pressure(scorer.a, scorer.b, pose)), []
+
+
+def _compare_with_building(scores: Mapping[str, float]) -> dict[str, float]:
+    return {name: scores[name] - scores["building"] for name in ALTERNATIVES}
+
+
+SCORES = {kind: _build_testimony(kind) for kind in KINDS} | {
+    "radio": Testimony(lambda map: bool(map.landmarks.is_kind("radio").any()), score_radio_testimony),
+    "pressure": Testimony(lambda map: bool(map.landmarks.is_kind("pressure").any()), score_pressure_testimony),
+}  # a further kind is a line here
