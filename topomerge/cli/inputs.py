@@ -327,7 +327,7 @@ def _work(connection: Connection[Any, Any], options: argparse.Namespace, shows_p
 
 
 def _share_cores(processes: int) -> None:
-    """Leave the compiled loops of each process its share of the cores: threads that wait for a core wait busily."""
-    import numba
+    """Leave the compiled loops of each process its share of the cores."""
+    from topomerge.kernels import count_threads, set_thread_count
 
-    numba.set_num_threads(max(numba.get_num_threads() // processes, 1))
+    set_thread_count(count_threads() // processes)

@@ -126,7 +126,7 @@ def measure(
     points = into.scale * (pieces.walls[every] - about)
     sector = target.find_sectors(pieces.faces[every] @ turn.T)
     placed = pieces.anchors[chosen] + moves[chosen, :2]
-    places = into.apply(np.column_stack([placed, np.zeros(len(placed))]))[:, :2]
+    places = np.ascontiguousarray(into.apply(np.column_stack([placed, np.zeros(len(placed))]))[:, :2])
     shift = window.shift * into.scale
     step = max(shift / 8, SHIFT_STEP)
     shifts = np.arange(-np.round(shift / step), np.round(shift / step) + 1) * step
@@ -186,7 +186,7 @@ def build_wall_lines(fields: PlanFields, middles: Array) -> WallLines:
     """
     plan = fields.plan
     row = np.full(plan.wall.shape, -1, np.int32)
-    columns = np.argwhere(plan.wall)
+    columns = np.ascontiguousarray(np.argwhere(plan.wall))
     row[plan.wall] = np.arange(len(columns))
     cells = np.floor((middles[:, :2] - plan.origin) / plan.edge + 1e-6).astype(np.int64)
     inside = ((cells >= 0) & (cells < row.shape)).all(axis=1)
@@ -225,7 +225,7 @@ def measure_lines(
     start = np.searchsorted(owner[rows], np.append(chosen, chosen[-1] + 1))
     points = into.scale * (lines.points[rows] - pieces.anchors[owner[rows]])
     placed = pieces.anchors[chosen] + moves[chosen, :2]
-    places = into.apply(np.column_stack([placed, np.zeros(len(placed))]))[:, :2]
+    places = np.ascontiguousarray(into.apply(np.column_stack([placed, np.zeros(len(placed))]))[:, :2])
     straight = np.where(target.straight, np.arange(len(target.points)), -1).astype(np.int32)
     row = np.where(target.row >= 0, straight[target.row], -1)
     h, g, partners, sums = build_line_equations(
