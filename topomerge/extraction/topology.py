@@ -57,11 +57,11 @@ def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceilin
     a[swap], b[swap] = b[swap], a[swap]
     edges: list[tuple[Any, ...]] = []
     pair = room[a].astype(np.int64) * (int(room.max(initial=0)) + 1) + room[b]
-    order = np.argsort(pair, kind="stable")
+    order, near = np.argsort(pair, kind="stable"), build_sphere(2.5 * navigable.edge, navigable.edge)
     for contacts in np.split(order, np.flatnonzero(np.diff(pair[order])) + 1) if len(order) else []:
         rows = np.unique(np.concatenate([a[contacts], b[contacts]]))
         meeting = navigable.select_cells(rows)
-        contact = label_components(meeting, build_sphere(2.5 * navigable.edge, navigable.edge))
+        contact = label_components(meeting, near)
         parts = [rows[contact == c] for c in range(int(contact.max()) + 1)]
         passages = [_edge(navigable, room, part, storey_of_room, floor_to_ceiling, body) for part in parts]
         edges += _select_distinct_doors(passages)

@@ -147,10 +147,10 @@ def _locate_cell(points, i, shift, edge):  # type: ignore[no-untyped-def]  # pra
     )
 
 
-@compile_ahead("f4[:,::1], i8, f8[::1], f8, i8", error_model="numpy")
-def _locate_part(points, i, shift, edge, axis):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Which of the `OFFSET_STEPS` parts of its cell the finite point i lies in, along an axis: exact: a power of 2."""
-    return np.int64(np.floor((points[i, axis] + shift[axis]) / edge * OFFSET_STEPS)) & (OFFSET_STEPS - 1)
+@compile_ahead("f8", error_model="numpy")
+def _find_part(place):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Which of the `OFFSET_STEPS` parts of its cell a place, in cells, lies in: exact: a power of 2."""
+    return np.int64(np.floor(place * OFFSET_STEPS)) & (OFFSET_STEPS - 1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -161,7 +161,7 @@ def convert_to_lattice(points, shift, edge, out, parts):  # type: ignore[no-unty
         if finite:
             out[i, 0], out[i, 1], out[i, 2] = x, y, z
             for k in range(3):
-                parts[i, k] = _locate_part(points, i, shift, edge, k)
+                parts[i, k] = _find_part((points[i, k] + shift[k]) / edge)
         else:
             out[i, 0] = out[i, 1] = out[i, 2] = np.iinfo(np.int64).min
 
@@ -189,13 +189,15 @@ def count(points, shift, edge, base, table, counts, places):  # type: ignore[no-
     """Second pass: points in each cell of the bricks in use; of each point where in `counts` (flat) it is counted (-1 nowhere),
     with the parts of its cell in the 24 lowest bits."""
     for i in range(len(points)):
-        finite, x, y, z = _locate_cell(points, i, shift, edge)
-        if finite:
-            cx, cy, cz = x - base[0], y - base[1], z - base[2]
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if np.isfinite(x) and np.isfinite(y) and np.isfinite(z):
+            u, v, w = (x + shift[0]) / edge, (y + shift[1]) / edge, (z + shift[2]) / edge
+            cx, cy, cz = np.int64(np.floor(u)) - base[0], np.int64(np.floor(v)) - base[1], np.int64(np.floor(w)) - base[2]
             at = (np.int64(table[cx >> 3, cy >> 3, cz >> 3]) << 9) + _encode_place(cx, cy, cz)
             counts[at] += 1
-            for k in range(3):
-                at = (at << 8) | _locate_part(points, i, shift, edge, k)
+            at = (at << 8) | _find_part(u)
+            at = (at << 8) | _find_part(v)
+            at = (at << 8) | _find_part(w)
             places[i] = at
         else:
             places[i] = -1

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES, INSIDE_CLASS, StoreyPlan
-from topomerge.networks.network import Network, Run, Signature, Tensor, load_network, load_shipped_network
+from topomerge.networks.network import Network, Run, Signature, Tensor, load_network, load_shipped_network, run_side_by_side
 from topomerge.types import Array
 
 PLAN_NETWORK_FILE = "plan_network.onnx"
@@ -86,8 +86,11 @@ def compute_column_probabilities(plan: StoreyPlan, network: Run | None = None) -
 
 def _average_turns(x: Array, network: Run) -> Array:
     """(nx, ny, 5) mean probability over (11, nx, ny) evidence turned by quarters."""
-    turned = (run_network(np.rot90(x, k, (1, 2)), network) for k in range(4))
-    mean: Array = np.mean([np.rot90(probability, -k, (1, 2)) for k, probability in enumerate(turned)], axis=0)
+
+    def look(k: int) -> Array:
+        return np.rot90(run_network(np.rot90(x, k, (1, 2)), network), -k, (1, 2))
+
+    mean: Array = np.mean(run_side_by_side(look, range(4)), axis=0)
     return np.moveaxis(mean, 0, -1)
 
 
