@@ -264,7 +264,7 @@ def _run_parallel(tasks: Iterable[Task], sharing: BuildSettings, work: Work) -> 
 
 @contextmanager
 def _configure_backend(sharing: BuildSettings) -> Iterator[None]:
-    """Where joblib works: processes started afresh (never forked: numba's threads don't survive that), or a cluster."""
+    """Where joblib works: processes started afresh (never forked: threads and locks don't survive that), or a cluster."""
     from joblib import parallel_config
 
     if sharing.cluster is None:

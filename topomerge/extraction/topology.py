@@ -245,8 +245,11 @@ def _find_middle_cell(first: Array, second: Array, way: Array) -> Array | None:
 
 def _across(free: Array, clearance: Array, saddle: Array, low: Array) -> tuple[Array, Array, float]:
     """Middle, direction and width of the passage at `saddle`: from its nearest wall straight to the one opposite."""
-    _, nearest = ndimage.distance_transform_edt(np.pad(free, 1), return_indices=True)
-    wall = nearest[:, saddle[0] + 1, saddle[1] + 1] - 1
+    reach = int(np.ceil(clearance[tuple(saddle)])) + 1  # within which the nearest wall lies
+    low_corner = np.maximum(saddle + 1 - reach, 0)
+    around = np.pad(free, 1)[low_corner[0] : saddle[0] + reach + 2, low_corner[1] : saddle[1] + reach + 2]
+    _, nearest = ndimage.distance_transform_edt(around, return_indices=True)
+    wall = nearest[:, *(saddle + 1 - low_corner)] + low_corner - 1
     along = (wall - saddle) / max(float(np.linalg.norm(wall - saddle)), 1e-9)
     ends = []
     for sign in (1.0, -1.0):

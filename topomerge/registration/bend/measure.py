@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from topomerge.kernels import run_in_slices
 from topomerge.kernels.bend import build_line_equations, compute_wall_gain, estimate_line_normals, score_moves
 from topomerge.matching.poses import DISTANCE_CAP, PlanFields, compute_distance
 from topomerge.registration.bend.pieces import Pieces
@@ -132,9 +133,14 @@ def measure(
     shifts = np.arange(-np.round(shift / step), np.round(shift / step) + 1) * step
     yaws = np.linspace(-window.turn, window.turn, TURNS)
     gain, origin = target.compute_gain(window.sigma)
-    scores = score_moves(
-        points, sector, firsts, places, into.yaw + moves[chosen, 2], yaws, shifts, gain, origin, target.fields.plan.edge
-    )
+    turns, edge = into.yaw + moves[chosen, 2], target.fields.plan.edge
+
+    def score(first: int, last: int) -> Array:
+        of, ends = slice(first, last), firsts[first : last + 1]
+        scores: Array = score_moves(points, sector, ends, places[of], turns[of], yaws, shifts, gain, origin, edge)
+        return scores
+
+    scores = np.concatenate(run_in_slices(score, len(chosen), 1))
     mean, information = _fit_gaussian(scores, shifts, yaws)
     back = np.eye(3)
     back[:2, :2] = turn.T / into.scale
