@@ -65,7 +65,7 @@ def compile_missing(cache: Path, processes: int) -> None:
         with _lock(cache / f"{NOTE}.lock"):
             if _read(note) == state:
                 return
-            _log.warning("compiling the inner loops, once on this machine: about 25 s of one core")
+            _log.warning("compiling the inner loops, once on this machine: about 25 s of a core")
             if _run_workers(processes):
                 note.write_text(state, encoding="ascii")
     except OSError:
