@@ -18,6 +18,7 @@ setup: .venv/ready
 	$(PIP) --upgrade pip
 	$(PIP) --constraint constraints.txt torch==2.13.0 $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX))
 	$(PIP) --constraint constraints.txt --editable '.[all,dev]'
+	$(BIN)/python -c 'import topomerge.kernels'
 	@touch $@
 
 # Under five minutes on two cores: two scans merged; then a small embedder trained, judged on buildings that it never saw, exported.

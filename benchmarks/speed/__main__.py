@@ -11,6 +11,8 @@ from typing import Any
 
 SMALL: dict[str, dict[str, Any]] = {
     "start": {"repeat": 1, "commands": 1},
+    "first_merge": {},
+    "whole": {"pairs": 1, "repeat": 1},
     "voxelise": {"points": 200_000},
     "visibility": {"points": 200_000, "views": 5},
     "octree_queries": {"queries": 50, "radii": (0.2,)},

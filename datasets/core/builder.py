@@ -140,17 +140,18 @@ def read_refusal(folder: Path, name: str) -> str:
 
 @contextmanager
 def limit_threads() -> Iterator[None]:
-    """Keep BLAS, OpenMP and numba to one thread."""
-    import numba
+    """Keep BLAS, OpenMP and the compiled loops to one thread."""
     from threadpoolctl import threadpool_limits
 
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
+    from topomerge.kernels import count_threads, set_thread_count
+
+    threads = count_threads()
+    set_thread_count(1)
     try:
         with threadpool_limits(1):
             yield
     finally:
-        numba.set_num_threads(threads)
+        set_thread_count(threads)
 
 
 @contextmanager
@@ -262,7 +263,7 @@ def _run_parallel(tasks: Iterable[Task], sharing: BuildSettings, work: Work) -> 
 
 @contextmanager
 def _configure_backend(sharing: BuildSettings) -> Iterator[None]:
-    """Where joblib works: processes started afresh (never forked: numba's threads don't survive that), or a cluster."""
+    """Where joblib works: processes started afresh (never forked: threads and locks don't survive that), or a cluster."""
     from joblib import parallel_config
 
     if sharing.cluster is None:

@@ -1,8 +1,8 @@
 """The maps that the inputs of a command stand for: read from a .tmap, or extracted from anything else, large ones side by side.
 
 Extraction holds the interpreter's lock for most of its time, so that threads gain nothing: each core has a process of its own.
-They are spawned, as GNU OpenMP refuses forked ones. A started process imports for about a second before it works: small clouds
-are extracted here.
+They are spawned, as locks and threads do not survive a fork. A started process imports for about a second before it works: small
+clouds are extracted here.
 """
 
 from __future__ import annotations
@@ -327,7 +327,7 @@ def _work(connection: Connection[Any, Any], options: argparse.Namespace, shows_p
 
 
 def _share_cores(processes: int) -> None:
-    """Leave the compiled loops of each process its share of the cores: threads that wait for a core wait busily."""
-    import numba
+    """Leave the compiled loops of each process its share of the cores."""
+    from topomerge.kernels import count_threads, set_thread_count
 
-    numba.set_num_threads(max(numba.get_num_threads() // processes, 1))
+    set_thread_count(count_threads() // processes)

@@ -20,6 +20,7 @@ from topomerge.extraction.navigable import add_crossed_cells, compute_navigable_
 from topomerge.extraction.parameters import DefaultParameters, Parameters, ThesisParameters, resolve_parameters
 from topomerge.extraction.plans.part_rooms import PartRooms
 from topomerge.extraction.plans.passages import Pair, Passage, compute_door_features, predict_door, sort_pair
+from topomerge.extraction.plans.plan_network import LOOKS
 from topomerge.extraction.plans.storey_floor import build_floor
 from topomerge.extraction.plans.storey_plan import Floor
 from topomerge.extraction.scan import Scan, read_scan
@@ -50,6 +51,7 @@ SCORE_INPUTS = ("constant", "plan", "shown")
 KINDS = ("walls",)  # of scans that have a model: walls show at heights
 PASSAGES_FILE = "passages.json"
 MOST_LOG_ODDS = 8.0
+JOINED_LOOKS = 1  # at the plan of joined maps: their rooms were cut by four looks each, and have a say (docs/adr/0031)
 
 
 def find_passages(storeys: Sequence[SegmentedStorey], walls: StoreyWalls | None, weigh: bool = True) -> list[SegmentedStorey]:
@@ -248,7 +250,8 @@ def gather_evidence(
 ) -> Evidence:
     """Cut the storeys into too many segments rather than too few, and gather what speaks for doors between them."""
     watch.begin("segments", 0.4)
-    rasters, places = rasterise_storeys(scan, navigable, p.standing_height), scan.places
+    looks = JOINED_LOOKS if parts else LOOKS
+    rasters, places = rasterise_storeys(scan, navigable, p.standing_height, looks), scan.places
     narrow = min(p.narrow, p.slice_door if scan.flat else p.door)
     storeys = [segment_storey(rasters, i, narrow, parts, places) for i in range(len(rasters.numbers))]
     watch.begin("walls", 0.6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from topomerge.errors import InputError
 from topomerge.extraction.cleaning import COARSEST_CELL, coarsen_until_dense
 from topomerge.extraction.levelling import LevelledChunks
 from topomerge.extraction.voxels import LatticeCells, voxelise
+from topomerge.kernels import count_threads
 from topomerge.types import Array, Landmarks, PointCloud, VoxelGrid, join_landmarks
 
 FINEST_CELL = 0.02  # m
@@ -146,6 +148,24 @@ class _Chunks:
         self._step = 1  # of the rays, every one or every second, fourth ... is held
 
     def __iter__(self) -> Iterator[PointCloud]:
+        """Yield the chunks; the fine cells of one are found in a thread while it is used and the next one is read."""
+        if self.fine is None or count_threads() == 1:
+            for chunk in self._take_in():
+                if self.fine is not None:
+                    self.fine.add(chunk)
+                yield chunk
+            return
+        with ThreadPoolExecutor(1) as beside:
+            before: Future[None] | None = None
+            for chunk in self._take_in():
+                if before is not None:
+                    before.result()
+                before = beside.submit(self.fine.add, chunk)
+                yield chunk
+            if before is not None:
+                before.result()
+
+    def _take_in(self) -> Iterator[PointCloud]:
         for chunk in self.chunks:
             if not isinstance(chunk, PointCloud):
                 kind = type(chunk).__name__
@@ -156,8 +176,6 @@ class _Chunks:
             self.landmarks += [] if chunk.landmarks is None else [chunk.landmarks]
             if chunk.poses is not None and chunk.pose_of is not None and len(chunk):
                 self._add_rays(*_select_rays(chunk, chunk.poses, chunk.pose_of))
-            if self.fine is not None:
-                self.fine.add(chunk)
             yield chunk
 
     def _add_rays(self, starts: Array, ends: Array) -> None:

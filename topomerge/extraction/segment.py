@@ -25,7 +25,7 @@ from topomerge.extraction.plans.passages import (
     sort_pair,
 )
 from topomerge.extraction.plans.plan import build_storey_plan, locate_columns, remove_upper_sides
-from topomerge.extraction.plans.plan_network import compute_column_probabilities, load_weights, remove_furniture
+from topomerge.extraction.plans.plan_network import LOOKS, compute_column_probabilities, load_weights, remove_furniture
 from topomerge.extraction.plans.storey_plan import ClassifiedStorey, StoreyPlan
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.slices import is_raised
@@ -105,12 +105,13 @@ class SegmentedStorey:
         return np.append(at, self.plan.floor[passage.place])
 
 
-def rasterise_storeys(scan: Scan, navigable: VoxelGrid, standing_height: float) -> RasterisedStoreys:
+def rasterise_storeys(scan: Scan, navigable: VoxelGrid, standing_height: float, looks: int = LOOKS) -> RasterisedStoreys:
     """Detect the storeys and draw each of them once, with what probably stands in its columns.
 
     Args:
         navigable: the navigable volume.
         standing_height: m, whatever is lower than this above the floor is no ceiling.
+        looks: of the network at each plan.
     """
     grid = scan.grid
     storeys, storey = find_storeys(navigable, measure_floor_to_ceiling(grid, navigable, standing_height))
@@ -121,7 +122,7 @@ def rasterise_storeys(scan: Scan, navigable: VoxelGrid, standing_height: float) 
     plans, probabilities = [], []
     for k in numbers:
         plan = build_storey_plan(coarse, floor, of_coarse, k, scan.crossed)
-        probability = compute_column_probabilities(plan, load_weights(raised))
+        probability = compute_column_probabilities(plan, load_weights(raised), looks)
         plans.append(remove_furniture(plan, probability))
         probabilities.append(probability)
     return RasterisedStoreys(coarse, storeys, storey, factor, tuple(numbers), tuple(plans), tuple(probabilities))

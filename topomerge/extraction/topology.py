@@ -57,11 +57,11 @@ def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceilin
     a[swap], b[swap] = b[swap], a[swap]
     edges: list[tuple[Any, ...]] = []
     pair = room[a].astype(np.int64) * (int(room.max(initial=0)) + 1) + room[b]
-    order = np.argsort(pair, kind="stable")
+    order, near = np.argsort(pair, kind="stable"), build_sphere(2.5 * navigable.edge, navigable.edge)
     for contacts in np.split(order, np.flatnonzero(np.diff(pair[order])) + 1) if len(order) else []:
         rows = np.unique(np.concatenate([a[contacts], b[contacts]]))
         meeting = navigable.select_cells(rows)
-        contact = label_components(meeting, build_sphere(2.5 * navigable.edge, navigable.edge))
+        contact = label_components(meeting, near)
         parts = [rows[contact == c] for c in range(int(contact.max()) + 1)]
         passages = [_edge(navigable, room, part, storey_of_room, floor_to_ceiling, body) for part in parts]
         edges += _select_distinct_doors(passages)
@@ -245,8 +245,11 @@ def _find_middle_cell(first: Array, second: Array, way: Array) -> Array | None:
 
 def _across(free: Array, clearance: Array, saddle: Array, low: Array) -> tuple[Array, Array, float]:
     """Middle, direction and width of the passage at `saddle`: from its nearest wall straight to the one opposite."""
-    _, nearest = ndimage.distance_transform_edt(np.pad(free, 1), return_indices=True)
-    wall = nearest[:, saddle[0] + 1, saddle[1] + 1] - 1
+    reach = int(np.ceil(clearance[tuple(saddle)])) + 1  # within which the nearest wall lies
+    low_corner = np.maximum(saddle + 1 - reach, 0)
+    around = np.pad(free, 1)[low_corner[0] : saddle[0] + reach + 2, low_corner[1] : saddle[1] + reach + 2]
+    _, nearest = ndimage.distance_transform_edt(around, return_indices=True)
+    wall = nearest[:, *(saddle + 1 - low_corner)] + low_corner - 1
     along = (wall - saddle) / max(float(np.linalg.norm(wall - saddle)), 1e-9)
     ends = []
     for sign in (1.0, -1.0):

@@ -12,7 +12,7 @@ import numpy as np
 
 from topomerge.extraction.cleaning import compute_cell_means
 from topomerge.kernels import registration as kernel
-from topomerge.kernels import voxels
+from topomerge.kernels import run_in_slices, voxels
 from topomerge.kernels.voxels import build, find_filled_cells
 from topomerge.types import Array, Placement, Sim3, VoxelGrid
 from topomerge.types.placement import BETWEEN_STOREYS, Deformation
@@ -24,6 +24,7 @@ FILLED_WEIGHT = 0.01  # of the points of a cell where they only fill a neighbour
 CODE_OFFSET = 1 << 20  # cells are counted from there, as Morton codes hold no negative ones
 COPY_REACH = 0.25  # m between a wall and its copy, at most
 AROUND = 8  # cells about the walls, of which free ones are asked for
+LEAST_CELLS = 4096  # that a thread looks at
 Seen = tuple[Array, Array]
 
 
@@ -61,7 +62,14 @@ def _find_filled_cells(grid: VoxelGrid, chosen: slice, placement: Placement, ori
     back = pose.inverse().matrix
     matrix = np.column_stack([back[:3, :3] * edge, back[:3, :3] @ origin + back[:3, 3] - grid.origin]) / grid.edge
     slack = SLACK if len(local) else 0.0
-    cells, rows = find_filled_cells(grid.cells[chosen], holding, matrix, local, slack, int(wide + 0.5), int(ratio / 2 + 0.5))
+    own, reach = grid.cells[chosen], (int(wide + 0.5), int(ratio / 2 + 0.5))
+
+    def fill(first: int, last: int) -> tuple[Array, Array]:
+        of = slice(first, last)
+        cells, rows = find_filled_cells(own[of], holding[of], matrix, local[of], slack, *reach)
+        return cells, rows + first
+
+    cells, rows = (np.concatenate(part) for part in zip(*run_in_slices(fill, len(own), LEAST_CELLS), strict=True))
     return np.concatenate([cells, holding]), np.concatenate([rows, np.arange(len(holding))]) + chosen.start
 
 
@@ -144,7 +152,13 @@ def find_wall_copies(first: Seen, second: Seen, edge: float) -> Array:
     high = np.maximum(first[0].max(axis=0), second[0].max(axis=0)) + AROUND + 1 - low
     tables = [_build_table(cells - low, high) for cells in (first[0], second[0])]
     tables += [_build_table(cells - low // 2, high // 2 + 1) for cells in (first[1], second[1])]
-    return kernel.find_copied_cells(np.ascontiguousarray(second[0] - low), offsets, *tables)
+    cells = np.ascontiguousarray(second[0] - low)
+
+    def find(first: int, last: int) -> Array:
+        copies: Array = kernel.find_copied_cells(cells[first:last], offsets, *tables)
+        return copies
+
+    return np.concatenate(run_in_slices(find, len(cells), LEAST_CELLS))
 
 
 def _build_table(cells: Array, size: Array) -> tuple[Array, Array]:

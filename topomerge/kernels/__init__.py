@@ -2,6 +2,10 @@
 
 Where neither can be written (an installation by somebody else, a container without a home), numba would refuse to import them
 at all: then they are kept in a folder below the system's temporary one.
+
+What an extraction and a merge need is compiled before its first use, by one process a core (`topomerge.kernels.ahead`).
+Loops run on all cores through slices of their range: they let go of the interpreter, and numba's own parallel loops take three
+times as long to compile.
 """
 
 from __future__ import annotations
@@ -10,12 +14,44 @@ import errno
 import os
 import stat
 import tempfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any, TypeVar
 
 from numba import config, njit
 
-if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:  # TBB is there with Open3D only, and may then hang when Python ends
-    config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]
+from topomerge.kernels.ahead import compile_ahead as compile_ahead
+from topomerge.kernels.ahead import compile_missing
+
+T = TypeVar("T")
+SLICES_A_THREAD = 4  # so that threads end at about the same time
+_threads = {"count": int(config.NUMBA_NUM_THREADS)}  # type: ignore[attr-defined]
+
+
+def count_threads() -> int:
+    """Return how many threads share a loop: as many as cores, unless `set_thread_count` says otherwise."""
+    return _threads["count"]
+
+
+def set_thread_count(count: int) -> None:
+    """Let so many threads share a loop from now on."""
+    _threads["count"] = max(count, 1)
+
+
+def run_in_slices(function: Callable[..., T], count: int, least: int, *args: Any) -> list[T]:
+    """Call function(first, last, *args) for slices of range(count) side by side; return what it returns, in order.
+
+    Args:
+        function: lets go of the interpreter; what it writes for one index does not depend on other ones.
+        least: of a slice, below which a thread costs more than it saves.
+    """
+    slices = min(count // least, SLICES_A_THREAD * count_threads())
+    if slices < 2 or count_threads() == 1:
+        return [function(0, count, *args)]
+    borders = [count * k // slices for k in range(slices + 1)]
+    with ThreadPoolExecutor(min(slices, count_threads())) as pool:
+        return list(pool.map(lambda first, last: function(first, last, *args), borders[:-1], borders[1:]))
 
 
 def _probe() -> None: ...
@@ -37,6 +73,8 @@ def _create_private_folder() -> Path:
 
 
 try:
-    njit(cache=True)(_probe)  # compiles nothing yet
+    _kept = njit(cache=True)(_probe)  # compiles nothing yet
 except RuntimeError:  # no place to keep it
     config.CACHE_DIR = str(_create_private_folder())  # type: ignore[attr-defined]
+    _kept = njit(cache=True)(_probe)
+compile_missing(Path(_kept.stats.cache_path), count_threads())

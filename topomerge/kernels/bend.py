@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from topomerge.kernels import compile_ahead
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compile_ahead("f8[:,::1], i8[::1], i8[::1], f8[:,::1], f8[::1], f8[::1], f8[::1], f4[:,:,::1], f8[::1], f8", error_model="numpy")
 def score_moves(points, sector, start, places, turns, yaws, shifts, gain, origin, edge):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(K, Y, S, S) sums of the gain at the points of each piece under each turn and shift.
 
@@ -42,7 +43,7 @@ def score_moves(points, sector, start, places, turns, yaws, shifts, gain, origin
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compile_ahead("f8[:,::1], f8[::1], i8[::1], i8, f8[:,::1], f4[:,::1], f8[::1], f8", error_model="numpy")
 def sum_shifted_values(points, weights, owner, owners, shifts, values, origin, edge):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(S, owners) sums of the values of a raster (nx, ny) at weighted points (n, 2) of each owner, moved by each shift (S, 2)."""
     out = np.zeros((len(shifts), owners))
@@ -55,7 +56,7 @@ def sum_shifted_values(points, weights, owner, owners, shifts, values, origin, e
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compile_ahead("i4[:,::1], f8[:,::1], i8[:,::1], i8, i8", error_model="numpy")
 def estimate_line_normals(row, points, columns, reach, least):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(n, 2) unit normals of the lines through the points within `reach` columns of each one, and (n,) how straight these are
     (0 to 1); 0 where fewer than `least` points are near.
@@ -87,7 +88,10 @@ def estimate_line_normals(row, points, columns, reach, least):  # type: ignore[n
     return out, straight
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compile_ahead(
+    "f8[:,::1], f8[:,::1], b1[::1], i8[::1], f8[:,::1], f8[::1], i4[:,::1], f8[:,::1], f8[:,::1], b1[::1], f8[::1], f8, i8, f8",
+    error_model="numpy",
+)
 def build_line_equations(
     points, normal, faced, start, places, turns, row, target, target_normal, target_faced, origin, edge, reach, sigma
 ):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
@@ -143,7 +147,7 @@ def build_line_equations(
     return h, g, partners, sums
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compile_ahead("f8[:,::1], f8[::1], f8, f8[:,:,::1]", error_model="numpy")
 def interpolate_nodes(points, origin, step, nodes):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(n, 2) bilinear values at points (n, 2) of those at the nodes (nx, ny, 2) of a lattice; outside the value at its rim.
 
@@ -164,7 +168,7 @@ def interpolate_nodes(points, origin, step, nodes):  # type: ignore[no-untyped-d
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compile_ahead("u1[:,:,::1], f4[::1], f4[:,::1], b1[:,::1]", error_model="numpy")
 def compute_wall_gain(level, table, lost, seen):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(Q, nx, ny) float32: the entry of a table (256,) at each level (Q, nx, ny) uint8, less what is lost there (nx, ny) float32;
     0 where nothing was seen (nx, ny) and the entry is not above 0."""
@@ -178,7 +182,7 @@ def compute_wall_gain(level, table, lost, seen):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compile_ahead("f8[:,::1], f8[:,::1], i8[:,::1], f8[:,::1], f8[:,::1], f8", error_model="numpy")
 def blend_moves(points, distance, nearest, anchors, moves, reach):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(n, 2) m: shifts of points (n, 2) by the moves (k, 4) of pieces about their anchors (k, 2).
 

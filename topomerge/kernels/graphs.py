@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-from numba import njit, prange, types
+from numba import njit, types
 from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from topomerge.kernels import compile_ahead, run_in_slices
+
+Ints = NDArray[Any]
+LEAST_SETS = 64  # of a slice
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -69,7 +77,7 @@ def run_mcl_step(indptr, indices, values, inflation, threshold, most):  # type: 
     return out, new_indices, new_values, chaos
 
 
-@njit(cache=True)
+@compile_ahead("i4[::1], i4[::1], f8[::1], f8[::1]")
 def compute_selected_inverse(indptr, rows, values, diagonal):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Lower half of the inverse of L D L^T on the entries of L; nan at its first entry if those do not close under elimination.
 
@@ -113,11 +121,16 @@ def count_bits(typingctx, value):  # type: ignore[no-untyped-def]  # pragma: no 
     return types.uint64(types.uint64), codegen
 
 
-@njit(cache=True, parallel=True)
-def count_intersections(indptr, words, masks, first, second):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def count_intersections(indptr: Ints, words: Ints, masks: Ints, first: Ints, second: Ints) -> Ints:
     """(p,) size of the intersection of sets first[k] and second[k]."""
     out = np.zeros(len(first), np.int64)
-    for k in prange(len(first)):
+    run_in_slices(_count_intersections, len(first), LEAST_SETS, indptr, words, masks, first, second, out)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _count_intersections(begin, end, indptr, words, masks, first, second, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for k in range(begin, end):
         i, i_end = indptr[first[k]], indptr[first[k] + 1]
         j, j_end = indptr[second[k]], indptr[second[k] + 1]
         total = np.uint64(0)
@@ -128,14 +141,18 @@ def count_intersections(indptr, words, masks, first, second):  # type: ignore[no
             i += a <= b
             j += b <= a
         out[k] = total
+
+
+def compute_extents(indptr: Ints, words: Ints, masks: Ints, values: Ints) -> Ints:
+    """(s, 2) smallest and largest of the rows' values in each set; (largest, smallest) integers for an empty one."""
+    out = np.empty((len(indptr) - 1, 2), np.int64)
+    run_in_slices(_compute_extents, len(out), LEAST_SETS, indptr, words, masks, values, out)
     return out
 
 
-@njit(cache=True, parallel=True)
-def compute_extents(indptr, words, masks, values):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(s, 2) smallest and largest of the rows' values in each set; (largest, smallest) integers for an empty one."""
-    out = np.empty((len(indptr) - 1, 2), np.int64)
-    for s in prange(len(indptr) - 1):
+@njit(cache=True, nogil=True)
+def _compute_extents(first, last, indptr, words, masks, values, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    for s in range(first, last):
         low, high = np.iinfo(np.int64).max, np.iinfo(np.int64).min
         for k in range(indptr[s], indptr[s + 1]):
             mask, base = masks[k], np.int64(words[k]) << 6
@@ -145,7 +162,6 @@ def compute_extents(indptr, words, masks, values):  # type: ignore[no-untyped-de
                 mask ^= lowest
                 low, high = min(low, value), max(high, value)
         out[s, 0], out[s, 1] = low, high
-    return out
 
 
 @njit(cache=True)

@@ -6,6 +6,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from topomerge.kernels import compile_ahead
+
 
 @njit(cache=True, nogil=True)
 def cut(planes, room, corner, number, side, step):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
@@ -92,7 +94,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-@njit(cache=True)
+@compile_ahead("f8[:,::1], f8[:,::1], i8[::1], i8[::1], f8[::1], f8, i8[::1], i8[::1], i8[::1], f8[::1], f4[:,:,::1]")
 def _fill(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     points, frames, sizes, starts, low, tile, columns, first, lines, step, out
 ):

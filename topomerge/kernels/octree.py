@@ -10,11 +10,13 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
+from topomerge.kernels import run_in_slices
+
 STACK_SIZE = 8 * 22  # room on the stack: every level leaves at most seven siblings behind
-QUERIES_A_TASK = 64
+LEAST_QUERIES = 64  # of a slice
 MOST_BRICKS = 64  # a ball that may touch more than this is searched from the root
 
 
@@ -147,7 +149,7 @@ def _find_in_ball(cells, child, span, box, centre, square, top, stack, out, fill
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _query_ball_task(tree, centres, reach, indptr, out, fill, begin, end):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _query_balls(begin, end, tree, centres, reach, indptr, out, fill):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     cells, child, span, box, table, first_brick = tree
     root, stack = len(cells) + len(span) - 1, np.empty(STACK_SIZE, np.int64)
     for i in range(begin, end):
@@ -156,14 +158,6 @@ def _query_ball_task(tree, centres, reach, indptr, out, fill, begin, end):  # ty
         count = _find_in_ball(cells, child, span, box, centres[i], reach * reach, top, stack, part, fill)
         if not fill:
             indptr[i + 1] = count
-
-
-@njit(cache=True, error_model="numpy", parallel=True)
-def _query_balls(tree, centres, reach, indptr, out, fill):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    for task in prange((len(centres) + QUERIES_A_TASK - 1) // QUERIES_A_TASK):
-        _query_ball_task(
-            tree, centres, reach, indptr, out, fill, task * QUERIES_A_TASK, min((task + 1) * QUERIES_A_TASK, len(centres))
-        )
 
 
 @njit(cache=True, error_model="numpy")
@@ -217,8 +211,5 @@ def find_in_balls(
         if fill:
             np.cumsum(indptr, out=indptr)
             rows = np.empty(indptr[-1], np.int64)
-        if len(centres) > QUERIES_A_TASK:
-            _query_balls(tree, centres, radius, indptr, rows, fill)
-        else:  # waking the other cores costs more than so few queries
-            _query_ball_task(tree, centres, radius, indptr, rows, fill, 0, len(centres))
+        run_in_slices(_query_balls, len(centres), LEAST_QUERIES, tree, centres, radius, indptr, rows, fill)
     return indptr, rows

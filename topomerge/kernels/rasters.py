@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit, prange
+from typing import Any
 
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from topomerge.kernels import compile_ahead, run_in_slices
 from topomerge.kernels.voxels import find_row
 
+LEAST_CELLS = 1 << 13  # of a slice
+Ints = NDArray[Any]
 
-@njit(cache=True)
+
+@compile_ahead("i8[::1], i8")
 def _find_root(parent, i):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     while parent[i] != i:
         parent[i] = parent[parent[i]]
@@ -16,7 +23,7 @@ def _find_root(parent, i):  # type: ignore[no-untyped-def]  # pragma: no cover -
     return i
 
 
-@njit(cache=True)
+@compile_ahead("i4[:,::1], i4[:,:,::1], i4[:,::1], i8[:,::1], i8[::1]")
 def label_components(cells, table, bricks, offsets, group):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(n,) component of each cell, numbered by first cell. Neighbours are `offsets` (k, 3), which must hold one of each pair of
     opposite directions; only cells of the same `group` are joined, cells of a negative group are left out (-1)."""
@@ -47,7 +54,7 @@ def label_components(cells, table, bricks, offsets, group):  # type: ignore[no-u
     return labels
 
 
-@njit(cache=True)
+@compile_ahead("i4[:,::1], i4[:,:,::1], i4[:,::1], i8[:,::1], i8[::1], i8")
 def spread(cells, table, bricks, offsets, labels, limit):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Labels carried breadth first from labelled cells to unlabelled (-1) neighbours, at most `limit` steps; in place."""
     n = len(cells)
@@ -73,7 +80,7 @@ def spread(cells, table, bricks, offsets, labels, limit):  # type: ignore[no-unt
                     tail += 1
 
 
-@njit(cache=True)
+@compile_ahead("f8[:,::1], i8[::1], f8")
 def compute_watershed(clearance, order, prominence):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(nx, ny) int64 label of each cell with clearance above 0, numbered in the order of the peaks, -1 elsewhere.
 
@@ -127,7 +134,7 @@ def compute_watershed(clearance, order, prominence):  # type: ignore[no-untyped-
     return label
 
 
-@njit(cache=True)
+@compile_ahead("i8[:,::1], f8[:,::1]")
 def find_contacts(label, clearance):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(k, 3) int64 pairs of neighbouring cells of different labels: the two labels, ascending, and the flat index of the
     narrower cell."""
@@ -150,7 +157,7 @@ def find_contacts(label, clearance):  # type: ignore[no-untyped-def]  # pragma: 
     return out
 
 
-@njit(cache=True)
+@compile_ahead("b1[:,::1], b1[:,::1]")
 def count_steps(start, way):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(nx, ny) int64 fewest steps, of 8 neighbours and through pixels of `way` only, from a pixel of `start` to each; -1 none.
 
@@ -180,7 +187,7 @@ def count_steps(start, way):  # type: ignore[no-untyped-def]  # pragma: no cover
     return steps
 
 
-@njit(cache=True, nogil=True)
+@compile_ahead("i8[::1], i8[::1], f8[::1], f8[:,::1], f8, f8")
 def compute_column_bits(ix, iy, z, base, low, band):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(H, W) uint32: bit k is set where a cell lies between low + k * band and low + (k + 1) * band above `base` (H, W)."""
     out = np.zeros(base.shape, np.uint32)
@@ -239,7 +246,7 @@ PROFILE_LEVELS = 64
 PROFILE_BELOW = 4  # levels below the floor that a profile begins with
 
 
-@njit(cache=True)
+@compile_ahead("i4[:,::1], i8[::1], i8[:,::1], i8[:,::1], u8[:,::1]")
 def fill_profiles(cells, low, base, top, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Sets in `out` (nx, ny) uint64 bit b where cell (x, y, base - PROFILE_BELOW + b) is occupied, up to the level `top`.
 
@@ -254,7 +261,7 @@ def fill_profiles(cells, low, base, top, out):  # type: ignore[no-untyped-def]  
                 out[x, y] |= np.uint64(1) << np.uint64(b)
 
 
-@njit(cache=True)
+@compile_ahead("u8[::1], i8")
 def find_lowest_bit(profile, begin):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(n,) first set bit of each profile from bit `begin` on; -1: none."""
     out = np.full(len(profile), -1, np.int64)
@@ -267,20 +274,24 @@ def find_lowest_bit(profile, begin):  # type: ignore[no-untyped-def]  # pragma: 
     return out
 
 
-@njit(cache=True, parallel=True)
-def find_first_occupied(table, bricks, cells, start, step, limit):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(m,) number of cells from each cell to the first occupied one above (`step` 1) or below (-1) it, beginning `start` cells
-    away; 0 where there is none within `limit` cells."""
-    out = np.zeros(len(cells), np.int64)
-    for i in prange(len(cells)):
+@compile_ahead("i8, i8, i4[:,:,::1], i4[:,::1], i8[:,::1], i8, i8, i8, i8[::1]")
+def _find_first_occupied(first, last, table, bricks, cells, start, step, limit, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for i in range(first, last):
         for d in range(start, limit + 1):
             if find_row(table, bricks, cells[i, 0], cells[i, 1], cells[i, 2] + step * d) >= 0:
                 out[i] = d
                 break
+
+
+def find_first_occupied(table: Ints, bricks: Ints, cells: Ints, start: int, step: int, limit: int) -> Ints:
+    """(m,) number of cells from each cell to the first occupied one above (`step` 1) or below (-1) it, beginning `start` cells
+    away; 0 where there is none within `limit` cells."""
+    out = np.zeros(len(cells), np.int64)
+    run_in_slices(_find_first_occupied, len(cells), LEAST_CELLS, table, bricks, cells, start, step, limit, out)
     return out
 
 
-@njit(cache=True, inline="always")
+@compile_ahead("i4[:,:,::1], i4[:,::1], i8, i8, i8, i8")
 def _is_any_near(table, bricks, x, y, z, reach):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     for dx in range(-reach, reach + 1):
         for dy in range(-reach, reach + 1):
@@ -289,12 +300,9 @@ def _is_any_near(table, bricks, x, y, z, reach):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True, parallel=True)
-def is_hollow_below(table, bricks, cells, reach, thickness, headroom, limit):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(m,) bool: does a run of at least `headroom` empty cells begin within `thickness` cells below each cell, and end at an
-    occupied one within `limit` cells? A level is occupied if any cell within `reach` columns is: sparse points leave gaps."""
-    out = np.zeros(len(cells), np.bool_)
-    for i in prange(len(cells)):
+@compile_ahead("i8, i8, i4[:,:,::1], i4[:,::1], i8[:,::1], i8, i8, i8, i8, b1[::1]")
+def _is_hollow_below(first, last, table, bricks, cells, reach, thickness, headroom, limit, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for i in range(first, last):
         empty = 0
         for d in range(1, limit + 1):
             if _is_any_near(table, bricks, cells[i, 0], cells[i, 1], cells[i, 2] - d, reach):
@@ -306,20 +314,33 @@ def is_hollow_below(table, bricks, cells, reach, thickness, headroom, limit):  #
                 if empty == 0 and d > thickness + 1:
                     break
                 empty += 1
+
+
+def is_hollow_below(
+    table: Ints, bricks: Ints, cells: Ints, reach: int, thickness: int, headroom: int, limit: int
+) -> NDArray[np.bool_]:
+    """(m,) bool: does a run of at least `headroom` empty cells begin within `thickness` cells below each cell, and end at an
+    occupied one within `limit` cells? A level is occupied if any cell within `reach` columns is: sparse points leave gaps."""
+    out = np.zeros(len(cells), np.bool_)
+    run_in_slices(_is_hollow_below, len(cells), LEAST_CELLS, table, bricks, cells, reach, thickness, headroom, limit, out)
     return out
 
 
-@njit(cache=True, parallel=True)
-def count_levels_below(table, bricks, cells, reach, depth):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(m,) how many of the `depth` levels below each cell are occupied within `reach` columns."""
-    out = np.zeros(len(cells), np.int64)
-    for i in prange(len(cells)):
+@compile_ahead("i8, i8, i4[:,:,::1], i4[:,::1], i8[:,::1], i8, i8, i8[::1]")
+def _count_levels_below(first, last, table, bricks, cells, reach, depth, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for i in range(first, last):
         for d in range(1, depth + 1):
             out[i] += _is_any_near(table, bricks, cells[i, 0], cells[i, 1], cells[i, 2] - d, reach)
+
+
+def count_levels_below(table: Ints, bricks: Ints, cells: Ints, reach: int, depth: int) -> Ints:
+    """(m,) how many of the `depth` levels below each cell are occupied within `reach` columns."""
+    out = np.zeros(len(cells), np.int64)
+    run_in_slices(_count_levels_below, len(cells), LEAST_CELLS, table, bricks, cells, reach, depth, out)
     return out
 
 
-@njit(cache=True)
+@compile_ahead("f8[:,::1], f8[::1], f8[::1], f8")
 def find_strongest_line(points, weights, angles, width):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Direction (rad) and offset across it (m) of the line with most weight in two neighbouring bins; the first of several.
 

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit, prange
+from typing import Any
 
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from topomerge.kernels import compile_ahead, run_in_slices
 from topomerge.kernels.voxels import find_row
 
+Ints = NDArray[Any]
+Floats = NDArray[np.float64]
+LEAST_TARGETS = 64  # of a slice: each has many starts, or a long ray
 FIELD_LIMIT = 255  # the distance field is a byte
 
 
@@ -40,7 +47,7 @@ def compute_distance_field(cells, low, size):  # type: ignore[no-untyped-def]  #
     return field[1 : sx + 1, 1 : sy + 1, 1 : sz + 1].copy()
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def is_visible(field, ox, oy, oz, tx, ty, tz):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Does the ray from (ox, oy, oz) meet no occupied cell before cell (tx, ty, tz)? Coordinates in cells of the window."""
     dx, dy, dz = tx + 0.5 - ox, ty + 0.5 - oy, tz + 0.5 - oz
@@ -124,15 +131,9 @@ def count_words(near, rows):  # type: ignore[no-untyped-def]  # pragma: no cover
     return count
 
 
-@njit(cache=True, parallel=True)
-def is_seen_from(free, targets, starts, reach):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(t,) bool: does a straight line over columns that are `free` (nx, ny) lead from any start to each target, at most `reach`
-    columns long?
-
-    `targets` (t, 2) and `starts` (s, 2) int64 columns.
-    """
-    out = np.zeros(len(targets), np.bool_)
-    for i in prange(len(targets)):
+@compile_ahead("i8, i8, b1[:,::1], i8[:,::1], i8[:,::1], f8, b1[::1]")
+def _is_seen_from(first, last, free, targets, starts, reach, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    for i in range(first, last):
         x, y = targets[i, 0], targets[i, 1]
         for k in range(len(starts)):
             dx, dy = starts[k, 0] - x, starts[k, 1] - y
@@ -147,6 +148,16 @@ def is_seen_from(free, targets, starts, reach):  # type: ignore[no-untyped-def] 
             if clear:
                 out[i] = True
                 break
+
+
+def is_seen_from(free: NDArray[np.bool_], targets: Ints, starts: Ints, reach: float) -> NDArray[np.bool_]:
+    """(t,) bool: does a straight line over columns that are `free` (nx, ny) lead from any start to each target, at most `reach`
+    columns long?
+
+    `targets` (t, 2) and `starts` (s, 2) int64 columns.
+    """
+    out = np.zeros(len(targets), np.bool_)
+    run_in_slices(_is_seen_from, len(targets), LEAST_TARGETS, free, targets, starts, float(reach), out)
     return out
 
 
@@ -174,12 +185,16 @@ def find_lit_pixels(opaque, starts, reach):  # type: ignore[no-untyped-def]  # p
     return out
 
 
-@njit(cache=True, parallel=True)
-def carve(starts, ends, margin, crossed):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def carve(starts: Floats, ends: Floats, margin: float, crossed: NDArray[np.bool_]) -> None:
     """Sets `crossed` (nx, ny, nz) bool in every cell that a ray enters between `starts` and `margin` cells before `ends`
     ((k, 3) float64, in cells), by the digital differential analyser of Amanatides and Woo (1987)."""
+    run_in_slices(_carve, len(starts), LEAST_TARGETS, starts, ends, margin, crossed)
+
+
+@njit(cache=True, nogil=True)
+def _carve(first, last, starts, ends, margin, crossed):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     nx, ny, nz = crossed.shape
-    for i in prange(len(starts)):
+    for i in range(first, last):
         length = 0.0
         for k in range(3):
             length += (ends[i, k] - starts[i, k]) ** 2
@@ -207,15 +222,21 @@ def carve(starts, ends, margin, crossed):  # type: ignore[no-untyped-def]  # pra
                 t, tz, z = tz, tz + uz, z + sz
 
 
-@njit(cache=True, parallel=True)
-def sweep(table, bricks, starts, directions, reach, coarser, crossed):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def sweep(
+    table: Ints, bricks: Ints, starts: Floats, directions: Floats, reach: float, coarser: int, crossed: NDArray[np.bool_]
+) -> None:
     """Sets `crossed` in every cell, `coarser` times as long as those of the grid, that lies between a start and the first
     occupied cell in each direction; nothing for a ray that meets none within `reach` cells.
 
     `starts` (v, 3) in cells, `directions` (d, 3) unit vectors.
     """
+    run_in_slices(_sweep, len(starts), 1, table, bricks, starts, directions, float(reach), coarser, crossed)
+
+
+@compile_ahead("i8, i8, i4[:,:,::1], i4[:,::1], f8[:,::1], f8[:,::1], f8, i8, b1[:,:,::1]")
+def _sweep(first, last, table, bricks, starts, directions, reach, coarser, crossed):  # type: ignore[no-untyped-def]  # pragma: no cover
     nx, ny, nz = crossed.shape
-    for i in prange(len(starts)):
+    for i in range(first, last):
         for d in range(len(directions)):
             dx, dy, dz = directions[d, 0], directions[d, 1], directions[d, 2]
             met = -1.0
@@ -265,7 +286,7 @@ def count_rays(starts, ends, margin, passed, met):  # type: ignore[no-untyped-de
                 t, ty, y = ty, ty + uy, y + sy
 
 
-@njit(cache=True)
+@compile_ahead("b1[:,::1], f8, f8, f8, f8, f8")
 def measure_run(mask, x, y, dx, dy, limit):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Cells from (x, y) along the unit vector (dx, dy) while `mask` holds, in halves, at most `limit`."""
     length = 0.0
@@ -277,7 +298,7 @@ def measure_run(mask, x, y, dx, dy, limit):  # type: ignore[no-untyped-def]  # p
     return length
 
 
-@njit(cache=True)
+@compile_ahead("b1[:,::1], f8, f8, f8, f8, i8, f8")
 def measure_widths(mask, x, y, dx, dy, steps, limit):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(2 steps + 1,) free width (cells) across the direction (dx, dy)'s normal, at -steps..steps cells along that normal from
     (x, y); -1 from where the normal itself is blocked."""
@@ -292,7 +313,7 @@ def measure_widths(mask, x, y, dx, dy, steps, limit):  # type: ignore[no-untyped
     return out
 
 
-@njit(cache=True)
+@compile_ahead("f4[:,::1], f8, f8, f8, f8, f8, f8, i8")
 def measure_cover(mask, x, y, dx, dy, before, after, steps):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Greatest share of the cells of a line, from `before` cells behind (x, y) to `after` ahead along (dx, dy), for which `mask`
     holds; the line may be shifted by up to `steps` cells along its normal."""

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit, prange
+from typing import Any
 
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from topomerge.kernels import compile_ahead, run_in_slices
 from topomerge.kernels.voxels import find_row
 
+Ints = NDArray[Any]
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+LEAST_NORMALS = 1024  # of a slice
 
-@njit(cache=True, nogil=True, error_model="numpy")
+
+@compile_ahead("f8[:,::1], f8[::1], i8", error_model="numpy")
 def solve_cholesky(h, g, count):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(F,) x of H x = g in the first `count` of F unknowns, 0 in the others: by Cholesky's factor.
 
@@ -36,7 +45,7 @@ def solve_cholesky(h, g, count):  # type: ignore[no-untyped-def]  # pragma: no c
     return x
 
 
-@njit(cache=True, nogil=True, inline="always")
+@compile_ahead("f4[:,::1], f8, f8")
 def _sample(field, u, v):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Value and gradient (per cell) of a field between the middles of its cells; False outside."""
     i, j = int(np.floor(u)), int(np.floor(v))
@@ -48,7 +57,7 @@ def _sample(field, u, v):  # type: ignore[no-untyped-def]  # pragma: no cover - 
     return True, value, (f10 - f00) * (1 - b) + (f11 - f01) * b, (f01 - f00) * (1 - a) + (f11 - f10) * a
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compile_ahead("f8[:,::1], f4[:,::1], f8[::1], f8, f8[:,::1], f8[::1], i8, b1", error_model="numpy")
 def refine(points, field, origin, cell, poses, sigmas, rounds, scaled):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Gauss-Newton over (x, y, yaw, log scale) of many poses on a distance field, weights exp(-d2 / 2 sigma2), sigma shrinking.
 
@@ -100,7 +109,7 @@ def refine(points, field, origin, cell, poses, sigmas, rounds, scaled):  # type:
     return out, score
 
 
-@njit(cache=True, nogil=True, inline="always")
+@compile_ahead("u4, u4")
 def _compare_bits(p, q):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Bits in both of those in either."""
     both, either = 0, 0
@@ -114,7 +123,10 @@ def _compare_bits(p, q):  # type: ignore[no-untyped-def]  # pragma: no cover - c
 WALL_STATE, FREE_STATE, CLUTTER_STATE, HAZE_STATE = 1, 2, 3, 4
 
 
-@njit(cache=True, nogil=True)
+@compile_ahead(
+    "f8[:,::1], u1[::1], f4[:,::1], b1[::1], u4[::1], u1[:,::1], f4[:,::1], f4[:,::1], f4[:,:,::1], b1[:,::1], u4[:,::1],"
+    "f8[::1], f8, f8[::1], f8, f8"
+)
 def tally(points, kinds, facing, inner, filled, kind, to_wall, to_any, face, open_, bits, origin, cell, pose, near, far):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Count what the columns of one plan meet in the other under a pose (x, y, yaw, log scale) of it in the other.
 
@@ -172,14 +184,28 @@ def tally(points, kinds, facing, inner, filled, kind, to_wall, to_any, face, ope
     return out
 
 
-@njit(cache=True, nogil=True)
-def estimate_normals(table, bricks, cells, points, chosen, reach, least):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def estimate_normals(
+    table: Ints, bricks: Ints, cells: Ints, points: Floats, chosen: Ints, reach: int, least: int
+) -> tuple[Floats, Floats]:
     """(m, 3) unit normals of the planes through the points of the cells within `reach` of each `chosen` row, and (m,) how flat
     these are (0 to 1); 0 where fewer than `least` cells are near."""
     out, flat = np.zeros((len(chosen), 3)), np.zeros(len(chosen))
-    for k in range(len(chosen)):
+    square, enough = np.zeros((len(chosen), 3, 3)), np.zeros(len(chosen), np.bool_)
+    run_in_slices(_sum_squares, len(chosen), LEAST_NORMALS, table, bricks, cells, points, chosen, reach, least, square, enough)
+    values, vectors = np.linalg.eigh(square[enough])
+    is_plane = values[:, 1] > 1e-12
+    rows = np.flatnonzero(enough)[is_plane]
+    out[rows] = vectors[is_plane, :, 0]
+    flat[rows] = 1.0 - np.maximum(values[is_plane, 0], 0.0) / values[is_plane, 1]
+    return out, flat
+
+
+@compile_ahead("i8, i8, i4[:,:,::1], i4[:,::1], i4[:,::1], f8[:,::1], i8[::1], i8, i8, f8[:,:,::1], b1[::1]")
+def _sum_squares(first, last, table, bricks, cells, points, chosen, reach, least, out, enough):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Covariances (m, 3, 3) of the points around each chosen row of which enough cells are near."""
+    for k in range(first, last):
         i = chosen[k]
-        n, mean, square = 0, np.zeros(3), np.zeros((3, 3))
+        n, mean, square = 0, np.zeros(3), out[k]
         for a in range(-reach, reach + 1):
             for b in range(-reach, reach + 1):
                 for c in range(-reach, reach + 1):
@@ -197,14 +223,12 @@ def estimate_normals(table, bricks, cells, points, chosen, reach, least):  # typ
             for v in range(u + 1):
                 square[u, v] = square[u, v] / n - mean[u] * mean[v] / (n * n)
                 square[v, u] = square[u, v]
-        values, vectors = np.linalg.eigh(square)
-        if values[1] > 1e-12:
-            out[k] = vectors[:, 0]
-            flat[k] = 1.0 - max(values[0], 0.0) / values[1]
-    return out, flat
+        enough[k] = True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compile_ahead(
+    "i4[:,:,::1], i4[:,::1], f8[::1], f8, f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], i8, f8, b1", error_model="numpy"
+)
 def build_normal_equations(table, bricks, origin, edge, points, normal, moving, moving_normal, pose, reach, sigma, scaled):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Normal equations of one round: each moving point and the nearest one with a like normal within `reach` cells.
 
@@ -265,8 +289,10 @@ def build_normal_equations(table, bricks, origin, edge, points, normal, moving, 
 WALL_NEAR, WALL_FAR = 0.1, 0.3  # m from a wall column: floor there stands in the wall; a wall beyond it stands on free floor
 
 
-@njit(cache=True, parallel=True)
-def measure_pose_evidence(poses, storeys, points, storey, is_wall, distance, floor, origin, edge, sigma):  # type: ignore[no-untyped-def]  # pragma: no cover
+def measure_pose_evidence(
+    poses: Floats, storeys: Ints, points: Floats, storey: Ints, is_wall: Bools, distance: NDArray[np.float32], floor: Bools,
+    origin: Floats, edge: float, sigma: float,
+) -> Floats:  # fmt: skip
     """Agreement, conflict and common floor of each pose, in numbers of points.
 
     Args:
@@ -280,8 +306,16 @@ def measure_pose_evidence(poses, storeys, points, storey, is_wall, distance, flo
         (H, 3) float64: walls on walls, points that contradict the plan (walls on free floor, floor in walls), floor on floor.
     """
     out = np.zeros((len(poses), 3))
+    run_in_slices(
+        _measure_pose_evidence, len(poses), 1, poses, storeys, points, storey, is_wall, distance, floor, origin, edge, sigma, out
+    )
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _measure_pose_evidence(first, last, poses, storeys, points, storey, is_wall, distance, floor, origin, edge, sigma, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     _, nx, ny = distance.shape
-    for h in prange(len(poses)):
+    for h in range(first, last):
         a, b, x, y = poses[h, 0], poses[h, 1], poses[h, 2], poses[h, 3]
         agree, against, common = 0.0, 0.0, 0.0
         for i in range(len(points)):
@@ -303,7 +337,6 @@ def measure_pose_evidence(poses, storeys, points, storey, is_wall, distance, flo
             elif d < WALL_NEAR:
                 against += 1
         out[h, 0], out[h, 1], out[h, 2] = agree, against, common
-    return out
 
 
 @njit(cache=True, error_model="numpy")
@@ -337,7 +370,7 @@ def sum_votes(way, rise, room, chance, voted, voters, widths, level_gap):  # typ
 UP, LEAST_UP = 2, 4  # of a cell's wall: of so many cells above it and below it, itself included, these many are occupied
 
 
-@njit(cache=True)
+@compile_ahead("i4[:,:,::1], i4[:,::1], i8, i8, i8")
 def _is_upright(table, bricks, x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     count = 0
     for w in range(z - UP, z + UP + 1):
@@ -346,7 +379,7 @@ def _is_upright(table, bricks, x, y, z):  # type: ignore[no-untyped-def]  # prag
     return count >= LEAST_UP
 
 
-@njit(cache=True)
+@compile_ahead("Tuple((i4[:,:,::1], i4[:,::1])), i8, i8, i8, f8, f8")
 def _is_seen_through(free, x, y, z, u, v):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Is the first or second place of free space behind (x, y, z), in the direction (u, v), known to be empty?"""
     for step in (1.5, 2.5, 3.5):
@@ -356,7 +389,10 @@ def _is_seen_through(free, x, y, z, u, v):  # type: ignore[no-untyped-def]  # pr
     return False
 
 
-@njit(cache=True)
+@compile_ahead(
+    "i8[:,::1], i8[:,::1], Tuple((i4[:,:,::1], i4[:,::1])), Tuple((i4[:,:,::1], i4[:,::1])), "
+    "Tuple((i4[:,:,::1], i4[:,::1])), Tuple((i4[:,:,::1], i4[:,::1]))"
+)
 def find_copied_cells(cells, offsets, first, second, first_free, second_free):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(n,) int64 row of the first map's cell of which each of the second one's is a copy, -1 none.
 

@@ -9,17 +9,18 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
+from topomerge.kernels import compile_ahead, run_in_slices
 from topomerge.kernels.voxels import find_row
 
-CELLS_A_TASK = 2048  # scratch memory is made once a task, and two cores stay level
+LEAST_CELLS = 2048  # of a slice
 Arrays2 = tuple[NDArray[Any], NDArray[Any]]  # table and bricks of `lookup.build`; offsets and weights of a stencil
 _ONES = np.array([bin(i).count("1") for i in range(256)], np.int64)
 
 
-@njit(cache=True)
+@compile_ahead("i4[:,::1], i4[:,:,::1], u1[:,::1]")
 def _fill_columns(cells, table, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     for i in range(len(cells)):
         x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
@@ -33,9 +34,9 @@ def build_columns(cells: NDArray[Any], table: NDArray[Any], bricks: NDArray[Any]
     return out
 
 
-@njit(cache=True, error_model="numpy")
-def _count_in_column(table, bits, x, y, low, high, stop):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Occupied cells (x, y, low .. high); with `stop` the count ends in the first brick that holds one."""
+@compile_ahead("i4[:,:,::1], u1[:,::1], i8, i8, i8, i8", error_model="numpy")
+def _count_in_column(table, bits, x, y, low, high):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Occupied cells (x, y, low .. high)."""
     low, high = max(low, 0), min(high, table.shape[2] * 8 - 1)
     if x < 0 or y < 0 or (x >> 3) >= table.shape[0] or (y >> 3) >= table.shape[1] or low > high:
         return 0
@@ -50,38 +51,26 @@ def _count_in_column(table, bits, x, y, low, high, stop):  # type: ignore[no-unt
         if bz == high >> 3:
             mask &= 255 >> (7 - (high & 7))
         count += _ONES[bits[brick, column] & mask]
-        if stop and count:
-            break
     return count
 
 
-@njit(cache=True, error_model="numpy", parallel=True)
-def _count(table, bits, cells, runs, weights, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    for i in prange(len(cells)):
+@compile_ahead("i8, i8, i4[:,:,::1], u1[:,::1], i8[:,::1], i8[:,::1], f8[::1], b1, f8[::1]", error_model="numpy")
+def _count(first, last, table, bits, cells, runs, weights, stop, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """With `stop` a count ends with the first run that holds a cell."""
+    for i in range(first, last):
         x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
         total = 0.0
         for j in range(len(runs)):
             low, high = z + runs[j, 2], z + runs[j, 3]
-            total += weights[j] * _count_in_column(table, bits, x + runs[j, 0], y + runs[j, 1], low, high, False)
+            total += weights[j] * _count_in_column(table, bits, x + runs[j, 0], y + runs[j, 1], low, high)
+            if stop and total > 0:
+                break
         out[i] = total
 
 
-@njit(cache=True, error_model="numpy", parallel=True)
-def _find_any(table, bits, cells, runs, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    for i in prange(len(cells)):
-        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
-        occupied = False
-        for j in range(len(runs)):
-            low, high = z + runs[j, 2], z + runs[j, 3]
-            if _count_in_column(table, bits, x + runs[j, 0], y + runs[j, 1], low, high, True):
-                occupied = True
-                break
-        out[i] = occupied
-
-
-@njit(cache=True, error_model="numpy", parallel=True)
-def _weigh(table, bricks, cells, offsets, weights, values, largest, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    for i in prange(len(cells)):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _weigh(first, last, table, bricks, cells, offsets, weights, values, largest, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for i in range(first, last):
         x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
         out[i] = -np.inf if largest else 0.0
         for j in range(len(offsets)):
@@ -106,26 +95,25 @@ def _find_winner(voted, votes, count, present):  # type: ignore[no-untyped-def] 
     return best
 
 
-@njit(cache=True, error_model="numpy", parallel=True)
-def _vote(table, bricks, cells, offsets, weights, labels, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    for task in prange((len(cells) + CELLS_A_TASK - 1) // CELLS_A_TASK):
-        voted = np.empty(len(offsets), np.int64)  # labels met, in order of appearance: mostly one or two
-        votes = np.empty(len(offsets), np.float64)
-        for i in range(task * CELLS_A_TASK, min((task + 1) * CELLS_A_TASK, len(cells))):
-            x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
-            count = 0
-            for j in range(len(offsets)):
-                r = find_row(table, bricks, x + offsets[j, 0], y + offsets[j, 1], z + offsets[j, 2])
-                if r < 0 or labels[r] < 0:
-                    continue
-                k = 0
-                while k < count and voted[k] != labels[r]:
-                    k += 1
-                if k == count:
-                    voted[k], votes[k] = labels[r], 0.0
-                    count += 1
-                votes[k] += weights[j]
-            out[i] = _find_winner(voted, votes, count, labels[i])
+@njit(cache=True, nogil=True, error_model="numpy")
+def _vote(first, last, table, bricks, cells, offsets, weights, labels, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    voted = np.empty(len(offsets), np.int64)  # labels met, in order of appearance: mostly one or two
+    votes = np.empty(len(offsets), np.float64)
+    for i in range(first, last):
+        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
+        count = 0
+        for j in range(len(offsets)):
+            r = find_row(table, bricks, x + offsets[j, 0], y + offsets[j, 1], z + offsets[j, 2])
+            if r < 0 or labels[r] < 0:
+                continue
+            k = 0
+            while k < count and voted[k] != labels[r]:
+                k += 1
+            if k == count:
+                voted[k], votes[k] = labels[r], 0.0
+                count += 1
+            votes[k] += weights[j]
+        out[i] = _find_winner(voted, votes, count, labels[i])
 
 
 def count(
@@ -133,26 +121,26 @@ def count(
 ) -> NDArray[np.float64]:
     """(m,) weighted number of cells under runs (dx, dy, lowest, highest dz) placed at each of (m, 3) int64 cells."""
     out = np.empty(len(cells), np.float64)
-    _count(table, bits, cells, runs, weights, out)
+    run_in_slices(_count, len(cells), LEAST_CELLS, table, bits, cells, runs, weights, False, out)
     return out
 
 
 def is_any_occupied(table: NDArray[Any], bits: NDArray[Any], cells: NDArray[Any], runs: NDArray[Any]) -> NDArray[np.bool_]:
     """(m,) is any cell under the runs placed at each of (m, 3) int64 cells occupied?"""
-    out = np.empty(len(cells), np.bool_)
-    _find_any(table, bits, cells, runs, out)
-    return out
+    out = np.empty(len(cells), np.float64)
+    run_in_slices(_count, len(cells), LEAST_CELLS, table, bits, cells, runs, np.ones(len(runs)), True, out)
+    return out > 0
 
 
 def weigh(bricks: Arrays2, cells: NDArray[Any], stencil: Arrays2, values: NDArray[Any], largest: bool) -> NDArray[np.float64]:
     """(n, c) sum, or `largest`, of weight * value over the cells under (k, 3) int64 offsets; values (n, c) float64."""
     out = np.empty(values.shape, np.float64)
-    _weigh(*bricks, cells, *stencil, values, largest, out)
+    run_in_slices(_weigh, len(cells), LEAST_CELLS, *bricks, cells, *stencil, values, largest, out)
     return out
 
 
 def vote(bricks: Arrays2, cells: NDArray[Any], stencil: Arrays2, labels: NDArray[Any]) -> NDArray[np.int64]:
     """Return (n,) most voted of the (n,) int64 labels under the stencil; negative labels do not vote."""
     out = np.empty(len(cells), np.int64)
-    _vote(*bricks, cells, *stencil, labels, out)
+    run_in_slices(_vote, len(cells), LEAST_CELLS, *bricks, cells, *stencil, labels, out)
     return out

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange, uint64
+from numba import njit, uint64
 from numpy.typing import NDArray
+
+from topomerge.kernels import compile_ahead, run_in_slices
 
 BITS = 21
 AXIS_LIMIT = 1 << BITS  # cells along an axis
@@ -35,13 +37,13 @@ def gather(code):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     return (v | (v >> uint64(32))) & uint64(0x1FFFFF)
 
 
-@njit(cache=True)
+@compile_ahead("i4[:,::1], u8[::1]")
 def _encode(cells, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     for i in range(len(cells)):
         out[i] = spread(cells[i, 0]) | (spread(cells[i, 1]) << uint64(1)) | (spread(cells[i, 2]) << uint64(2))
 
 
-@njit(cache=True)
+@compile_ahead("u8[::1], i4[:,::1]")
 def _decode(codes, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     for i in range(len(codes)):
         out[i, 0] = gather(codes[i])
@@ -49,7 +51,7 @@ def _decode(codes, out):  # type: ignore[no-untyped-def]  # pragma: no cover - c
         out[i, 2] = gather(codes[i] >> uint64(2))
 
 
-@njit(cache=True)
+@compile_ahead("u8[::1], i8[::1], u8, u8[::1], i8[::1]")
 def _run_radix_pass(keys, rows, shift, keys_out, rows_out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     starts = np.zeros((1 << DIGIT) + 1, np.int64)
     for i in range(len(keys)):
@@ -62,7 +64,7 @@ def _run_radix_pass(keys, rows, shift, keys_out, rows_out):  # type: ignore[no-u
         starts[d] += 1
 
 
-@njit(cache=True)
+@compile_ahead("u8[::1], i8[::1]")
 def _select_first_of_each(keys, rows):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     count = 0
     for i in range(len(keys)):
@@ -90,7 +92,7 @@ def find_unique_rows(codes: NDArray[np.uint64]) -> NDArray[np.int64]:
 def encode(cells: NDArray[Any]) -> NDArray[np.uint64]:
     """Return (n,) uint64 Morton codes of (n, 3) integer cells in 0 .. 2**21 - 1."""
     out = np.empty(len(cells), np.uint64)
-    _encode(np.ascontiguousarray(cells), out)
+    _encode(np.ascontiguousarray(cells, np.int32), out)
     return out
 
 
@@ -103,33 +105,35 @@ def decode(codes: NDArray[Any]) -> NDArray[np.int32]:
 
 TABLE_REACH = 1 << 10  # cells around the median point that `_split` puts into a table, which is then small enough
 OFFSET_STEPS = 256  # in which the way through a cell is divided
+LEAST_POINTS = 1 << 16  # of a slice of a chunk
 MAX_TABLE = 1 << 26  # bricks of the dense table; larger extents are sorted instead
 
 
-@njit(cache=True, parallel=True)
-def compute_bounds(points):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+@compile_ahead("i8, i8, f4[:,::1], f8[::1], f8[::1]")
+def _compute_bounds(first, last, points, low, high):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    bad = 0
+    for i in range(first, last):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
+            bad += 1
+            continue
+        for k in range(3):
+            low[k], high[k] = min(low[k], points[i, k]), max(high[k], points[i, k])
+    return bad
+
+
+def compute_bounds(points: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
     """Lowest and highest finite coordinates of (N, 3) points and the number of points that are not finite."""
-    parts = 16
-    low = np.full((parts, 3), np.inf)
-    high = np.full((parts, 3), -np.inf)
-    bad = np.zeros(parts, np.int64)
-    n = len(points)
-    for p in prange(parts):
-        for i in range(n * p // parts, n * (p + 1) // parts):
-            x, y, z = points[i, 0], points[i, 1], points[i, 2]
-            if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
-                bad[p] += 1
-                continue
-            low[p, 0], high[p, 0] = min(low[p, 0], x), max(high[p, 0], x)
-            low[p, 1], high[p, 1] = min(low[p, 1], y), max(high[p, 1], y)
-            low[p, 2], high[p, 2] = min(low[p, 2], z), max(high[p, 2], z)
-    for p in range(1, parts):
-        for a in range(3):
-            low[0, a], high[0, a] = min(low[0, a], low[p, a]), max(high[0, a], high[p, a])
-    return low[0], high[0], bad.sum()
+
+    def compute(first: int, last: int) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        return low, high, int(_compute_bounds(first, last, points, low, high))
+
+    lows, highs, bad = zip(*run_in_slices(compute, len(points), LEAST_POINTS), strict=True)
+    return np.min(lows, axis=0), np.max(highs, axis=0), sum(bad)
 
 
-@njit(cache=True, error_model="numpy")
+@compile_ahead("f4[:,::1], i8, f8[::1], f8", error_model="numpy")
 def _locate_cell(points, i, shift, edge):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Is point i finite, and its lattice cell floor((p + shift) / edge)."""
     x, y, z = points[i, 0], points[i, 1], points[i, 2]
@@ -143,35 +147,35 @@ def _locate_cell(points, i, shift, edge):  # type: ignore[no-untyped-def]  # pra
     )
 
 
-@njit(cache=True, error_model="numpy")
-def _locate_part(points, i, shift, edge, axis):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Which of the `OFFSET_STEPS` parts of its cell the finite point i lies in, along an axis: exact: a power of 2."""
-    return np.int64(np.floor((points[i, axis] + shift[axis]) / edge * OFFSET_STEPS)) & (OFFSET_STEPS - 1)
+@compile_ahead("f8", error_model="numpy")
+def _find_part(place):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Which of the `OFFSET_STEPS` parts of its cell a place, in cells, lies in: exact: a power of 2."""
+    return np.int64(np.floor(place * OFFSET_STEPS)) & (OFFSET_STEPS - 1)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def convert_to_lattice(points, shift, edge, out, parts):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Lattice cell of each point, and its part of the cell; points that are not finite get the lowest integer."""
-    for i in prange(len(points)):
+    for i in range(len(points)):
         finite, x, y, z = _locate_cell(points, i, shift, edge)
         if finite:
             out[i, 0], out[i, 1], out[i, 2] = x, y, z
             for k in range(3):
-                parts[i, k] = _locate_part(points, i, shift, edge, k)
+                parts[i, k] = _find_part((points[i, k] + shift[k]) / edge)
         else:
             out[i, 0] = out[i, 1] = out[i, 2] = np.iinfo(np.int64).min
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def mark(points, shift, edge, base, table):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+@compile_ahead("i8, i8, f4[:,::1], f8[::1], f8, i8[::1], i4[:,:,::1]", error_model="numpy")
+def mark(first, last, points, shift, edge, base, table):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """First pass: 1 in `table` for each brick that holds a point. Threads may write the same 1 twice."""
-    for i in prange(len(points)):
+    for i in range(first, last):
         finite, x, y, z = _locate_cell(points, i, shift, edge)
         if finite:
             table[(x - base[0]) >> 3, (y - base[1]) >> 3, (z - base[2]) >> 3] = 1
 
 
-@njit(cache=True)
+@compile_ahead("i8, i8, i8")
 def _encode_place(x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Place of a cell in its brick, in Morton order."""
     x3, y3, z3 = x & 7, y & 7, z & 7
@@ -180,24 +184,26 @@ def _encode_place(x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover 
     return code | (x3 & 4) << 4 | (y3 & 4) << 5 | (z3 & 4) << 6
 
 
-@njit(cache=True, error_model="numpy")
+@compile_ahead("f4[:,::1], f8[::1], f8, i8[::1], i4[:,:,::1], u4[::1], i8[::1]", error_model="numpy")
 def count(points, shift, edge, base, table, counts, places):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Second pass: points in each cell of the bricks in use; of each point where in `counts` (flat) it is counted (-1 nowhere),
     with the parts of its cell in the 24 lowest bits."""
     for i in range(len(points)):
-        finite, x, y, z = _locate_cell(points, i, shift, edge)
-        if finite:
-            cx, cy, cz = x - base[0], y - base[1], z - base[2]
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if np.isfinite(x) and np.isfinite(y) and np.isfinite(z):
+            u, v, w = (x + shift[0]) / edge, (y + shift[1]) / edge, (z + shift[2]) / edge
+            cx, cy, cz = np.int64(np.floor(u)) - base[0], np.int64(np.floor(v)) - base[1], np.int64(np.floor(w)) - base[2]
             at = (np.int64(table[cx >> 3, cy >> 3, cz >> 3]) << 9) + _encode_place(cx, cy, cz)
             counts[at] += 1
-            for k in range(3):
-                at = (at << 8) | _locate_part(points, i, shift, edge, k)
+            at = (at << 8) | _find_part(u)
+            at = (at << 8) | _find_part(v)
+            at = (at << 8) | _find_part(w)
             places[i] = at
         else:
             places[i] = -1
 
 
-@njit(cache=True, error_model="numpy")
+@compile_ahead("i8[::1], u4[::1], i8[:,::1]", error_model="numpy")
 def add_parts(places, rows, sums):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Third pass: sums (n, 3) of the parts of their cells that points lie in; rows: number of the cell at each place."""
     for place in places:
@@ -208,7 +214,7 @@ def add_parts(places, rows, sums):  # type: ignore[no-untyped-def]  # pragma: no
             sums[row, 2] += place & 255
 
 
-@njit(cache=True)
+@compile_ahead("u8[::1], u8[::1]")
 def _count_in_either(first, second):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     i = j = number = 0
     while i < len(first) and j < len(second):
@@ -217,7 +223,7 @@ def _count_in_either(first, second):  # type: ignore[no-untyped-def]  # pragma: 
     return number + len(first) - i + len(second) - j
 
 
-@njit(cache=True)
+@compile_ahead("u8[::1], i8[::1], i8[:,::1], u8[::1], i8[::1], i8[:,::1], u8[::1], i8[::1], i8[:,::1]")
 def _unite(codes, counts, sums, others, other_counts, other_sums, out, out_counts, out_sums):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     i = j = 0
     for row in range(len(out)):
@@ -276,7 +282,7 @@ def find_occupied_cells(points: NDArray[Any], shift: NDArray[Any], edge: float) 
     if float(np.prod(size.astype(np.float64))) > MAX_TABLE:
         return _split(points, shift, edge)
     table = np.zeros(tuple(size), np.int32)
-    mark(points, shift, edge, base, table)
+    run_in_slices(mark, len(points), LEAST_POINTS, points, shift, edge, base, table)
     bricks = np.argwhere(table)
     bricks = bricks[np.argsort(encode(bricks), kind="stable")]
     table[tuple(bricks.T)] = np.arange(len(bricks))
@@ -315,7 +321,7 @@ def _split(points: NDArray[Any], shift: NDArray[Any], edge: float) -> Occupied:
 MAX_BRICKS = 1 << 27  # 512 MB of table
 
 
-@njit(cache=True)
+@compile_ahead("i4[:,::1], i4[:,:,::1]")
 def _fill_table(cells, table):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     count = 0
     for i in range(len(cells)):
@@ -326,14 +332,14 @@ def _fill_table(cells, table):  # type: ignore[no-untyped-def]  # pragma: no cov
     return count
 
 
-@njit(cache=True)
+@compile_ahead("i4[:,::1], i4[:,:,::1], i4[:,::1]")
 def _fill_bricks(cells, table, bricks):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     for i in range(len(cells)):
         x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
         bricks[table[x >> 3, y >> 3, z >> 3], ((x & 7) << 6) | ((y & 7) << 3) | (z & 7)] = i
 
 
-@njit(cache=True, inline="always")
+@compile_ahead("i4[:,:,::1], i4[:,::1], i8, i8, i8")
 def find_row(table, bricks, x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Row of cell (x, y, z), -1 where it is empty or outside."""
     if x < 0 or y < 0 or z < 0:
@@ -347,7 +353,7 @@ def find_row(table, bricks, x, y, z):  # type: ignore[no-untyped-def]  # pragma:
     return bricks[brick, ((x & 7) << 6) | ((y & 7) << 3) | (z & 7)]
 
 
-@njit(cache=True)
+@compile_ahead("i4[:,:,::1], i4[:,::1], i8[:,::1], i8[::1]")
 def _find_rows(table, bricks, cells, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     for i in range(len(cells)):
         out[i] = find_row(table, bricks, cells[i, 0], cells[i, 1], cells[i, 2])
@@ -360,6 +366,7 @@ def build(cells: NDArray[Any], shape: tuple[int, int, int]) -> tuple[NDArray[np.
         extent = " x ".join(str(s) for s in shape)
         raise ValueError(f"the volume of {extent} cells is too large: crop the input or take larger voxels")
     table = np.full(size, -1, np.int32)
+    cells = np.ascontiguousarray(cells, np.int32)
     bricks = np.full((_fill_table(cells, table), 512), -1, np.int32)
     _fill_bricks(cells, table, bricks)
     return table, bricks
@@ -368,11 +375,11 @@ def build(cells: NDArray[Any], shape: tuple[int, int, int]) -> tuple[NDArray[np.
 def find_rows(table: NDArray[Any], bricks: NDArray[Any], cells: NDArray[Any]) -> NDArray[np.int64]:
     """Return (m,) row of each (m, 3) cell, -1 where it is not in the grid."""
     out = np.empty(len(cells), np.int64)
-    _find_rows(table, bricks, cells, out)
+    _find_rows(table, bricks, np.ascontiguousarray(cells, np.int64), out)
     return out
 
 
-@njit(cache=True)
+@compile_ahead("i4[:,::1], i8[:,::1], f8[:,::1], f8[:,::1], f8, i8, i8")
 def find_filled_cells(cells, holding, matrix, local, slack, reach, tall):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(m, 3) int64 cells of the lattice of which the middle lies in a cell of the grid, and (m,) int64 in which one.
 

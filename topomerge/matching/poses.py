@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.extraction.plans.storey_plan import StoreyPlan
-from topomerge.kernels import registration
+from topomerge.kernels import registration, run_in_slices
 from topomerge.types import Array, Sim3
 
 LARGEST_LOG_ODDS = 7.0
@@ -370,7 +370,14 @@ def _refine_group(v: PlanFields, w: PlanFields, group: Sequence[PoseHypothesis],
     start = np.array([[*_place_point(h.transform, middle), h.transform.yaw, np.log(h.transform.scale)] for h in group])
     field = (*v.field, v.plan.edge)
     about = np.ascontiguousarray(walls - middle)
-    poses, score = registration.refine(about, *field, start, np.array(REFINE.sigmas), REFINE.rounds, scaled)
+
+    def refine(first: int, last: int) -> tuple[Array, Array]:
+        moved: tuple[Array, Array] = registration.refine(
+            about, *field, start[first:last], np.array(REFINE.sigmas), REFINE.rounds, scaled
+        )
+        return moved
+
+    poses, score = (np.concatenate(part) for part in zip(*run_in_slices(refine, len(start), 1), strict=True))
     moved = []
     for hypothesis, (x, y, yaw, size), value in zip(group, poses, score, strict=True):
         turned = Sim3(wrap_yaw(yaw), (0.0, 0.0, 0.0), float(np.exp(size)))

@@ -252,6 +252,7 @@ def _moved(rows: Array, target: PlanFields, main: float) -> Array:
     """How much more of the walls would agree if each square were moved along one of the main directions by itself, m2, and how
     much there is of them: a longer end fits only after such a move, and furniture or noise hardly fit better."""
     rows = rows[rows[:, 2] > 0]
+    places, weights = np.ascontiguousarray(rows[:, :2]), np.ascontiguousarray(rows[:, 5])
     steps = np.arange(*WINDOW_SHIFTS)
     steps = np.concatenate([[0.0], steps, -steps])
     axes = np.array([[np.cos(main), np.sin(main)], [-np.sin(main), np.cos(main)]])
@@ -259,11 +260,11 @@ def _moved(rows: Array, target: PlanFields, main: float) -> Array:
     fitting = np.exp(-((target.to_wall / WINDOW_SIGMA) ** 2) / 2)
     out = np.zeros(2)
     for offset in (0.0, 0.5):
-        square = np.floor(rows[:, :2] @ axes.T / WINDOW_SIDE + offset).astype(np.int64)
+        square = np.floor(places @ axes.T / WINDOW_SIDE + offset).astype(np.int64)
         _, owner = np.unique(square[:, 0] << 32 | (square[:, 1] & 0xFFFFFFFF), return_inverse=True)
-        area = np.bincount(owner, weights=rows[:, 5], minlength=1)
+        area = np.bincount(owner, weights, minlength=1)
         plan = target.plan
-        fit = sum_shifted_values(rows[:, :2], rows[:, 5], owner, len(area), shifts, fitting, plan.origin, plan.edge)
+        fit = sum_shifted_values(places, weights, owner, len(area), shifts, fitting, plan.origin, plan.edge)
         compared = area >= WINDOW_WALLS
         gain = np.maximum(fit[1:].max(axis=0) - fit[0], 0.0)
         out += gain[compared].sum(), area[compared].sum()

@@ -177,7 +177,7 @@ def build_plans(map: TopometricMap | VoxelGrid, free: VoxelGrid | None = None, c
     storeys = [(z - SLICE_ABOVE_FLOOR, np.nan, z - SLICE_DRAWN) for z in layers] if layers else find_levels(grid)
     above = [base for _, _, base in storeys[1:]] + [np.inf]
     for (floor, ceiling, base), next_floor in zip(storeys, above, strict=True):
-        z, crossing = points[:, 2], empty
+        z, crossing = np.ascontiguousarray(points[:, 2]), empty
         if layers:  # all that is near the layer is drawn at one height
             level = base + SLICE_DRAWN
             z = np.where(np.abs(z - level) <= SLICE_HEIGHT / 2, level, np.nan)

@@ -40,7 +40,7 @@ class ShiftField:
     def at(self, points: Array) -> Array:
         """(n, 2) m by which the points (n, 2) are moved."""
         out: Array = interpolate_nodes(
-            np.asarray(points, np.float64), self.origin, self.step, np.asarray(self.shifts, np.float64)
+            np.ascontiguousarray(points, np.float64), self.origin, self.step, np.ascontiguousarray(self.shifts, np.float64)
         )
         return out
 

@@ -20,7 +20,9 @@ from topomerge.extraction.elevations.elevation import (
     WALL_CLASSES,
     Elevations,
     compute_place_probabilities,
+    weights,
 )
+from topomerge.networks.network import Run, run_side_by_side
 from topomerge.types import Array
 
 DOOR_CHANCE, LIKELY_DOOR = 0.35, 0.5  # probability of a door of every place of a doorway, and of one of them
@@ -68,17 +70,20 @@ class StoreyWalls:
 
 def classify_places(walls: Elevations) -> Array:
     """(n / 2, 7) float32 probability of each of `WALL_CLASSES` in each place along all strips, each read from both its ends."""
-    parts = [read_both_ways(walls.strips[low:high]) for low, high in iter_strip_bounds(walls)]
+    bounds = list(iter_strip_bounds(walls))
+    network = weights() if bounds else None  # once, before threads ask for it
+    parts = run_side_by_side(lambda ends: read_both_ways(walls.strips[slice(*ends)], network), bounds)
     return np.concatenate([np.zeros((0, len(WALL_CLASSES)), np.float32), *parts])
 
 
-def read_both_ways(strip: Array) -> Array:
+def read_both_ways(strip: Array, network: Run | None = None) -> Array:
     """(n / 2, 7) float32 probability of each of `WALL_CLASSES`: a mirrored wall has the same doors, so two readings are averaged.
 
     Args:
         strip: (n, 32, 17), n even.
+        network: that ships, if None.
     """
-    one, mirrored = compute_place_probabilities(np.stack([strip, strip[::-1]]))
+    one, mirrored = compute_place_probabilities(np.stack([strip, strip[::-1]]), network)
     mean: Array = (one + mirrored[::-1]) / np.float32(2)
     return mean
 

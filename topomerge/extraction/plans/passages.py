@@ -127,11 +127,8 @@ class _PassageMeasurer:
         self.thick_wall = ndimage.binary_dilation(plan.wall, np.ones((3, 3)))  # walls are not quite straight
         self.nearest_wall = ndimage.distance_transform_edt(plan.inside, return_distances=False, return_indices=True)
         low = plan.clear < plan.ceiling - LINTEL_DROP  # nan: no
-        doorway, boundary = (
-            np.ascontiguousarray(probability[..., DOORWAY_CLASS]),
-            probability[..., WALL_CLASS : SHUT_CLASS + 1].sum(axis=-1),
-        )
-        self.layers = low, doorway, boundary
+        doorway, boundary = probability[..., DOORWAY_CLASS], probability[..., WALL_CLASS : SHUT_CLASS + 1].sum(axis=-1)
+        self.layers = [np.ascontiguousarray(layer, np.float32) for layer in (low, doorway, boundary)]
 
     def measure_passage(self, a: int, b: int, at: int) -> Passage:
         """Return the passage between two regions at a flat index of the plan."""
@@ -140,7 +137,7 @@ class _PassageMeasurer:
         wall = self.nearest_wall[:, x, y] - (x, y)
         dx, dy = (wall / max(float(np.hypot(*wall)), 1e-9)).tolist()
         limit = 3.0 / e
-        ahead, behind = rays.measure_run(inside, x, y, dx, dy, limit), rays.measure_run(inside, x, y, -dx, -dy, limit)
+        ahead, behind = (rays.measure_run(inside, float(x), float(y), s * dx, s * dy, limit) for s in (1, -1))
         mx, my, half = x + dx * (ahead - behind) / 2, y + dy * (ahead - behind) / 2, (ahead + behind) / 2
         jambs = sorted(
             rays.measure_run(self.thick_wall, mx + s * (half + 1) * dx, my + s * (half + 1) * dy, s * dx, s * dy, 1.0 / e) * e

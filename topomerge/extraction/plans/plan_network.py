@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES, INSIDE_CLASS, StoreyPlan
-from topomerge.networks.network import Network, Run, Signature, Tensor, load_network, load_shipped_network
+from topomerge.networks.network import Network, Run, Signature, Tensor, load_network, load_shipped_network, run_side_by_side
 from topomerge.types import Array
 
 PLAN_NETWORK_FILE = "plan_network.onnx"
@@ -25,6 +25,7 @@ COARSEST_STRIDE = 16  # columns a side, of an element of the coarsest level
 DOWN_LEVELS = ("a", "b", "c", "d")  # levels of 1/2, 1/4, 1/8, 1/16: each halves and goes on
 UP_LEVELS = ("e", "f", "g", "h")  # and back, each beside what went down
 SIZE_CHANNEL = EVIDENCE_CHANNELS - 1  # the last one, which is the same everywhere
+LOOKS = 4  # at a plan, each a quarter turned
 NETWORK_REACH = 4  # strides: the network sees 60 columns to each side
 WORTH_PARTING = 0.8  # of a plan's area: its parts are looked at one by one where their boxes have less
 FURNITURE_CHANCE = 0.6, 0.95  # of the inside of a room, from which on what looked like wall is none: without and with a ceiling
@@ -60,11 +61,14 @@ def compute_evidence(plan: StoreyPlan) -> Array:
     )
 
 
-def compute_column_probabilities(plan: StoreyPlan, network: Run | None = None) -> Array:
+def compute_column_probabilities(plan: StoreyPlan, network: Run | None = None, looks: int = LOOKS) -> Array:
     """(nx, ny, 5) float32 probability of each of `COLUMN_CLASSES` in each column, by the weights that ship or by others.
 
     The mean over the plan turned by quarters: what the network says of a door hangs on how its walls lie on the columns, and
     where they do by chance, four looks err less than one (docs/adr/0005).
+
+    Args:
+        looks: at how many of the four turns it is looked.
     """
     x, margin = np.moveaxis(compute_evidence(plan), -1, 0), COARSEST_STRIDE
     nx, ny = plan.wall.shape
@@ -72,22 +76,25 @@ def compute_column_probabilities(plan: StoreyPlan, network: Run | None = None) -
     w = load_weights() if network is None else network
     parts = _split_parts(np.asarray(x[:SIZE_CHANNEL].any(axis=0)))
     if parts is None:
-        mean = _average_turns(x, w)
+        mean = _average_turns(x, w, looks)
     else:
         side = (2 * NETWORK_REACH + 1) * COARSEST_STRIDE
         nothing = np.zeros((EVIDENCE_CHANNELS, side, side), np.float32)
         nothing[SIZE_CHANNEL] = 5 * plan.edge
         mean = np.empty((*x.shape[1:], len(COLUMN_CLASSES)), np.float32)
-        mean[:] = _average_turns(nothing, w)[side // 2, side // 2]
+        mean[:] = _average_turns(nothing, w, looks)[side // 2, side // 2]
         for box, mask in parts:
-            mean[box][mask] = _average_turns(x[:, *box], w)[mask]
+            mean[box][mask] = _average_turns(x[:, *box], w, looks)[mask]
     return np.ascontiguousarray(mean[margin : margin + nx, margin : margin + ny])
 
 
-def _average_turns(x: Array, network: Run) -> Array:
-    """(nx, ny, 5) mean probability over (11, nx, ny) evidence turned by quarters."""
-    turned = (run_network(np.rot90(x, k, (1, 2)), network) for k in range(4))
-    mean: Array = np.mean([np.rot90(probability, -k, (1, 2)) for k, probability in enumerate(turned)], axis=0)
+def _average_turns(x: Array, network: Run, looks: int) -> Array:
+    """(nx, ny, 5) mean probability over (11, nx, ny) evidence turned by the first `looks` quarters."""
+
+    def look(k: int) -> Array:
+        return np.rot90(run_network(np.rot90(x, k, (1, 2)), network), -k, (1, 2))
+
+    mean: Array = np.mean(run_side_by_side(look, range(looks)), axis=0)
     return np.moveaxis(mean, 0, -1)
 
 

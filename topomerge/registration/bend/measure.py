@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from topomerge.kernels import run_in_slices
 from topomerge.kernels.bend import build_line_equations, compute_wall_gain, estimate_line_normals, score_moves
 from topomerge.matching.poses import DISTANCE_CAP, PlanFields, compute_distance
 from topomerge.registration.bend.pieces import Pieces
@@ -126,15 +127,20 @@ def measure(
     points = into.scale * (pieces.walls[every] - about)
     sector = target.find_sectors(pieces.faces[every] @ turn.T)
     placed = pieces.anchors[chosen] + moves[chosen, :2]
-    places = into.apply(np.column_stack([placed, np.zeros(len(placed))]))[:, :2]
+    places = np.ascontiguousarray(into.apply(np.column_stack([placed, np.zeros(len(placed))]))[:, :2])
     shift = window.shift * into.scale
     step = max(shift / 8, SHIFT_STEP)
     shifts = np.arange(-np.round(shift / step), np.round(shift / step) + 1) * step
     yaws = np.linspace(-window.turn, window.turn, TURNS)
     gain, origin = target.compute_gain(window.sigma)
-    scores = score_moves(
-        points, sector, firsts, places, into.yaw + moves[chosen, 2], yaws, shifts, gain, origin, target.fields.plan.edge
-    )
+    turns, edge = into.yaw + moves[chosen, 2], target.fields.plan.edge
+
+    def score(first: int, last: int) -> Array:
+        of, ends = slice(first, last), firsts[first : last + 1]
+        scores: Array = score_moves(points, sector, ends, places[of], turns[of], yaws, shifts, gain, origin, edge)
+        return scores
+
+    scores = np.concatenate(run_in_slices(score, len(chosen), 1))
     mean, information = _fit_gaussian(scores, shifts, yaws)
     back = np.eye(3)
     back[:2, :2] = turn.T / into.scale
@@ -186,7 +192,7 @@ def build_wall_lines(fields: PlanFields, middles: Array) -> WallLines:
     """
     plan = fields.plan
     row = np.full(plan.wall.shape, -1, np.int32)
-    columns = np.argwhere(plan.wall)
+    columns = np.ascontiguousarray(np.argwhere(plan.wall))
     row[plan.wall] = np.arange(len(columns))
     cells = np.floor((middles[:, :2] - plan.origin) / plan.edge + 1e-6).astype(np.int64)
     inside = ((cells >= 0) & (cells < row.shape)).all(axis=1)
@@ -225,7 +231,7 @@ def measure_lines(
     start = np.searchsorted(owner[rows], np.append(chosen, chosen[-1] + 1))
     points = into.scale * (lines.points[rows] - pieces.anchors[owner[rows]])
     placed = pieces.anchors[chosen] + moves[chosen, :2]
-    places = into.apply(np.column_stack([placed, np.zeros(len(placed))]))[:, :2]
+    places = np.ascontiguousarray(into.apply(np.column_stack([placed, np.zeros(len(placed))]))[:, :2])
     straight = np.where(target.straight, np.arange(len(target.points)), -1).astype(np.int32)
     row = np.where(target.row >= 0, straight[target.row], -1)
     h, g, partners, sums = build_line_equations(
