@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import topomerge
 from tests.fusion.plans_of import MOVE, office, part
@@ -33,7 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (place / "copy.tmap").write_bytes((place / "b.tmap").read_bytes())
     (place / "broken.tmap").write_bytes((place / "b.tmap").read_bytes()[:-2000])
     (place / "text.ply").write_text("no points\n")
-    (place / "plan.png").write_text("a picture by its name\n")
+    Image.new("L", (8, 8)).save(place / "plan.png")
     np.save(place / "mm.npy", np.load(place / "a.npy")[::40] * 1000)
     return place
 

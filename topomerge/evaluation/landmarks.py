@@ -98,7 +98,7 @@ def measure(settings: Settings, log_line: LogFn) -> list[Row]:
     return [{**row, **of} for row in rows for of in row["readings"]]
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Sharing:
     """How the building of a set is shared out (`BuildSettings`)."""
 

@@ -66,8 +66,8 @@ def _read_node(node: Any, graph: Mapping[str, Any]) -> dict[str, Any] | None:
             classes = graph["metadata"]["labelspaces"][f"_l{layer}p0"]
             name = next(str(label) for number, label in classes if number == about["semantic_label"])
         if layer == OBJECT_LAYER:
-            kind = (about.get("metadata") or {}).get("kind")
-            kind = kind if kind in LANDMARK_KINDS else "object"
+            said = (about.get("metadata") or {}).get("kind")
+            kind = said if said in LANDMARK_KINDS else "object"
         x, y, z = (float(v) for v in about["position"])
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, StopIteration):
         return None

@@ -245,7 +245,7 @@ def _open_study(plan: Plan) -> Any:
     pruner: Any = optuna.pruners.NopPruner()
     if plan.search.prune:
         pruner = optuna.pruners.MedianPruner(n_startup_trials=plan.search.startup, n_warmup_steps=1)
-    direction = "minimize" if plan.lower else "maximize"
+    direction: Any = "minimize" if plan.lower else "maximize"
     study = optuna.create_study(storage=storage, study_name=STUDY, direction=direction, pruner=pruner, load_if_exists=True)
     seed = derive_seed(plan.seed, len(study.get_trials(deepcopy=False))) % (1 << 32)
     study.sampler = optuna.samplers.TPESampler(
