@@ -40,6 +40,30 @@ def find_landmark_file(path: Path) -> Path | None:
     return place if place.is_file() and place != path else None
 
 
+def find_radio_file(path: Path) -> Path | None:
+    """Find the table of readings of radio beside a file, or in a folder of scans; None where there is none."""
+    place = path / RADIO_TABLE if path.is_dir() else path.with_name(f"{path.stem}.{RADIO_TABLE}")
+    return place if place.is_file() and place != path else None
+
+
+def read_tables_beside(path: Path, poses: str | None = None) -> list[Landmarks]:
+    """Read the tables beside a scan: of landmarks, and of readings of radio.
+
+    Args:
+        poses: the trajectory that the user names, for radio.
+
+    Raises:
+        InputError: as `read_landmark_file` and `radio_csv.read_radio_beside`.
+    """
+    landmarks, radio = find_landmark_file(path), find_radio_file(path)
+    found = [] if landmarks is None else [read_landmark_file(landmarks)]
+    if radio is not None:
+        from topomerge.io.radio_csv import read_radio_beside
+
+        found.append(read_radio_beside(radio, path, poses))
+    return found
+
+
 def read_landmark_file(path: Path) -> Landmarks:
     """Read a table of landmarks; its name is their source.
 

@@ -24,8 +24,8 @@ from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError, is_memory_short
 from topomerge.io import frame
 from topomerge.io.frame import get_axis_rotation
+from topomerge.io.landmarks import read_tables_beside
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_options
-from topomerge.io.radio_csv import read_tables_beside
 from topomerge.io.sightings import ObjectFinder
 from topomerge.types import (
     Array,

@@ -15,7 +15,6 @@ import numpy as np
 
 from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError
-from topomerge.io.landmarks import RADIO_TABLE, find_landmark_file, read_landmark_file
 from topomerge.io.trajectory import LONGEST_GAP, Trajectory, read_trajectory
 from topomerge.types import Landmarks, build_landmarks
 
@@ -29,23 +28,6 @@ SAME_SCAN = 0.5  # s between readings of one scan
 POSSIBLE = (-130.0, 20.0)  # dBm
 POSE_GAP = 5.0  # s from the nearest pose, up to which a reading has a place
 POSITION_SIGMA = 0.5  # m
-
-
-def read_tables_beside(path: Path, poses: str | None = None) -> list[Landmarks]:
-    """Read the tables beside a scan: of landmarks, and of readings of radio.
-
-    Raises:
-        InputError: as `read_landmark_file` and `read_radio_beside`.
-    """
-    landmarks, radio = find_landmark_file(path), find_radio_file(path)
-    found = [] if landmarks is None else [read_landmark_file(landmarks)]
-    return found if radio is None else [*found, read_radio_beside(radio, path, poses)]
-
-
-def find_radio_file(path: Path) -> Path | None:
-    """Find the table of readings beside a file (`a.radio.csv`), or in a folder (`radio.csv`); None where there is none."""
-    place = path / RADIO_TABLE if path.is_dir() else path.with_name(f"{path.stem}.{RADIO_TABLE}")
-    return place if place.is_file() and place != path else None
 
 
 def read_radio_beside(table: Path, path: Path, poses: str | None = None) -> Landmarks:
