@@ -194,7 +194,7 @@ def test_yaml_of_extend_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     pytest.importorskip("hydra")
     text = (ROOT / "docs" / "extend.md").read_text()
     added = re.findall(r"\*\*One YAML\*\*, `configs/(\w+)/(\w+)\.yaml`.*?```yaml\n(.*?)```", text, re.DOTALL)
-    assert len(added) == text.count("```yaml") == 6
+    assert len(added) == text.count("```yaml") == 7
     code = [
         re.findall(r"```python\n(.*?)```", text[text.index(head) :], re.DOTALL)[0] for head in ("### A task", "### A dataset")
     ]
@@ -202,7 +202,7 @@ def test_yaml_of_extend_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     (tmp_path / "page.py").write_text(
         "from torch import nn\nimport torch\nfrom topomerge.registry import *\n"
         "NODES.register('transformer')(nn.Linear)\nLOSSES.register('alignment')(print)\nPOINTS.register('extent')(nn.Linear)\n"
-        "OPTIMIZERS.register('nadam')(torch.optim.NAdam)\nSCHEDULES.register('halved')(max)\n"
+        "OPTIMIZERS.register('nadam')(torch.optim.NAdam)\nSCHEDULES.register('halved')(max)\nLOGGERS.register('lines')(print)\n"
         f"{classes}\nTASKS.register('area')(Task(Area, print, ('error',)))\n{code[1]}"
     )
     for group, name, block in added:
@@ -213,10 +213,11 @@ def test_yaml_of_extend_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         "s = c(['plugins=[page]', 'geometry=extent', 'node=transformer', 'loss=alignment',"
         " 'experiment=descent', 'data=twins', 'path=.']); check(s)\n"
         "print(s.network.geometry.parts, s.network.node.kind, s.loss.options, s.optimizer, s.schedule, s.data)\n"
+        "print(c(['plugins=[page]', 'experiment=told']).logger)\n"
         "print(c(['plugins=[page]', 'task=area']).watch)"
     )
     done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300)
-    assert done.stdout == "['extent'] transformer {'spread': 0.5} nadam halved twins\nerror\n", done.stderr
+    assert done.stdout == "['extent'] transformer {'spread': 0.5} nadam halved twins\n['lines']\nerror\n", done.stderr
 
 
 def test_every_formula_has_its_function() -> None:
