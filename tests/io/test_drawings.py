@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from PIL import Image, ImageDraw
 from scipy import ndimage
 from topomerge.datasets.drawings.hands import draw_plan
 from topomerge.datasets.drawings.pages import spoil_page
 from topomerge.datasets.drawings.shapes import DrawingShapes, OpeningShape, RoomShape
-from topomerge.datasets.drawings.sheet import Hand
+from topomerge.datasets.drawings.sheet import Hand, load_font
 
+from topomerge.extraction.extract import extract
 from topomerge.io.drawing import (
     PictureText,
     choose_zoom,
@@ -17,6 +19,7 @@ from topomerge.io.drawing import (
     is_drawing,
     parse_lengths,
 )
+from topomerge.io.points import read_points
 from topomerge.networks.drawing import DRAWING_CLASSES, compute_drawing_probabilities
 
 PLAIN = Hand("filled", (0, 0, 0), 0.25, 0.1, 2, False, "arc", "lines", 0.0, 0.0, 1.0, "m2", False, 3, 0.3)
@@ -192,3 +195,55 @@ def test_spoiled_pages_keep_their_truth():
         assert np.abs(shares[0] - shares[1]).max() < 0.2
         again = spoil_page(drawing, np.random.default_rng(seed))
         assert (again.picture == page.picture).all()
+
+
+def draw_case(path, labels=True):
+    """A plan with a hall and four rooms as an estate agent's program draws it: 0.02 m a pixel."""
+    picture = Image.new("RGB", (760, 600), "white")
+    pen = ImageDraw.Draw(picture)
+    for wall in ((80, 70, 680, 84), (80, 506, 680, 520), (80, 70, 94, 520), (666, 70, 680, 520)):
+        pen.rectangle(wall, fill="black")
+    for wall in ((80, 268, 680, 276), (80, 336, 680, 344), (376, 70, 384, 276), (326, 336, 334, 520)):
+        pen.rectangle(wall, fill="black")
+    pen.rectangle((78, 277, 96, 335), fill="white")
+    for x, y, way in ((200, 268, -1), (500, 268, -1), (180, 336, 1), (480, 336, 1)):
+        pen.rectangle((x, y, x + 45, y + 8), fill="white")
+        face = y if way < 0 else y + 8
+        pen.line((x, face, x, face + way * 45), fill="black", width=2)
+        pen.arc((x - 45, face - 45, x + 45, face + 45), *((270, 360) if way < 0 else (0, 90)), fill="black")
+    for x0, y0 in ((150, 70), (480, 70), (150, 506), (500, 506)):
+        pen.rectangle((x0, y0, x0 + 80, y0 + 14), fill="white", outline="black")
+        pen.line((x0, y0 + 7, x0 + 80, y0 + 7), fill="black")
+    if labels:
+        font = load_font(0, 24)
+        for text, place in (("BEDROOM", (230, 160)), ("LIVING", (520, 160)), ("HALL", (370, 306)), ("OFFICE", (500, 440))):
+            pen.text(place, text, fill="black", font=font, anchor="mm")
+    picture.save(path)
+    return path
+
+
+@pytest.mark.parametrize("labels", [True, False])
+def test_a_drawn_plan_has_its_rooms_and_nothing_outside(tmp_path, labels):
+    map = extract(read_points(draw_case(tmp_path / "plan.png", labels), resolution=0.02, text=False))
+    assert len(map.rooms) == 5 and (map.rooms["outside"] < 0.5).all()
+    assert sorted(np.bincount(map.edges["rooms"].ravel(), minlength=5).tolist()) == [1, 1, 1, 1, 4]
+    assert map.rooms["area"].sum() == pytest.approx(11.4 * 8.2, rel=0.12)
+    assert any("read as a drawn plan" in warning for warning in map.warnings)
+
+
+def test_without_the_parsing_the_page_is_floor(tmp_path):
+    map = extract(read_points(draw_case(tmp_path / "plan.png"), resolution=0.02, drawing=False))
+    assert len(map.rooms) > 5
+
+
+def test_the_case_of_a_plan_with_labels(case_dir):
+    map = extract(read_points(case_dir / "plan-with-labels" / "plan.png", resolution=0.02))
+    assert len(map.rooms) == 5 and len(map.edges) == 4 and (map.rooms["outside"] < 0.5).all()
+
+
+def test_names_and_scale_are_read_where_the_reader_is_installed(case_dir):
+    pytest.importorskip("rapidocr_onnxruntime")
+    map = extract(read_points(case_dir / "plan-with-labels" / "plan.png"))
+    assert len(map.rooms) == 5 and map.rooms["area"].sum() == pytest.approx(98, rel=0.1)
+    names = dict(zip(map.landmarks.get_values(), map.landmarks.table["room"].tolist(), strict=True))
+    assert {"BEDROOM", "LIVING", "HALL", "KITCHEN", "OFFICE"} <= set(names) and len(set(names.values())) == 5

@@ -103,3 +103,9 @@ def test_cells_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     for _ in range(50):  # the same cells over and over
         again.add(rng.uniform(0, 0.6, (500, 3)), np.ones(500, int))
     assert not again.is_full and len(again.find_objects("a")) == 1
+
+
+def test_classes_at_the_ends_of_the_world_are_apart(recwarn):
+    """A fuzzed cloud had points so far apart that their cells could not be numbered."""
+    keys = np.array([[1, 0, 0, 0], [1, 2**40, 2**40, 2**40]], np.int64)
+    assert len(set(sightings._label_clusters(keys).tolist())) == 2 and not recwarn.list

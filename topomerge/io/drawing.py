@@ -31,6 +31,7 @@ PLAUSIBLE_AREA, PLAUSIBLE_SIDE = (0.8, 3000.0), (0.6, 100.0)  # m2, m
 FEWEST_PIXELS = 30  # of a room that gives a scale
 AGREEING = 0.12  # of the logarithm of the scale: texts that differ more from the median are not of their room
 NAME_HEIGHT = 1.2  # m above the floor at which the name of a room is placed
+ALIKE = 0.3  # likewise, of how long rooms are for their width
 DOOR_WIDTH, DOOR_SPREAD = 0.82, 0.12  # m, usual clear width of drawn doors, and its spread as a logarithm
 
 NUMBER = r"(\d{1,5}(?:[.,]\d{1,3})?)"
@@ -86,6 +87,7 @@ class DrawingScale:
 
 
 LEAST_PIXELS = 100  # of a side of a page
+SMALL_PICTURE = 1000  # px of its longer side, below which letters are enlarged
 
 
 def is_drawing(bright: Array, clear: Array) -> bool:
@@ -134,7 +136,7 @@ def resize_picture(picture: Array, zoom: float) -> Array:
     if zoom == 1.0:
         return picture
     size = max(round(picture.shape[1] * zoom), 1), max(round(picture.shape[0] * zoom), 1)
-    how = Image.Resampling.BOX if zoom < 1 else Image.Resampling.BILINEAR
+    how = Image.Resampling.BOX if zoom < 1 else Image.Resampling.BICUBIC
     return np.asarray(Image.fromarray(picture).resize(size, how))
 
 
@@ -206,8 +208,8 @@ def find_name(text: str) -> str:
 def estimate_scale(drawing: ParsedDrawing, texts: Sequence[PictureText]) -> DrawingScale | None:
     """Estimate the size of a pixel by the areas and sides that are written in rooms; else by the width of doors.
 
-    Each text that lies in a room says how long a pixel is: by the room's area, or by its box. The median decides; texts that
-    differ from it by more than `AGREEING` are left out.
+    Each text that lies in a room says how long a pixel is: by the room's area, or by its box. The largest group of texts that
+    agree decides, of alike ones that which doors are nearer to.
 
     Returns:
         None where neither texts nor doors say anything.
@@ -229,17 +231,20 @@ def estimate_scale(drawing: ParsedDrawing, texts: Sequence[PictureText]) -> Draw
         if sides is not None:
             box = sorted(float(v) for v in inside.shape)
             small, large = sorted(sides)
-            found.append((np.sqrt(small * large / (box[0] * box[1])), text.text))
-    if found:
-        logs = np.log([value for value, _ in found])
-        middle = np.median(logs)
-        agree = np.abs(logs - middle) <= AGREEING
-        if agree.sum() * 2 > len(logs) or len(logs) == 1:
-            middle = float(np.median(logs[agree]))
-            spread = 0.05 / np.sqrt(agree.sum()) if agree.sum() > 1 else 0.1
-            reasons = tuple(dict.fromkeys(text for (_, text), good in zip(found, agree, strict=True) if good))
-            return DrawingScale(float(np.exp(middle)) * drawing.zoom, float(spread), reasons)
-    return _estimate_scale_by_doors(drawing)
+            if abs(np.log(small / box[0] * box[1] / large)) <= ALIKE:  # else the text is not of this box
+                found.append((np.sqrt(small * large / (box[0] * box[1])), text.text))
+    by_doors = _estimate_scale_by_doors(drawing)
+    if not found:
+        return by_doors
+    logs = np.log([value for value, _ in found])
+    agree = np.abs(logs[:, None] - logs) <= AGREEING
+    votes = agree.sum(axis=1).astype(float)
+    if by_doors is not None:  # where as many speak for one as for another
+        votes -= 0.5 * np.minimum(np.abs(logs - np.log(by_doors.resolution / drawing.zoom)), 1.0)
+    kept = agree[int(votes.argmax())]
+    spread = 0.05 / np.sqrt(kept.sum()) if kept.sum() > 1 else 0.1
+    reasons = tuple(dict.fromkeys(text for (_, text), good in zip(found, kept, strict=True) if good))
+    return DrawingScale(float(np.exp(np.median(logs[kept]))) * drawing.zoom, float(spread), reasons)
 
 
 def _find_room(rooms: Array, text: PictureText, zoom: float) -> int:
@@ -355,13 +360,14 @@ def build_name_landmarks(
 
 
 def read_texts(picture: Array) -> tuple[PictureText, ...] | None:
-    """Read the texts of a picture (h, w, 3); None where the extra `text` is not installed."""
+    """Read the texts of a picture (h, w, 3); None where the extra `text` is not installed. Small pictures are enlarged first."""
     reader = load_text_reader()
     if reader is None:
         return None
+    finer = 2.0 if max(picture.shape[:2]) < SMALL_PICTURE else 1.0
     out = []
-    for corners, text, confidence in reader(picture):
-        middle = corners.mean(axis=0)
-        height = float(np.hypot(*(corners[3] - corners[0])))
+    for corners, text, confidence in reader(resize_picture(picture, finer)):
+        middle = corners.mean(axis=0) / finer
+        height = float(np.hypot(*(corners[3] - corners[0]))) / finer
         out.append(PictureText(clean_text(text), (float(middle[0]), float(middle[1])), height, confidence))
     return tuple(out)

@@ -193,6 +193,7 @@ SMALLEST_OBJECT, LARGEST_OBJECT = 0.1, 3.0  # m; walls, floors and ceilings are 
 LEAST_OBJECT_POINTS = 20
 MOST_CLASSES = 256  # more are numbers of things, not of classes
 MOST_OBJECT_CELLS = 4_000_000
+MOST_CODES = 2.0**62  # of cells that can be numbered
 HALF = np.array([(i, j, k) for i in (0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if (i, j, k) > (0, 0, 0)])
 
 
@@ -257,6 +258,8 @@ def _label_clusters(keys: Array) -> Array:
 
     low = keys.min(axis=0)
     span = keys.max(axis=0) - low + 3
+    if np.prod(span.astype(np.float64)) > MOST_CODES:  # nothing is near anything there
+        return np.arange(len(keys))
     scale = np.array([span[1] * span[2] * span[3], span[2] * span[3], span[3], 1])
     codes = (keys - low + 1) @ scale
     order = np.argsort(codes, kind="stable")
