@@ -88,6 +88,9 @@ def indexed(small: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
     return folder
 
 
+LEAST_SHARE = 1e-4  # of the probability: maps with less come in any order
+
+
 @pytest.mark.longer
 def test_a_shortlist_gives_what_the_comparison_with_all_maps_gives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     maps = many_maps()
@@ -99,7 +102,8 @@ def test_a_shortlist_gives_what_the_comparison_with_all_maps_gives(tmp_path: Pat
             [str(m) for m in range(MAPS)], [replace(m, rows=m.rows.astype(np.float32)) for m in maps], new, 3
         )
         shown = look(folder, new, 3, monkeypatch)
-        assert shown[0].name == str(k) and [s.name for s in shown] == [s.name for s in among_all]
+        counted, expected = ([s.name for s in some if s.share > LEAST_SHARE] for some in (shown, among_all))
+        assert shown[0].name == str(k) and counted == expected and len(shown) == 3
         assert shown[0].rooms[0][:2] == among_all[0].rooms[0][:2] and shown[0].share >= among_all[0].share - 1e-9
     assert not (folder / INDEX_FILE).exists() and (folder / ROOMS_FILE).read_bytes() == written
     assert len(look(folder, seen_again(maps, 1), MAPS, monkeypatch)) == MAPS  # who asks for all gets all
