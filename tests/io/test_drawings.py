@@ -168,6 +168,24 @@ def test_grids_of_robots_are_no_drawings():
     assert not is_drawing(page[:50, :50], np.zeros((50, 50), bool))
 
 
+def test_rooms_painted_in_colours_as_bright_as_unknown_are_no_grid():
+    page = np.full((200, 200, 3), 255, np.uint8)
+    page[50:150, 50:150] = 222, 205, 188
+    bright = page.mean(axis=2) / 255
+    assert is_drawing(bright, np.zeros(bright.shape, bool), page)
+    page[50:150, 50:150] = 205
+    assert not is_drawing(page.mean(axis=2) / 255, np.zeros(bright.shape, bool), page)
+
+
+def test_floor_without_walls_is_no_room():
+    classes = np.full((200, 200), DRAWING_CLASSES.index("page"))
+    classes[20:100, 20:100] = DRAWING_CLASSES.index("wall")
+    classes[24:96, 24:96] = DRAWING_CLASSES.index("floor")
+    classes[130:190, 130:190] = DRAWING_CLASSES.index("floor")
+    parsed = find_structure(one_hot(classes), 1.0, 20.0)
+    assert parsed.free[50, 50] and not parsed.free[160, 160]
+
+
 def test_pictures_are_looked_at_in_pixels_that_the_network_knows():
     assert choose_zoom((800, 600), 0.05) == 1.0
     assert choose_zoom((800, 600), 0.01) == pytest.approx(1 / 4)

@@ -22,10 +22,12 @@ FINEST, COARSEST = 0.04, 0.12  # m a pixel: what the network was trained on lies
 LONGEST_SIDE = 640  # px at which a picture of unknown scale is looked at
 BRIGHT, BRIGHT_SHARE = 0.6, 0.8  # of the brightness, and of the pixels along the border of a page
 GREY_OF_UNKNOWN, GREY_WIDTH, GREY_SHARE = 205, 6, 0.03  # levels of 255: a robot's grid has so much of it
+COLOURLESS = 8  # levels of 255 between red, green and blue
 SMALLEST_ROOM, SMALLEST_WALL, SMALLEST_DOOR = 0.7, 0.35, 0.04  # m2: less is a letter or a mark
 USUAL_SCALE = 25.0  # px/m, where none is known
 WALL_NEAR = 0.5  # m from a room: what lies farther off is no wall of the building
 GAP = 3  # px of walls that the network missed
+WALLED = 0.4  # of a room's outline is wall or door, at least
 FOOT, INCH = 0.3048, 0.0254  # m
 PLAUSIBLE_AREA, PLAUSIBLE_SIDE = (0.8, 3000.0), (0.6, 100.0)  # m2, m
 FEWEST_PIXELS = 30  # of a room that gives a scale
@@ -90,16 +92,18 @@ LEAST_PIXELS = 100  # of a side of a page
 SMALL_PICTURE = 1000  # px of its longer side, below which letters are enlarged
 
 
-def is_drawing(bright: Array, clear: Array) -> bool:
+def is_drawing(bright: Array, clear: Array, picture: Array | None = None) -> bool:
     """Return whether a picture is a drawing on a page, and not the grid of a robot.
 
     Args:
         bright: (h, w) of 0..1; clear: (h, w) bool, transparent.
+        picture: (h, w, 3) uint8, its colours: what has any is no grey of unknown.
     """
     if min(bright.shape) < LEAST_PIXELS:
         return False
     levels = np.round(np.nan_to_num(np.where(clear, 1.0, bright)).clip(0, 1) * 255).astype(np.int32)
-    histogram = np.bincount(levels.ravel(), minlength=256) / levels.size
+    grey = np.ones(levels.shape, bool) if picture is None else np.ptp(picture, axis=2) <= COLOURLESS
+    histogram = np.bincount(levels[grey], minlength=256) / levels.size
     unknown = histogram[GREY_OF_UNKNOWN - GREY_WIDTH : GREY_OF_UNKNOWN + GREY_WIDTH + 1]
     if unknown.sum() > GREY_SHARE and unknown.max() > 0.6 * unknown.sum():
         return False
@@ -162,11 +166,23 @@ def find_structure(probability: Array, zoom: float, scale: float | None) -> Pars
     page = ndimage.mean(probability[..., PAGE], label, numbers) if count else np.zeros(0)
     floor = ndimage.mean(probability[..., FLOOR], label, numbers) if count else np.zeros(0)
     size = ndimage.sum(label > 0, label, numbers) if count else np.zeros(0)
-    rooms = np.append(False, (page < floor) & (size >= SMALLEST_ROOM * known**2))[label]
+    walled = measure_walled_share(label, count, occupied | door)
+    rooms = np.append(False, (page < floor) & (size >= SMALLEST_ROOM * known**2) & (walled >= WALLED))[label]
     doors, _ = ndimage.label(door)
     door &= np.isin(doors, np.unique(doors[ndimage.binary_dilation(rooms, np.ones((3, 3)), 2)]))
     near = ndimage.distance_transform_edt(~(rooms | door)) <= WALL_NEAR * known
     return ParsedDrawing(occupied & near, rooms | door, door, window & near, zoom)
+
+
+def measure_walled_share(label: Array, count: int, wall: Array) -> Array:
+    """Measure the share of the outline of each part of a label image (h, w) that is wall or door: (count,)."""
+    out = np.zeros(count)
+    for number, box in enumerate(ndimage.find_objects(label, count), 1):
+        wide = tuple(slice(max(side.start - 2, 0), side.stop + 2) for side in box)
+        part = label[wide] == number
+        outline = ndimage.binary_dilation(part, np.ones((3, 3)), 2) & ~part
+        out[number - 1] = wall[wide][outline].mean() if outline.any() else 0.0
+    return out
 
 
 def drop_small(mask: Array, least: float) -> Array:
