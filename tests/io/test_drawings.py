@@ -265,3 +265,12 @@ def test_names_and_scale_are_read_where_the_reader_is_installed(case_dir):
     assert len(map.rooms) == 5 and map.rooms["area"].sum() == pytest.approx(98, rel=0.1)
     names = dict(zip(map.landmarks.get_values(), map.landmarks.table["room"].tolist(), strict=True))
     assert {"BEDROOM", "LIVING", "HALL", "KITCHEN", "OFFICE"} <= set(names) and len(set(names.values())) == 5
+
+
+def test_a_plan_painted_in_colours_is_read_as_a_drawing(tmp_path):
+    path = draw_case(tmp_path / "plan.png")
+    pixels = np.array(Image.open(path))
+    pixels[90:260, 100:370][(pixels[90:260, 100:370] > 250).all(axis=2)] = 222, 205, 188
+    Image.fromarray(pixels).save(path)
+    map = extract(read_points(path, resolution=0.02, text=False))
+    assert len(map.rooms) == 5 and any("read as a drawn plan" in warning for warning in map.warnings)

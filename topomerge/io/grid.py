@@ -224,10 +224,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         if options.resolution is not None:
             raise InputError(f"{path}: states its own resolution of {plan.resolution:g} m; leave --resolution out")
         occupied, free, doubts = read_pixels(path, plan)
-    elif options.drawing and is_drawing(*read_image(path)):
-        yield from build_drawn_pieces(
-            path, trace_drawing(path, read_picture(path), options.resolution, text=options.text), options
-        )
+    elif options.drawing and is_drawing(*read_image(path), picture := read_picture(path)):
+        yield from build_drawn_pieces(path, trace_drawing(path, picture, options.resolution, text=options.text), options)
         return
     elif options.resolution is None:
         beside = next((b for b in (path.with_suffix(".yaml"), path.with_suffix(".yml")) if b.is_file()), None)
