@@ -28,20 +28,26 @@ def handlers() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-def as_compiler(file: str) -> Callable[[Callable[[], Any]], list[str]]:
+def as_compiler(file: str, name: str = "call") -> Callable[[Callable[[], Any]], list[str]]:
     """A function of a file that calls another one and swallows what it raises, as a callback from C does."""
     space: dict[str, Any] = {}
     source = (
-        "def call(f):\n    try:\n        f()\n    except BaseException as e:\n        return [type(e).__name__]\n    return []"
+        f"def {name}(f):\n    try:\n        f()\n    except BaseException as e:\n        return [type(e).__name__]\n    return []"
     )
     exec(compile(source, file, "exec"), space)
-    call: Callable[[Callable[[], Any]], list[str]] = space["call"]
+    call: Callable[[Callable[[], Any]], list[str]] = space[name]
     return call
 
 
+DEAF = ((os.sep + os.path.join("lib", "llvmlite", "binding", "ffi.py"), "call"), ("<frozen importlib._bootstrap>", "cb"))
+
+
+@pytest.mark.parametrize(("file", "name"), DEAF)
 @pytest.mark.parametrize(("number", "error"), [(signal.SIGTERM, SystemExit), (signal.SIGINT, KeyboardInterrupt)])
-def test_a_signal_within_the_compiler_is_raised_when_it_has_returned(number: int, error: type[BaseException]) -> None:
-    call = as_compiler(os.sep + os.path.join("lib", "llvmlite", "binding", "ffi.py"))
+def test_a_signal_where_it_would_be_lost_is_raised_afterwards(
+    number: int, error: type[BaseException], file: str, name: str
+) -> None:
+    call = as_compiler(file, name)
 
     def compile_and_go_on() -> None:
         assert call(lambda: os.kill(os.getpid(), number)) == []

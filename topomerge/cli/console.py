@@ -323,16 +323,20 @@ def write_all(outputs: Sequence[tuple[str | Path, Callable[[Path], None]]]) -> N
 
 
 COMPILER = f"{os.sep}llvmlite{os.sep}"
+IMPORTER, CALLBACK = "<frozen importlib._bootstrap>", "cb"  # of its locks: what is raised in there is printed and lost
 ASK_AGAIN = 0.1  # s
 
 
 def exit_on_signals() -> None:
-    """Exit on signals from now on: SIGINT raises KeyboardInterrupt, SIGTERM SystemExit(143), never within the compiler."""
+    """Exit on signals from now on: SIGINT raises KeyboardInterrupt, SIGTERM SystemExit(143).
+
+    Neither within the compiler nor within a callback of imports, where it would be lost: a moment later.
+    """
     asked: list[int] = []
 
     def leave(number: int, frame: FrameType | None) -> None:
         asked.append(number)
-        if hasattr(signal, "setitimer") and _is_within_compiler(frame):
+        if hasattr(signal, "setitimer") and _is_deaf(frame):
             signal.setitimer(signal.ITIMER_REAL, ASK_AGAIN)
         elif asked[0] == signal.SIGINT:
             raise KeyboardInterrupt
@@ -344,11 +348,14 @@ def exit_on_signals() -> None:
             signal.signal(getattr(signal, name), leave)
 
 
-def _is_within_compiler(frame: FrameType | None) -> bool:
-    """Is any function on the stack the compiler's?"""
-    while frame is not None and COMPILER not in frame.f_code.co_filename:
+def _is_deaf(frame: FrameType | None) -> bool:
+    """Would an exception be lost here: is any function on the stack the compiler's, or a callback of the importer's locks?"""
+    while frame is not None:
+        code = frame.f_code
+        if COMPILER in code.co_filename or (code.co_filename == IMPORTER and code.co_name == CALLBACK):
+            return True
         frame = frame.f_back
-    return frame is not None
+    return False
 
 
 Argument = tuple[tuple[str, ...], dict[str, Any]]
