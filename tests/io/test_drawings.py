@@ -260,7 +260,7 @@ def test_the_case_of_a_plan_with_labels(case_dir):
 
 
 def test_names_and_scale_are_read_where_the_reader_is_installed(case_dir):
-    pytest.importorskip("rapidocr_onnxruntime")
+    pytest.importorskip("rapidocr_onnxruntime", exc_type=ImportError)
     map = extract(read_points(case_dir / "plan-with-labels" / "plan.png"))
     assert len(map.rooms) == 5 and map.rooms["area"].sum() == pytest.approx(98, rel=0.1)
     names = dict(zip(map.landmarks.get_values(), map.landmarks.table["room"].tolist(), strict=True))
