@@ -143,8 +143,8 @@ def corridor_messages(poses: np.ndarray, depth: str, packed: bool) -> Any:
 @pytest.mark.parametrize(("kind", "depth", "packed"), [("bag", "images", False), ("mcap", "laser", True)])
 def test_signs_and_tags_on_pictures(tmp_path: Path, kind: str, depth: str, packed: bool) -> None:
     """As deep as the points of the bag say, whatever took them."""
-    pytest.importorskip("rapidocr_onnxruntime")
-    pytest.importorskip("pupil_apriltags")
+    pytest.importorskip("rapidocr_onnxruntime", exc_type=ImportError)
+    pytest.importorskip("pupil_apriltags", exc_type=ImportError)
     path = write_bag(tmp_path, kind, corridor_messages(poses_before_signs(), depth, packed))
     assert_hang(read_points(path).landmarks, SIGNS + TAG_SIGNS, reach=0.12)
     assert read_points(path, text=False).landmarks is None

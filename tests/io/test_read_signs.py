@@ -58,8 +58,8 @@ def assert_hang(landmarks: Landmarks | None, signs: tuple[Sign, ...], reach: flo
 
 
 def test_signs_and_tags_of_a_folder(tmp_path: Path) -> None:
-    pytest.importorskip("rapidocr_onnxruntime")
-    pytest.importorskip("pupil_apriltags")
+    pytest.importorskip("rapidocr_onnxruntime", exc_type=ImportError)
+    pytest.importorskip("pupil_apriltags", exc_type=ImportError)
     cloud = read_points(write_corridor(tmp_path / "walk", walk_poses()))
     assert_hang(cloud.landmarks, SIGNS + TAG_SIGNS)
     assert cloud.landmarks is not None and cloud.landmarks.sources == ("pictures",)
@@ -69,7 +69,7 @@ def test_signs_and_tags_of_a_folder(tmp_path: Path) -> None:
 
 def test_parts_of_signs_are_not_signs(tmp_path: Path) -> None:
     """Pictures that cut a sign off show a part of it."""
-    pytest.importorskip("rapidocr_onnxruntime")
+    pytest.importorskip("rapidocr_onnxruntime", exc_type=ImportError)
     poses = [looking(np.pi / 2 + turn, (4.6, 0.9, 1.5)) for turn in (0.3, 0.1, -0.1, -0.7, -0.75)]
     cut = take_picture(poses[-1])[0]
     found = pictures.load_text_reader()

@@ -83,8 +83,8 @@ def test_radio_and_pressure_of_nodes(tmp_path: Path) -> None:
 @pytest.mark.parametrize("laser", [False, True])
 def test_signs_on_pictures_of_nodes(tmp_path: Path, laser: bool) -> None:
     """Also where the points are those of a laser."""
-    pytest.importorskip("rapidocr_onnxruntime")
-    pytest.importorskip("pupil_apriltags")
+    pytest.importorskip("rapidocr_onnxruntime", exc_type=ImportError)
+    pytest.importorskip("pupil_apriltags", exc_type=ImportError)
     nodes = picture_nodes(poses_before_signs())
     if laser:
         points, info = room_walk().scans[0].astype("<f4")[None], scan_info_bytes("0.23.0", XYZ, np.eye(4))
