@@ -175,11 +175,11 @@ def _draw_opening(sheet: Sheet, opening: OpeningShape, hand: Hand, walls: Array,
     if opening.kind != "door" or hand.doors == "gap":
         return
     if hand.doors in ("threshold", "box"):
-        sheet.line(quad[[0, 1]], ink, thin)
-        sheet.line(quad[[3, 2]], ink, thin)
+        sheet.draw_line(quad[[0, 1]], ink, thin)
+        sheet.draw_line(quad[[3, 2]], ink, thin)
         if hand.doors == "box":
-            sheet.line(quad[[0, 3]], ink, thin)
-            sheet.line(quad[[1, 2]], ink, thin)
+            sheet.draw_line(quad[[0, 3]], ink, thin)
+            sheet.draw_line(quad[[1, 2]], ink, thin)
         return
     side = 1.0 if rng.random() < 0.5 else -1.0
     out = normal * side
@@ -191,9 +191,9 @@ def _draw_opening(sheet: Sheet, opening: OpeningShape, hand: Hand, walls: Array,
     for hinge, way, length in leaves:
         angle = np.linspace(0, swing, 14)[:, None]
         arc = hinge + face + length * (np.cos(angle) * way + np.sin(angle) * out)
-        sheet.line(np.stack([hinge + face, arc[-1]]), ink, max(thin, 2), SYMBOL)
+        sheet.draw_line(np.stack([hinge + face, arc[-1]]), ink, max(thin, 2), SYMBOL)
         if hand.doors == "arc":
-            sheet.line(arc, ink, max(thin - 1, 1), SYMBOL)
+            sheet.draw_line(arc, ink, max(thin - 1, 1), SYMBOL)
     sheet.fill(quad, None, DOOR)
 
 
@@ -215,10 +215,10 @@ def _draw_window(sheet: Sheet, quad: Array, hand: Hand) -> None:
     a, b, c, d = quad
     if hand.windows == "blue":
         sheet.fill(quad, (170, 205, 235))
-    sheet.line(quad[[0, 1, 2, 3, 0]], hand.ink, hand.line)
+    sheet.draw_line(quad[[0, 1, 2, 3, 0]], hand.ink, hand.line)
     shares = {"lines": (0.35, 0.65), "one": (0.5,), "box": (), "blue": (0.5,), "plain": (0.33, 0.5, 0.67)}[hand.windows]
     for share in shares:
-        sheet.line(np.stack([a + (d - a) * share, b + (c - b) * share]), hand.ink, max(hand.line - 1, 1))
+        sheet.draw_line(np.stack([a + (d - a) * share, b + (c - b) * share]), hand.ink, max(hand.line - 1, 1))
 
 
 def format_area(area: float, width: float, depth: float, style: str) -> list[str]:
@@ -266,9 +266,9 @@ def _draw_dimensions(sheet: Sheet, shapes: DrawingShapes, hand: Hand, rng: np.ra
         )
         chain = np.zeros((len(stops), 2))
         chain[:, axis], chain[:, 1 - axis] = stops, level
-        sheet.line(chain[[0, -1]], hand.ink, hand.line, TEXT)
+        sheet.draw_line(chain[[0, -1]], hand.ink, hand.line, TEXT)
         for k, stop in enumerate(chain):
-            sheet.line(np.stack([stop - tick, stop + tick]), hand.ink, hand.line, TEXT)
+            sheet.draw_line(np.stack([stop - tick, stop + tick]), hand.ink, hand.line, TEXT)
             if k + 1 < len(chain):
                 column, row = sheet.place((stop + chain[k + 1]) / 2)[0]
                 at = column, row - 0.25 * sheet.scale

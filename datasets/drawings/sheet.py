@@ -121,7 +121,7 @@ class Sheet:
         if kind is not None:
             self.mark.polygon(corners, fill=kind)
 
-    def line(self, points: Array, colour: tuple[int, int, int], width: int, kind: int | None = None) -> None:
+    def draw_line(self, points: Array, colour: tuple[int, int, int], width: int, kind: int | None = None) -> None:
         """Draw a line through points."""
         corners = self.place(points)
         self.draw.line(corners, fill=colour, width=width, joint="curve")

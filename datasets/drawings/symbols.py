@@ -32,10 +32,10 @@ def draw_treads(sheet: Sheet, rectangle: Array, hand: Hand, rng: np.random.Gener
     a, b, c, d = rectangle
     count = max(int(np.hypot(*(b - a)) / 0.28), 3)
     for share in np.linspace(0, 1, count + 1):
-        sheet.line(np.stack([a + (b - a) * share, d + (c - d) * share]), hand.ink, hand.line, STAIRS)
-    sheet.line(np.stack([a, b, c, d, a]), hand.ink, hand.line, STAIRS)
+        sheet.draw_line(np.stack([a + (b - a) * share, d + (c - d) * share]), hand.ink, hand.line, STAIRS)
+    sheet.draw_line(np.stack([a, b, c, d, a]), hand.ink, hand.line, STAIRS)
     middle = (a + d) / 2, (b + c) / 2
-    sheet.line(np.stack(middle), hand.ink, hand.line, STAIRS)
+    sheet.draw_line(np.stack(middle), hand.ink, hand.line, STAIRS)
 
 
 def furnish_rooms(sheet: Sheet, shapes: DrawingShapes, hand: Hand, rng: np.random.Generator) -> None:
@@ -68,7 +68,7 @@ def _draw_routes(sheet: Sheet, shapes: DrawingShapes, rng: np.random.Generator) 
         if doors:
             ends = np.stack([middles[int(rng.integers(len(middles)))], doors[int(rng.integers(len(doors)))]])
             if float(np.hypot(*np.ptp(ends, axis=0))) < 8:
-                sheet.line(ends, colour, max(int(0.08 * sheet.scale), 3), SYMBOL)
+                sheet.draw_line(ends, colour, max(int(0.08 * sheet.scale), 3), SYMBOL)
         (x, y), r = sheet.place(middles[int(rng.integers(len(middles)))])[0], rng.uniform(0.15, 0.4) * sheet.scale
         for image, ink in ((sheet.draw, colour), (sheet.mark, SYMBOL)):
             image.rectangle([x - r, y - r, x + r, y + r], fill=ink)

@@ -87,6 +87,7 @@ def test_what_is_noted_is_not_compiled_again(tmp_path: Path, monkeypatch: pytest
 def test_a_folder_that_cannot_be_written_is_left(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     ahead.compile_missing(tmp_path / "file" / "below", 1)  # they are compiled when they are called
+    assert [path.name for path in tmp_path.iterdir()] == ["file"] and not (tmp_path / "file").read_text()
 
 
 def test_slices_cover_the_range_in_order(three_threads: object) -> None:
