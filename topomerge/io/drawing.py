@@ -99,16 +99,20 @@ def is_drawing(bright: Array, clear: Array, picture: Array | None = None) -> boo
         bright: (h, w) of 0..1; clear: (h, w) bool, transparent.
         picture: (h, w, 3) uint8, its colours: what has any is no grey of unknown.
     """
-    if min(bright.shape) < LEAST_PIXELS:
+    if min(bright.shape) < LEAST_PIXELS or not has_bright_border(bright, clear):
         return False
     levels = np.round(np.nan_to_num(np.where(clear, 1.0, bright)).clip(0, 1) * 255).astype(np.int32)
     grey = np.ones(levels.shape, bool) if picture is None else np.ptp(picture, axis=2) <= COLOURLESS
     histogram = np.bincount(levels[grey], minlength=256) / levels.size
     unknown = histogram[GREY_OF_UNKNOWN - GREY_WIDTH : GREY_OF_UNKNOWN + GREY_WIDTH + 1]
-    if unknown.sum() > GREY_SHARE and unknown.max() > 0.6 * unknown.sum():
-        return False
-    border = np.concatenate([levels[0], levels[-1], levels[:, 0], levels[:, -1]])
-    return bool((border > BRIGHT * 255).mean() >= BRIGHT_SHARE)
+    return not (unknown.sum() > GREY_SHARE and unknown.max() > 0.6 * unknown.sum())
+
+
+def has_bright_border(bright: Array, clear: Array) -> bool:
+    """Return whether the border of a picture is that of a page: (h, w) of 0..1, and whether it is transparent."""
+    lines = [np.where(clear[at], 1.0, bright[at]) for at in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1])]
+    levels = np.round(np.nan_to_num(np.concatenate(lines)).clip(0, 1) * 255)
+    return bool((levels > BRIGHT * 255).mean() >= BRIGHT_SHARE)
 
 
 def parse_drawing(picture: Array, resolution: float | None = None, network: Run | None = None) -> ParsedDrawing:

@@ -19,6 +19,7 @@ from topomerge.io.drawing import (
     NAME_HEIGHT,
     TracedDrawing,
     build_name_landmarks,
+    has_bright_border,
     is_drawing,
     trace_drawing,
 )
@@ -224,8 +225,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         if options.resolution is not None:
             raise InputError(f"{path}: states its own resolution of {plan.resolution:g} m; leave --resolution out")
         occupied, free, doubts = read_pixels(path, plan)
-    elif options.drawing and is_drawing(*read_image(path), picture := read_picture(path)):
-        yield from build_drawn_pieces(path, trace_drawing(path, picture, options.resolution, text=options.text), options)
+    elif options.drawing and has_bright_border(*(page := read_image(path))) and is_drawing(*page, drawn := read_picture(path)):
+        yield from build_drawn_pieces(path, trace_drawing(path, drawn, options.resolution, text=options.text), options)
         return
     elif options.resolution is None:
         beside = next((b for b in (path.with_suffix(".yaml"), path.with_suffix(".yml")) if b.is_file()), None)
