@@ -222,7 +222,9 @@ class NodeEncoder(nn.Module):
     """(R, width) -> (R, out): each room with what it learns from its neighbours.
 
     Layers are of `topomerge.registry.NODES`, whose entries take the settings and a number of channels. A layer takes rooms
-    (R, channels), edge_index (2, E) and, where edges have features, these (E, settings.width); it gives (R, channels).
+    (R, channels), edge_index (2, E) and, where edges have features, these (E, settings.width); it gives (R, channels). A layer with
+    a true attribute `reads_map`, such as attention between all rooms of a map, gets `map=` as well: the number of each room's map
+    (R,) int64, or None where all rooms are of one map.
 
     Args:
         settings: kind of layer and how they are stacked; kind `none` gives the rooms back.
@@ -258,12 +260,14 @@ class NodeEncoder(nn.Module):
         pair_index: Tensor | None,
         pair_attr: Tensor | None,
         way: Tensor | None = None,
+        map: Tensor | None = None,
     ) -> Tensor:
         edges = self._encode_edges(edge_attr, pair_index, pair_attr, way)
         ways = edge_index.flip(0)  # edges lead from a room to its neighbours; messages come back
         states = [rooms]
         for layer, norm in zip(self.layers, self.norms, strict=True):
-            update = layer(states[-1], ways) if edges is None else layer(states[-1], ways, edges)
+            inputs = (states[-1], ways) if edges is None else (states[-1], ways, edges)
+            update = layer(*inputs, map=map) if getattr(layer, "reads_map", False) else layer(*inputs)
             update = self.drop(torch.relu(norm(update)))
             states.append(states[-1] + update if self.settings.skip else update)
         if self.settings.jump == "cat":

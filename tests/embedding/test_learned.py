@@ -126,22 +126,37 @@ def test_every_encoder_is_as_with_torch(torch, name, tmp_path):
     assert all(torch.equal(left[key], right[key]) for key in right)
 
 
-def test_a_node_encoder_of_somebody_else_trains_is_exported_and_loads(torch, tmp_path, monkeypatch):
+def build_layer_of_somebody_else(kind: str, settings: Node, channels: int):
+    """A layer of attention along doors, or one that attends to all rooms of the map as well (GPS: Rampasek et al. 2022)."""
+    from torch_geometric.nn import GPSConv, TransformerConv
+
+    beta = kind == "transformer"
+    along = TransformerConv(channels, channels // settings.heads, settings.heads, edge_dim=settings.width, beta=beta)
+    if kind == "transformer":
+        return along
+
+    class Gps(GPSConv):
+        reads_map = True
+
+        def forward(self, x, edge_index, edge_attr, map=None):
+            return super().forward(x, edge_index, map, edge_attr=edge_attr)
+
+    return Gps(channels, along, heads=settings.heads, norm="layer_norm", dropout=0.0)
+
+
+@pytest.mark.parametrize("kind", ["transformer", "gps"])
+def test_a_node_encoder_of_somebody_else_trains_is_exported_and_loads(torch, tmp_path, monkeypatch, kind):
     """Registered by one line. Those who load it need not know it."""
     from topomerge.models.weights import read_embedder
-    from torch_geometric.nn import TransformerConv
 
     from tests.graphs import write_set
     from topomerge.training.embedding import fit
     from topomerge.training.settings import Training
 
-    def build(settings: Node, channels: int):
-        return TransformerConv(channels, channels // settings.heads, settings.heads, edge_dim=settings.width, beta=True)
-
     write_set(tmp_path, "some", 6)
     with monkeypatch.context() as registered:
-        registered.setitem(NODES._registered, "transformer", build)
-        network = Network(Geometry(["scalars"], width=16), Node("transformer", 2, width=8), size=8)
+        registered.setitem(NODES._registered, kind, lambda *words: build_layer_of_somebody_else(kind, *words))
+        network = Network(Geometry(["scalars"], width=16), Node(kind, 2, width=8), size=8)
         common = {"runs": str(tmp_path), "cache": str(tmp_path), "data": "some", "validation": "", "logger": []}
         settings = Training(**common, epochs=2, batch=2, network=network)
         assert np.isfinite(fit(settings, lambda text: None)["train/loss"])
@@ -149,9 +164,29 @@ def test_a_node_encoder_of_somebody_else_trains_is_exported_and_loads(torch, tmp
     assert sorted(p.name for p in (tmp_path / "run" / "best").iterdir()) == ["embedder.card.json", "embedder.onnx"]
     ours = load_embedder(tmp_path / "run")
     compare(ours, made, graphs())
-    assert ours.network.node.kind == "transformer" and ours.about["loss"] == "infonce"
-    with pytest.raises(InputError, match="node.kind: unknown 'transformer'"):
+    assert ours.network.node.kind == kind and ours.about["loss"] == "infonce"
+    with pytest.raises(InputError, match=f"node.kind: unknown '{kind}'"):
         read_embedder(tmp_path / "run")
+
+
+def test_attention_between_rooms_stays_within_their_map(torch, monkeypatch):
+    """Of a batch of pairs a layer that reads the map gives each map the rows that it has alone."""
+    from topomerge.models.embedder import Embedder
+
+    from tests.graphs import pair as make_pair
+    from topomerge.training.batches import make_batch
+
+    monkeypatch.setitem(NODES._registered, "gps", lambda *words: build_layer_of_somebody_else("gps", *words))
+    torch.manual_seed(0)
+    network = Embedder(Network(Geometry(["scalars"], width=16), Node("gps", 2, width=8), size=8)).eval()
+    pairs = [make_pair(seed, rooms) for seed, rooms in enumerate((7, 5, 6))]
+    names = network.tensors
+    with torch.no_grad():
+        together = make_batch(pairs, names)
+        rows, _ = network(together.tensors)
+        alone = [network({name: of[name] for name in names})[0] for pair in pairs for of in (pair.a, pair.b)]
+    assert together["map"].tolist() == sorted(together["map"].tolist()) and int(together["map"].max()) == 5
+    assert torch.allclose(rows, torch.cat(alone), atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["gat_around", "one_crop"])

@@ -217,6 +217,7 @@ class MapPair(Data):
     | tensor | shape | content |
     |---|---|---|
     | `side` | (R,) | 0: of a, 1: of b |
+    | `map` | (R,) int64 | number of the map; one that comes again, turned, has a number of its own |
     | `true` | (R,) | true room, -1 none |
     | `clear` | (R,) bool | see `find_well_seen_rooms` |
     | `building` | (R,) int64 | number of the physical building |
@@ -229,6 +230,8 @@ class MapPair(Data):
     def __inc__(self, key: str, value: Any, *args: Any, **kwargs: Any) -> Any:
         if key in ("door_index", "near_index"):  # of edges, not of rooms
             return self["edge_index"].size(1)
+        if key == "map":
+            return int(value.max()) + 1 if len(value) else 0
         return super().__inc__(key, value, *args, **kwargs)
 
     @property
@@ -326,6 +329,7 @@ def build_map_pair(
     return MapPair(
         **_join_graphs(graphs, [*counts.tolist(), again], names),
         side=side,
+        map=torch.repeat_interleave(torch.arange(3), torch.tensor([*counts.tolist(), again])),
         building=torch.tensor(pair.building_numbers)[side],
         true=torch.cat([*true_rooms, torch.full((again,), -1)]),
         clear=torch.cat([*clear, torch.zeros(again, dtype=torch.bool)]),
