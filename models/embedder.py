@@ -90,7 +90,9 @@ class Embedder(nn.Module):
 
     def forward(self, tensors: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         pairs: list[Tensor | None] = [tensors[name] for name in self.pairs] or [None, None]
-        rooms = self.node(self.geometry(tensors), *(tensors[name] for name in GRAPH), *pairs, tensors.get("edge_way"), tensors.get("map"))
+        rooms = self.node(
+            self.geometry(tensors), *(tensors[name] for name in GRAPH), *pairs, tensors.get("edge_way"), tensors.get("map")
+        )
         return nn.functional.normalize(self.project(rooms), dim=1), self.dustbin(rooms)[:, 0]
 
     def embed_rotations(self, tensors: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:

@@ -267,8 +267,8 @@ class DevicePairs:
         door = torch.from_numpy(np.flatnonzero(self.has_door[s.room])).to(device, non_blocking=True)
         tensors |= self._sample_crops(room, room_part, local, door, views)
         batch = MapPair(
-            **{name: tensors[name] for name in self.names if name in tensors}, edge_index=ends, side=side, map=room_part, true=true,
-            clear=clear.bool(), building=self.building[map_of_room], match_index=match,
+            **{name: tensors[name] for name in self.names if name in tensors}, edge_index=ends, side=side, true=true,
+            map=room_part, clear=clear.bool(), building=self.building[map_of_room], match_index=match,
             room_counts=torch.from_numpy(s.counts.ravel()), num_nodes=len(s.room),
         )  # fmt: skip
         batch["batch"] = pair
