@@ -223,8 +223,8 @@ class NodeEncoder(nn.Module):
 
     Layers are of `topomerge.registry.NODES`, whose entries take the settings and a number of channels. A layer takes rooms
     (R, channels), edge_index (2, E) and, where edges have features, these (E, settings.width); it gives (R, channels).
-    A layer with a true attribute `reads_map`, such as attention between all rooms of a map, gets `map=` as well: the number of each
-    room's map (R,) int64, or None where all rooms are of one map.
+    A layer with a true attribute `reads_map`, such as attention between all rooms of a map, gets `map=` as well: the number of
+    each room's map (R,) int64, or None where all rooms are of one map.
 
     Args:
         settings: kind of layer and how they are stacked; kind `none` gives the rooms back.
