@@ -405,7 +405,7 @@ def read_texts(picture: Array) -> tuple[PictureText, ...] | None:
 def erase_texts(picture: Array, texts: Sequence[PictureText]) -> Array:
     """Return a picture (h, w, 3) uint8 without the letters of texts that were read: large ones look like walls.
 
-    Within the box of a text, what differs from the paper and does not reach beyond the box becomes paper. A wall through a text stays.
+    Within the box of a text, what differs from the paper and does not reach beyond the box becomes paper. Walls stay.
     """
     out = picture.copy()
     for text in texts:
