@@ -83,10 +83,12 @@ def test_two_sessions_become_one(tmp_path: Path, version: str) -> None:
         (2 * count, 2 * count, 2 * count, 2)
     ]
     assert ask(out, "SELECT id, scan, scan_info FROM Data WHERE id > 0 ORDER BY id") == [
-        (row[0] + k * count, *row[1:]) for k, p in enumerate((a, b)) for row in ask(p, "SELECT id, scan, scan_info FROM Data ORDER BY id")
+        (row[0] + k * count, *row[1:])
+        for k, p in enumerate((a, b))
+        for row in ask(p, "SELECT id, scan, scan_info FROM Data ORDER BY id")
     ]
     assert [d for (d,) in ask(out, "SELECT descriptor FROM Word ORDER BY id")] == [bytes([n]) for n in (1, 2, 3, 101, 102, 103)]
-    assert ask(out, "SELECT node_id, word_id FROM Feature WHERE node_id > %d AND word_id > 0" % count) == [
+    assert ask(out, f"SELECT node_id, word_id FROM Feature WHERE node_id > {count} AND word_id > 0") == [
         (count + k, 3 + k) for k in (1, 2, 3)
     ]
     assert ask(out, "SELECT COUNT(*) FROM Feature WHERE word_id = -1") == [(6,)]
@@ -188,5 +190,8 @@ def test_what_cannot_be_joined_is_refused(tmp_path: Path) -> None:
         base.commit()
     with pytest.raises(InputError, match="computes its columns"):
         join(tmp_path, Source(new), Source(twice, MOTION))
+    far = Motion(Sim3(0.0, (480_000.0, 5_400_000.0, 0.0)).matrix)
+    with pytest.raises(InputError, match="where RTAB-Map's floats keep no millimetres"):
+        join(tmp_path, Source(new), Source(new, far))
     assert not (tmp_path / "joined.db").exists()
     assert refusal_of(cut)

@@ -118,7 +118,6 @@ NATIVE = {
     "las": Format("a LAS file", (".las", ".laz"), "clouds"),
     "ply": Format("a PLY file", (".ply",), "clouds"),
     "pcd": Format("a PCD file", (".pcd",), "clouds"),
-    "grid": Format("a robot map", (".yaml", ".yml"), "stations"),
     "trajectory": Format("a trajectory", (".txt", ".csv", ".tum", ".kitti"), "trajectories"),
 }
 

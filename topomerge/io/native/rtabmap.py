@@ -1,8 +1,8 @@
 """Databases of RTAB-Map joined into one that it opens: all nodes with their data, words, links, tags, and one optimised graph.
 
 Rows go from file to file within SQLite, so that no database is held in memory. Numbers of nodes, maps and words are moved up
-where they would collide. Loop closures by the user hold sessions together, both ways, as RTAB-Map stores them. All nodes are dated as
-the last state, so that it loads all of them into its memory and goes on from there.
+where they would collide. Loop closures by the user hold sessions together, both ways, as RTAB-Map stores them. All nodes are
+dated as the last state, so that it loads all of them into its memory and goes on from there.
 Source: the schemas in RTAB-Map's `corelib/src/resources/backward_compatibility`, and how its driver reads them.
 """
 
@@ -58,6 +58,7 @@ INDEXES = (
 DATED = {"Node": "Node", "Data": "Node", "Word": "Word", "Info": "Info"}  # tables with a time of entry -> whose is set
 COLUMN_TYPES = ("INTEGER", "FLOAT", "REAL", "TEXT", "BLOB", "DATE")
 USER_CLOSURE = 4  # kind of a link
+FLOAT32_WITHIN = 1e4  # m
 SAME_TAG = 1.0  # m, within which a tag of one number in two sessions is one
 COUNTED = {"nodes": "Node", "links": "Link", "words": "Word", "features": "Feature"}
 LARGEST_NUMBER = 2**31 - 1
@@ -199,6 +200,12 @@ def _copy_session(
     poses = {k: pose for k, pose in session.poses.items() if pose is not None}
     moved = session.source.motion.move_poses(np.array(list(poses.values())).reshape(-1, 4, 4))
     placed = dict(zip(poses, moved, strict=True))
+    far = float(np.abs(moved[:, :3, 3]).max(initial=0.0))
+    if far > FLOAT32_WITHIN:
+        raise InputError(
+            f"{session.source.path}: comes to lie {far:,.0f} m from the origin, where RTAB-Map's floats keep no "
+            "millimetres; merge with the database first"
+        )
     tags, told = _renumber_tags(session, placed, joined)
     first = not _count(base, "main", "Admin")
     for name in TABLES:
@@ -229,7 +236,8 @@ def _get_most(base: sqlite3.Connection, schema: str, kind: str) -> int:
 
 def _renumber_tags(session: _Session, placed: dict[int, Array], joined: dict[int, Array]) -> tuple[dict[int, int], list[str]]:
     """New numbers of tags that lie elsewhere in the sessions before, where they are other ones."""
-    told, fresh = [], {}
+    told: list[str] = []
+    fresh: dict[int, int] = {}
     for tag in sorted((k for k in placed if k < 0 and k in joined), reverse=True):
         apart = float(np.linalg.norm(placed[tag][:3, 3] - joined[tag][:3, 3]))
         if apart > SAME_TAG:
