@@ -49,6 +49,8 @@ def edge(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
 def flat_graph(rooms: tuple[int, ...], chair_at: float = 0.5, labels: tuple[str, ...] = ("chair", "table")) -> dict[str, Any]:
     """Rooms in a row, 5 m apart, three places in each, a chair in the first and a table in each; mesh of a box."""
     graph = scene_graph(*box_mesh())
+    graph["mesh"] |= {"header": graph["SPARK_DSG_header"], "has_labels": False, "has_timestamps": False}
+    graph["mesh"] |= {"has_first_seen_stamps": False, "has_colors": True, "colors": [{"r": 9, "g": 8, "b": 7, "a": 255}] * 8}
     building = node("B", 0, 5, (0, 0, 0))
     graph["nodes"], before = [building], None
     graph["layer_keys"] = [{"layer": k, "partition": 0} for k in KINDS]
