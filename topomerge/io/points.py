@@ -312,6 +312,7 @@ FORMATS = (
     Format("a map in JSON", "json_map", (".json",), fixed=True, takes=DRAWN),
     Format("an RTAB-Map database", "rtabmap", (".db",)),
     Format("a ScanNet recording", "sens", (".sens",)),
+    Format("a state of Cartographer", "pbstream", (".pbstream",), fixed=True, takes=("extrude", "ceiling")),
     Format("a DXF drawing", "dxf", (".dxf",), extra="dxf", takes=("extrude", "ceiling")),
     Format("a PDF drawing", "pdf", (".pdf",), fixed=True, extra="pdf", takes=(*DRAWN, "page")),
     Format("an SVG drawing", "svg", (".svg",), fixed=True, extra="svg", takes=DRAWN),
