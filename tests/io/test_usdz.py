@@ -177,8 +177,10 @@ def test_packed_and_damaged_archives(tmp_path: Path) -> None:
             read_points(tmp_path / "c.usdz")
 
 
-def test_references_in_a_circle_and_by_the_million(tmp_path: Path) -> None:
+@pytest.mark.longer
+def test_references_in_a_circle_and_by_the_million(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A layer that stands in itself, and ten that each hold the next ten times."""
+    monkeypatch.setattr("topomerge.io.usdz.SECONDS", 3)
     circle = ROOT + 'def "Room" (prepend references = @Room.usda@</W>) {}\n' + cube("W", "", (0, 0, 0), (1, 1, 1))
     read_points(package(tmp_path / "a.usdz", {"Room.usda": circle}))
     layers = {}

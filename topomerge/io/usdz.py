@@ -27,7 +27,7 @@ from topomerge.io.sightings import clean_text
 from topomerge.types import Array, build_landmarks, transform_points
 
 KIND = "a USDZ file"
-SECONDS, MEMORY = 120, 4 << 30  # of the processor for one part, and bytes
+SECONDS, MEMORY = 20, 4 << 30  # of the processor for one part, and bytes
 MOST_ENTRIES, MOST_PRIMS, MOST_PARTS = 10_000, 500_000, 200_000
 MOST_CORNERS = 60_000_000  # of all faces together
 NUMBERED = re.compile(r"([A-Za-z]+?)_?\d+(?:_\w+)?")  # names of RoomPlan's prims
