@@ -123,14 +123,15 @@ EXPORT = Command(
             required=True,
             metavar="FORMAT[,FORMAT]",
             default=None,
-            help="graphml, geojson, indoorgml, dsg (Spark-DSG), ros (grids, keepout, Nav2 routes), rviz, tf2, g2o, ply, las, ifc",
+            help="graphml, geojson, indoorgml, dsg (Spark-DSG), ros (grids, keepout, Nav2 routes), rmf, "
+            "rviz, tf2, g2o, ply, las, ifc",
         ),
         build_option(
             "-o",
             "--output",
             metavar="OUT",
             default=None,
-            help="file, or folder for several formats and for ros (default: beside the map, named after it)",
+            help="file, or folder for several formats, ros and rmf (default: beside the map, named after it)",
         ),
         build_option(
             "--origin",
@@ -140,7 +141,7 @@ EXPORT = Command(
         build_option(
             "--frames", metavar="NAME,NAME", help="tf2: names of the maps' frames, in their order (default: their files')"
         ),
-        build_option("--storey", type=parse_whole_number, metavar="N", help="geojson, ros: only this storey"),
+        build_option("--storey", type=parse_whole_number, metavar="N", help="geojson, ros, rmf: only this storey"),
         build_option(
             "--min-confidence",
             type=parse_share,
