@@ -130,7 +130,7 @@ def write_rtabmap(
             names = "id, image, depth, calibration, scan, scan_info, user_data"
             base.execute(f"INSERT INTO Data({names}) VALUES (?, ?, ?, ?, ?, ?, ?)", cells)
             for seen, pose in node.tags:
-                base.execute("INSERT INTO Link VALUES (?, ?, 8, ?, ?)", (number, -seen, packed(np.eye(6)), pose_bytes(pose)))
+                base.execute("INSERT INTO Link VALUES (?, ?, 8, ?, ?)", (number, -seen, np.eye(6).tobytes(), pose_bytes(pose)))
         present = [(number, pose) for number, pose in enumerate(optimised, 1) if pose is not None]
         if present:
             ids = np.array([[-tag[0], *(n for n, _ in present)]], "<i4")

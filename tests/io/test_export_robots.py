@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from tests.scenes_map import building
 from topomerge.errors import InputError
 from topomerge.io.exports import prepare_outputs
 from topomerge.io.points import read_points
-from topomerge.types import TopometricMap
+from topomerge.types import TopometricMap, build_landmarks
 
 
 def write(map: TopometricMap, folder: Path, **options) -> dict[str, Path]:
@@ -182,3 +183,75 @@ def test_maps_with_little_in_them(tmp_path):
 def test_the_same_map_gives_the_same_bytes(tmp_path):
     a, b = (write(two_floors(), tmp_path / name) for name in ("a", "b"))
     assert {n: p.read_bytes() for n, p in a.items()} == {n: p.read_bytes() for n, p in b.items()}
+
+
+def write_rmf(map: TopometricMap, folder: Path, **options: int) -> tuple[dict, dict]:
+    """The building and the navigation graph, parsed by PyYAML."""
+    files = prepare_outputs(map, "rmf", folder, False, **options)
+    folder.mkdir(exist_ok=True)
+    for path, save in files:
+        save(path)
+    building, graph = (yaml.safe_load(path.read_text()) for path, _ in files)
+    assert [path.name for path, _ in files] == ["building_rmf.building.yaml", "building_rmf_nav.yaml"]
+    return building, graph
+
+
+def test_lanes_of_rmf_are_the_ways_of_nav2(tmp_path):
+    """One graph in two files: the same places, joined alike; the lanes of the second lead one way each."""
+    map = building(3, 1)
+    write(map, tmp_path / "ros")
+    site, graph = write_rmf(map, tmp_path / "rmf")
+    routes = json.loads((tmp_path / "ros" / "storey_0_route.geojson").read_text())["features"]
+    place = {f["properties"]["id"]: tuple(f["geometry"]["coordinates"]) for f in routes if f["geometry"]["type"] == "Point"}
+    ways = {
+        frozenset((place[f["properties"]["startid"]], place[f["properties"]["endid"]]))
+        for f in routes
+        if "startid" in f["properties"]
+    }
+    level = site["levels"]["L1"]
+    assert site["coordinate_system"] == "cartesian_meters"
+    lanes = {frozenset(tuple(level["vertices"][k][:2]) for k in lane[:2]) for lane in level["lanes"]}
+    assert lanes == ways and all(lane[2]["bidirectional"] == [4, True] for lane in level["lanes"])
+    nav = graph["levels"]["L1"]
+    both = [(tuple(nav["vertices"][a][:2]), tuple(nav["vertices"][b][:2])) for a, b, _ in nav["lanes"]]
+    assert {frozenset(pair) for pair in both} == ways and {pair[::-1] for pair in both} == set(both)
+    doors = [edge for edge in map.edges if edge["kind"] == "door"]
+    assert len(level["doors"]) == len(graph["doors"]) == len(doors) > 0
+    for (a, b, about), edge in zip(level["doors"], doors, strict=True):
+        ends = np.array([level["vertices"][k][:2] for k in (a, b)])
+        np.testing.assert_allclose(ends.mean(axis=0), edge["centre"][:2], atol=1e-3)
+        assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(edge["width"], abs=1e-3)
+        normal = (np.cos(edge["direction"]), np.sin(edge["direction"]))
+        assert abs((ends[1] - ends[0]) @ normal) < 1e-3
+        assert graph["doors"][about["name"][1]]["endpoints"] == ends.tolist()
+    areas = [
+        abs(np.cross(p[:-1], p[1:]).sum() + np.cross(p[-1], p[0])) / 2
+        for p in (np.array([level["vertices"][k][:2] for k in f["vertices"]]) for f in level["floors"])
+    ]
+    assert sum(areas) == pytest.approx(float(map.rooms["area"].sum()), rel=0.15)
+
+
+def test_lifts_of_rmf_are_rooms_that_are_called_so(tmp_path):
+    map = named_lifts()
+    site, graph = write_rmf(map, tmp_path / "rmf")
+    assert list(site["lifts"]) == list(graph["lifts"]) == ["lift_0"]
+    lift = site["lifts"]["lift_0"]
+    assert (lift["lowest_floor"], lift["highest_floor"]) == ("L1", "L2") and set(lift["level_doors"]) <= {"L1", "L2"}
+    cabins = [v for level in site["levels"].values() for v in level["vertices"] if len(v) == 5]
+    assert [v[4]["lift_cabin"] for v in cabins] == [[1, "lift_0"]] * 2
+    only, _ = write_rmf(map, tmp_path / "one", storey=1)
+    assert list(only["levels"]) == ["L2"]
+    with pytest.raises(InputError, match="no such storey"):
+        prepare_outputs(map, "rmf", tmp_path, False, storey=9)
+    with pytest.raises(InputError, match="no storeys"):
+        prepare_outputs(nothing(), "rmf", tmp_path, False)
+
+
+def named_lifts() -> TopometricMap:
+    """Two storeys in which two rooms above each other are called lift."""
+    map = two_floors()
+    low, high = (np.flatnonzero(map.rooms["storey"] == storey) for storey in (0, 1))
+    middle = map.rooms["centroid"][:, :2]
+    rooms = next([a, b] for a in low for b in high if np.linalg.norm(middle[a] - middle[b]) < 1.0)
+    marks = build_landmarks("name", ["Lift A", "lift"], "hand", map.rooms["centroid"][rooms], room=np.array(rooms))
+    return replace(map, landmarks=marks)

@@ -58,17 +58,21 @@ def _collect_export_options(args: argparse.Namespace, names: list[str]) -> dict[
         able = [name for name, form in FORMATS.items() if key in form.options]
         if not set(able) & set(names):
             raise InputError(f"--{key}: means nothing for {', '.join(names)}; it is for {' and '.join(able)}")
-    if names == ["tf2"] and collect_given(args, "min_confidence"):
-        raise InputError("--min-confidence: means nothing for tf2, which holds no rooms; leave it out")
+    if set(names) <= {"tf2", "g2o"} and collect_given(args, "min_confidence"):
+        raise InputError(f"--min-confidence: means nothing for {names[0]}, which holds no rooms; leave it out")
     if "origin" in options:
         from topomerge.io.exports.geojson import parse_origin
 
         options["origin"] = parse_origin(options["origin"])
+    place = Path(args.input)
+    if "g2o" in names:
+        from topomerge.fusion.frames import build_map_graph, read_file_frames
+
+        options["graph"] = build_map_graph(read_file_frames(place if place.is_dir() else place.parent))
     if "tf2" in names:
         from topomerge.io.exports.tf2 import read_frame_poses
 
-        path = Path(args.input)
-        options["transforms"] = read_frame_poses(path if path.is_dir() else path.parent, frames)
+        options["transforms"] = read_frame_poses(place if place.is_dir() else place.parent, frames)
     elif frames:
         raise InputError(f"--frames: means nothing for {', '.join(names)}; it is for tf2")
     return options
@@ -119,14 +123,15 @@ EXPORT = Command(
             required=True,
             metavar="FORMAT[,FORMAT]",
             default=None,
-            help="graphml, geojson, indoorgml, dsg (Spark-DSG), ros (grids, keepout, Nav2 routes), rviz, tf2, ply, las, ifc",
+            help="graphml, geojson, indoorgml, dsg (Spark-DSG), ros (grids, keepout, Nav2 routes), rmf, "
+            "rviz, tf2, g2o, ply, las, ifc",
         ),
         build_option(
             "-o",
             "--output",
             metavar="OUT",
             default=None,
-            help="file, or folder for several formats and for ros (default: beside the map, named after it)",
+            help="file, or folder for several formats, ros and rmf (default: beside the map, named after it)",
         ),
         build_option(
             "--origin",
@@ -136,7 +141,7 @@ EXPORT = Command(
         build_option(
             "--frames", metavar="NAME,NAME", help="tf2: names of the maps' frames, in their order (default: their files')"
         ),
-        build_option("--storey", type=parse_whole_number, metavar="N", help="geojson, ros: only this storey"),
+        build_option("--storey", type=parse_whole_number, metavar="N", help="geojson, ros, rmf: only this storey"),
         build_option(
             "--min-confidence",
             type=parse_share,

@@ -43,6 +43,7 @@ from topomerge.cli.export import EXPORT
 from topomerge.cli.extract import EMBED, EXPORT_EMBEDDER, EXTRACT, INFO
 from topomerge.cli.landmarks import FIND, MARK
 from topomerge.cli.merge import MATCH, MERGE
+from topomerge.cli.move import MOVE
 from topomerge.cli.options import build_output_option, build_quiet_option, collect_given, parse_whole_number
 from topomerge.errors import InputError, make_printable
 
@@ -209,6 +210,7 @@ COMMANDS = (
     EMBED,
     MATCH,
     MERGE,
+    MOVE,
     SIMULATE,
     COMPLETION,
     ATLAS,

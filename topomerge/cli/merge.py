@@ -27,6 +27,7 @@ from topomerge.cli.console import (
     write_out,
 )
 from topomerge.cli.inputs import check_cloud_options, collect_reading_options, is_map, iter_input_maps
+from topomerge.cli.move import plan_merge, save_plan
 from topomerge.cli.options import (
     BELIEF_OPTIONS,
     CLOUD_OPTIONS,
@@ -161,8 +162,11 @@ def _merge(args: argparse.Namespace, folder: Path, files: Mapping[int, Path]) ->
     result = replace(result, seconds={**result.seconds, **seconds})
     warn(result.warnings)
     result = add_point_files(result, files)
+    plan, doubt = plan_merge(result, args, folder) if args.native else ([], None)
+    check_outputs([path for path, _, _ in plan], args.inputs)
     with write_points(result, folder, args):
         result.save(folder)
+    save_plan(plan, doubt, args.quiet)
     if not args.quiet:
         joined = f"; {len(result.matches)} matches, {len(result.map.rooms)} rooms in all" if result.map else ""
         joined = "; no points are written" if args.points and not result.placements else joined
@@ -217,6 +221,13 @@ MERGE = Command(
             action="store_true",
             default=False,
             help="also write the input points in the joined frame, bent like their maps: A_merged.las, .laz or .ply",
+        ),
+        build_option(
+            "--native",
+            action="store_true",
+            default=False,
+            help="also write the inputs again in their own formats with the new poses, joined where the format can hold several: "
+            "RTAB-Map, g2o, Cartographer, Spark-DSG, E57, LAS, PLY, PCD, trajectories",
         ),
         build_option(
             "--force", action="store_true", help="write the best merge even if it is not trusted (the exit status stays 2)"

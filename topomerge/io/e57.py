@@ -44,7 +44,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Read blocks of the points of all scans, in the file's common frame."""
     if find_spec("pye57") is None:
         raise ImportError("no pye57", name="pye57")
-    _check_pages(path)
+    check_pages(path)
     yield from read_in_subprocess("e57", "an E57 file", path, options, BLOCK_SECONDS, LIBRARY_MEMORY)
 
 
@@ -119,7 +119,7 @@ def _convert_to_cartesian(spherical: Array) -> Array:
     return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)], axis=1)
 
 
-def _check_pages(path: Path) -> None:
+def check_pages(path: Path) -> None:
     """Refuse a file whose header or any page is damaged."""
     head = read_head(path, "an E57 file", b"ASTM-E57", 48)
     length, xml, xml_length, page = struct.unpack("<QQQQ", head[16:48])

@@ -39,7 +39,7 @@ class Header:
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Read blocks of points; the viewpoint, where it is not the default, is the pose of all."""
     del options
-    header = _read_header(path)
+    header = read_header(path)
     names = header.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
         raise InputError(f"{path}: has the fields {' '.join(names)} but not x y z; export it with coordinates")
@@ -57,7 +57,12 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         raise build_truncation_error(path, done, header.points)
 
 
-def _read_header(path: Path) -> Header:
+def read_header(path: Path) -> Header:
+    """Read what stands before the points.
+
+    Raises:
+        InputError: it is no PCD file, or its header is damaged.
+    """
     with path.open("rb") as stream:
         head = stream.read(LONGEST_HEADER)
     end = re.search(rb"(?m)^DATA[ \t]+(\w+)[ \t]*\r?\n", head)

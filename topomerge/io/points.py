@@ -1,6 +1,4 @@
-"""From the pieces of a reader to clouds of a wanted size: placed, cleaned, judged.
-
-Points in: one door for every format.
+"""From the pieces of a reader to clouds of a wanted size: placed, cleaned, judged. One door for every format.
 
 `read_points` and `read_chunks` find the reader by the file's suffix, bring what it hands over into metres with z up, and turn
 every failure into an `InputError` of one line. Only the reader that is needed is imported.
@@ -306,12 +304,14 @@ FORMATS = (
     Format("an E57 file", "e57", (".e57",), extra="e57"),
     Format("a mesh", "mesh", (".obj", ".stl")),
     Format("a glTF mesh", "mesh", (".glb", ".gltf"), up="y"),
+    Format("a USDZ scene", "usdz", (".usdz",), fixed=True, extra="usd", takes=("doors",)),
     Format("an OctoMap", "octomap", (".bt", ".ot")),
     Format("an IFC model", "ifc", (".ifc",), fixed=True, extra="ifc", takes=("doors",)),
     Format("a ROS bag", "bag", (".bag", ".db3", ".mcap"), extra="ros", takes=("poses", "topic", "extrude", "ceiling")),
     Format("a map in JSON", "json_map", (".json",), fixed=True, takes=DRAWN),
     Format("an RTAB-Map database", "rtabmap", (".db",)),
     Format("a ScanNet recording", "sens", (".sens",)),
+    Format("a state of Cartographer", "pbstream", (".pbstream",), fixed=True, takes=("extrude", "ceiling")),
     Format("a DXF drawing", "dxf", (".dxf",), extra="dxf", takes=("extrude", "ceiling")),
     Format("a PDF drawing", "pdf", (".pdf",), fixed=True, extra="pdf", takes=(*DRAWN, "page")),
     Format("an SVG drawing", "svg", (".svg",), fixed=True, extra="svg", takes=DRAWN),

@@ -209,15 +209,9 @@ Poses = dict[int, Array | None]  # (4, 4) of the robot, by node
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Points in the frame of the map, node by node."""
-    read_head(path, RTABMAP_KIND, b"SQLite format 3\0", 100)
-    for ending in ("-journal", "-wal"):
-        beside = path.with_name(path.name + ending)
-        if beside.is_file() and beside.stat().st_size:
-            raise InputError(
-                f"{path}: is being written, or was cut off ({beside.name} lies beside it); close RTAB-Map, or open it there once"
-            )
+    refuse_open_database(path)
     try:
-        with closing(sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True)) as base:
+        with closing(sqlite3.connect(build_read_address(path), uri=True)) as base:
             base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_BLOB)
             base.execute("PRAGMA trusted_schema = OFF")
             yield from _iter_pieces(path, base, options.text)
@@ -225,10 +219,30 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         raise build_damage_error(path, RTABMAP_KIND, error) from error
 
 
+def refuse_open_database(path: Path) -> None:
+    """Refuse a file that is no database, or one that is being written.
+
+    Raises:
+        InputError: it is one of these.
+    """
+    read_head(path, RTABMAP_KIND, b"SQLite format 3\0", 100)
+    for ending in ("-journal", "-wal"):
+        beside = path.with_name(path.name + ending)
+        if beside.is_file() and beside.stat().st_size:
+            raise InputError(
+                f"{path}: is being written, or was cut off ({beside.name} lies beside it); close RTAB-Map, or open it there once"
+            )
+
+
+def build_read_address(path: Path) -> str:
+    """Build the address by which SQLite opens a database that it must not change."""
+    return f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
+
+
 def _iter_pieces(path: Path, base: sqlite3.Connection, text: bool | None) -> Iterator[Piece]:
-    version = _read_version(path, base)
+    version = read_version(path, base)
     said: list[str] = []
-    poses = _read_poses(path, base, version, said)
+    poses = read_poses(path, base, version, said)
     kind = _detect_kind(path, base, version)
     if kind == "depth":
         yield from iter_frame_pieces(path, _iter_frames(path, base, version, poses), said, text)
@@ -249,8 +263,8 @@ def _read_pictures(path: Path, base: sqlite3.Connection, version: tuple[int, ...
     return Piece(np.empty((0, 3)), landmarks=landmarks, warnings=tuple(reader.warnings), done=1.0)
 
 
-def _read_version(path: Path, base: sqlite3.Connection) -> tuple[int, ...]:
-    """The version of RTAB-Map that laid the database out.
+def read_version(path: Path, base: sqlite3.Connection) -> tuple[int, ...]:
+    """Read the version of RTAB-Map that laid the database out.
 
     Raises:
         InputError: it is none of RTAB-Map's, or one that is not read.
@@ -270,8 +284,8 @@ def _read_version(path: Path, base: sqlite3.Connection) -> tuple[int, ...]:
     return version
 
 
-def _read_poses(path: Path, base: sqlite3.Connection, version: tuple[int, ...], said: list[str]) -> Poses:
-    """The pose of the robot at each node: optimised ones, else those of the odometry.
+def read_poses(path: Path, base: sqlite3.Connection, version: tuple[int, ...], said: list[str]) -> Poses:
+    """Read the pose of the robot at each node: optimised ones, else those of the odometry.
 
     Raises:
         InputError: no poses, or those of several sessions without optimised ones.

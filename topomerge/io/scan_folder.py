@@ -43,7 +43,7 @@ INDEX_DIGITS = 8  # at most, of the number of a scan
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Read the points of all scans in the frame of the trajectory, scan by scan."""
     scans = find_scans(path)
-    trajectory_file = Path(options.poses) if options.poses else _find_trajectory(path, scans[0].parent)
+    trajectory_file = Path(options.poses) if options.poses else find_trajectory(path, scans[0].parent)
     if trajectory_file is None:
         yield from iter_pieces(_iter_viewpoint_scans(path, scans, options))
         return
@@ -88,8 +88,8 @@ def _list_scans(folder: Path) -> list[Path]:
     return sorted(scans, key=lambda p: ([int(n) for n in re.findall(r"\d+", p.stem)], p.name))
 
 
-def _find_trajectory(path: Path, beside: Path) -> Path | None:
-    """The trajectory that belongs to the scans: in the folder that was given, among the scans, or beside their folder."""
+def find_trajectory(path: Path, beside: Path) -> Path | None:
+    """Find the trajectory that belongs to the scans: in the folder that was given, among the scans, or beside their folder."""
     for folder in dict.fromkeys((path, beside, path.resolve().parent)):
         names = [p for p in sorted(folder.iterdir()) if p.suffix in (".txt", ".tum") and p.is_file()]
         for pattern in TRAJECTORY_NAMES:

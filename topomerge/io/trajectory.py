@@ -153,7 +153,7 @@ def _parse_kitti(path: Path, numbers: Array, rows: Array) -> Trajectory:
     if len(bad):
         raise InputError(f"{path}: line {numbers[bad[0]]} is not a rotation and a place (three rows of four numbers); mend it")
     calibration = path.with_name("calib.txt")
-    laser = _read_laser_calibration(calibration) if calibration.is_file() else None
+    laser = read_laser_calibration(calibration) if calibration.is_file() else None
     if laser is not None:
         poses = np.linalg.inv(laser) @ poses @ laser
     return Trajectory(poses)
@@ -171,8 +171,12 @@ def find_invalid_rotations(poses: Array) -> Array:
     return rows
 
 
-def _read_laser_calibration(path: Path) -> Array | None:
-    """(4, 4) Tr of a KITTI calibration, laser into camera; None where it has none."""
+def read_laser_calibration(path: Path) -> Array | None:
+    """Read (4, 4) Tr of a KITTI calibration, laser into camera; None where it has none.
+
+    Raises:
+        InputError: it is not a rotation and a place.
+    """
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
         name, _, text = line.partition(":")
         if name.strip() not in ("Tr", "Tr_velo_to_cam"):

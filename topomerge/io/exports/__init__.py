@@ -37,8 +37,10 @@ FORMATS = {
     "indoorgml": Format((".gml", ".indoorgml", ".xml"), "indoorgml"),
     "dsg": Format((".dsg.json", ".json"), "dsg"),
     "ros": Format((), "ros", folder=True, options=("storey",)),
+    "rmf": Format((), "rmf", folder=True, options=("storey",)),
     "rviz": Format((".mcap",), "rviz", needs=("rosbags", "ros")),
     "tf2": Format((".launch.xml", ".xml"), "tf2", options=("transforms",)),
+    "g2o": Format((".g2o",), "g2o", options=("graph",)),
     "ply": Format((".ply",), "ply"),
     "las": Format((".las", ".laz"), "las", needs=("laspy", "las")),
     "ifc": Format((".ifc",), "ifc", needs=("ifcopenshell", "ifc")),
@@ -92,11 +94,12 @@ def save_export(map: TopometricMap, name: str, path: str | Path, min_confidence:
 
     Args:
         map: any map.
-        name: graphml, geojson, indoorgml, dsg, ros, rviz, tf2, ply, las or ifc.
-        path: the file; for ros the folder, which is made.
+        name: graphml, geojson, indoorgml, dsg, ros, rmf, rviz, tf2, g2o, ply, las or ifc.
+        path: the file; for ros and rmf the folder, which is made.
         min_confidence: rooms, doors, stairs and windows that are less likely are left out, 0 to 1; 0: none.
-        options: `storey` (geojson, ros) a number; `origin` (geojson) "latitude,longitude" or "latitude,longitude,heading";
-            `transforms` (tf2) as `topomerge.io.exports.tf2.read_frame_poses` gives them.
+        options: `storey` (geojson, ros, rmf) a number; `origin` (geojson) "latitude,longitude" or "latitude,longitude,heading";
+            `transforms` (tf2) as `topomerge.io.exports.tf2.read_frame_poses` gives them; `graph` (g2o) as
+            `topomerge.fusion.frames.build_map_graph` builds it.
 
     Returns:
         The files that were written.
