@@ -25,6 +25,7 @@ RANKS = {
     "numpy_nn": 2,
     "networks": 1.9,  # pictures of plans are read by one
     "extraction": 3,
+    "edits": 3.5,  # maps as somebody corrected them: what all else reads
     "embedding": 4,
     "matching": 5,
     "landmarks": 5.2,  # testimony beyond walls
