@@ -70,6 +70,11 @@ class StudioFolder:
         """Return the path below the folder, as the page knows it."""
         return path.relative_to(self.root).as_posix()
 
+    def format_word(self, path: Path) -> str:
+        """Return the path as a word of a command that runs in the folder: it is no option, whatever it is called."""
+        name = self.name(path)
+        return f"./{name}" if name.startswith("-") else name
+
     def list_entries(self) -> list[dict[str, Any]]:
         """List what the page shows: maps, scans, merges, atlases, pages; sorted by name."""
         entries = []

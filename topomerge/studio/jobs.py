@@ -1,4 +1,4 @@
-"""Work that takes long, as commands of topomerge in processes of their own: with progress, one after the other, to be cancelled."""
+"""Work that takes long: commands of topomerge in processes of their own, one after the other, with progress, to be cancelled."""
 
 from __future__ import annotations
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,46 +19,98 @@ MOST_LANDMARKS = 2000  # of a storey, the surest
 PASSED = ("door", "opening")  # kinds of edges that stand in walls
 
 
-def build_plan_data(map: TopometricMap, sheet: Sheet | None = None) -> tuple[dict[str, Any], Sheet]:
+@dataclass(frozen=True, eq=False)
+class DrawnPlan:
+    """How a map was drawn, so that what it becomes is drawn in the same place and in the same colours.
+
+    Args:
+        sheet: the paper.
+        rooms: (nx, ny) int32 room of each pixel, -1 none, of each storey.
+        colours: (R,) int64 numbers in `PALETTE`.
+    """
+
+    sheet: Sheet
+    rooms: tuple[Array, ...]
+    colours: Array
+
+
+def build_plan_data(map: TopometricMap, before: DrawnPlan | None = None) -> tuple[dict[str, Any], DrawnPlan]:
     """Build the plans of all storeys, as plain values.
 
     Args:
         map: any map.
-        sheet: the paper on which it was drawn before, so that a corrected map stays in its place; None: a new one.
+        before: how it was drawn before it was corrected; None: on new paper.
 
     Returns:
-        `back` (a, b, c, d, e, f: paper to m, as `Sheet.back`), `size` (cm), `turn` (rad), `storeys`, lowest first, each with
-        `floor` (m), `rooms`, `walls`, `seen`, `doors`, `stairs`, `windows`, `narrows`, `landmarks`; and the paper.
+        `back` (a, b, c, d, e, f: paper to m, as `Sheet.back`), `size` (cm), `turn` (rad), `low` and `high` (m), `rooms` (their
+        number), `storeys`, lowest first, each with `floor` (m), `rooms`, `walls`, `seen`, `doors`, `stairs`, `windows`,
+        `narrows`, `landmarks`; and how it is drawn.
     """
-    if sheet is None:
+    if before is None:
         sheet, plans = lay_out(map)
     else:
-        plans = rasterize_storeys(map, sheet.frame)
-    rooms = _describe_rooms(map, _assign_colours(map, plans, sheet.frame.size))
-    storeys = [_build_storey(map, sheet, plan, s, rooms) for s, plan in enumerate(plans)]
+        sheet, plans = before.sheet, rasterize_storeys(map, before.sheet.frame)
+    rasters = tuple(plan.room for plan in plans)
+    colours = assign_colours(len(map.rooms), _find_neighbours(map, rasters, sheet.frame.size), _find_old_colours(rasters, before))
+    rooms = _describe_rooms(map, PALETTE[colours].reshape(-1, 3))
     low, high = map.grid.bounds if len(map.grid) else (np.zeros(3), np.zeros(3))
-    return {
+    listing = {
         "back": [round(v, 9) for v in sheet.back],
         "size": list(sheet.size),
         "turn": sheet.turn,
-        "low": [round(float(v), 3) for v in low],
-        "high": [round(float(v), 3) for v in high],
+        "low": _round_place(low),
+        "high": _round_place(high),
         "rooms": len(map.rooms),
-        "storeys": storeys,
-    }, sheet
+        "storeys": [_build_storey(map, sheet, plan, s, rooms) for s, plan in enumerate(plans)],
+    }
+    return listing, DrawnPlan(sheet, rasters, colours)
 
 
-def _assign_colours(map: TopometricMap, plans: Sequence[StoreyPlan], size: float) -> Array:
-    """(R, 3) uint8: neighbours differ. Who is whose neighbour is told by the plans: that takes a tenth of the time that all cells
-    of the floors would."""
+def _find_neighbours(map: TopometricMap, rasters: Sequence[Array], size: float) -> Array:
+    """(k, 2) int64 pairs of rooms, ascending, that a door or a wall's thickness parts; told by the plans, in a tenth of the time
+    that all cells of the floors would take."""
     pairs = [map.edges["rooms"].astype(np.int64)]
-    for plan in plans:
+    for room in rasters:
         for step in range(1, round(WALL_BETWEEN / size) + 2):
-            for one, other in ((plan.room[:-step], plan.room[step:]), (plan.room[:, :-step], plan.room[:, step:])):
+            for one, other in ((room[:-step], room[step:]), (room[:, :-step], room[:, step:])):
                 met = (one != other) & (one >= 0) & (other >= 0)
-                pairs.append(np.stack([one[met], other[met]], axis=1))
-    unique = np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0)
-    return PALETTE[assign_colour_numbers(len(map.rooms), unique)].reshape(-1, 3)
+                pairs.append(np.unique(np.stack([one[met], other[met]], axis=1), axis=0))
+    unique: Array = np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0)
+    return unique
+
+
+def _find_old_colours(rasters: Sequence[Array], before: DrawnPlan | None) -> dict[int, int]:
+    """Room -> the colour that most of its floor had, those with the most floor first."""
+    if before is None:
+        return {}
+    met = [np.stack([new, old])[:, (new >= 0) & (old >= 0)] for new, old in zip(rasters, before.rooms, strict=True)]
+    both, count = np.unique(np.concatenate(met, axis=1), axis=1, return_counts=True)
+    found: dict[int, int] = {}
+    for k in np.argsort(-count, kind="stable").tolist():
+        found.setdefault(int(both[0, k]), int(before.colours[both[1, k]]))
+    return found
+
+
+def assign_colours(rooms: int, pairs: Array, old: Mapping[int, int]) -> Array:
+    """Assign (rooms,) int64 numbers in `PALETTE`: neighbours differ, and rooms keep their colours where that allows it.
+
+    Args:
+        rooms: how many there are.
+        pairs: (k, 2) of rooms that are neighbours.
+        old: room -> its colour before, in the order in which they may keep it.
+    """
+    if not old:
+        return assign_colour_numbers(rooms, pairs)
+    around: list[set[int]] = [set() for _ in range(rooms)]
+    for a, b in pairs.tolist():
+        around[a].add(b)
+        around[b].add(a)
+    colours = np.full(rooms, -1)
+    for room in [*old, *(r for r in range(rooms) if r not in old)]:
+        taken = {int(colours[other]) for other in around[room]}
+        free = [c for c in (old.get(room, -1), *range(len(PALETTE))) if c >= 0 and c not in taken]
+        colours[room] = free[0] if free else 0
+    return colours
 
 
 def _describe_rooms(map: TopometricMap, colours: Array) -> list[dict[str, Any]]:

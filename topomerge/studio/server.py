@@ -12,6 +12,7 @@ from contextlib import asynccontextmanager
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qs
 
 import uvicorn
 from starlette.applications import Starlette
@@ -26,7 +27,7 @@ from topomerge.studio.folder import StudioFolder, UploadError, UploadLimits
 from topomerge.studio.guard import REPORT_POLICY, Access, Guard
 from topomerge.studio.jobs import Job, JobError, JobQueue
 from topomerge.studio.maps import OpenMaps
-from topomerge.studio.merges import describe_merge, list_merge_words, place_pair
+from topomerge.studio.merges import decide, describe_merge, place_pair
 
 LARGEST_REQUEST = 1 << 20  # bytes of JSON
 LOOK_EVERY = 2.0  # s between two looks at the folder
@@ -35,9 +36,9 @@ MOST_WAITING = 1000  # events that a page may be behind
 LOGIN_DELAY = 1.0  # s after a wrong password
 SHUTDOWN = 2  # s that requests have to end
 PAGE_FILES = {
-    **{name: "topomerge.studio.page" for name in ("studio.css", "studio.js", "api.js", "canvas.js", "editor.js", "tools.js")},
-    **{name: "topomerge.studio.page" for name in ("folder.js", "merge.js", "dom.js", "geometry.js")},
-    **{name: "topomerge.viz.template" for name in ("report.css", "plan.js", "camera.js", "cells.js", "scene.js")},
+    **dict.fromkeys(("studio.css", "studio.js", "api.js", "canvas.js", "editor.js", "tools.js"), "topomerge.studio.page"),
+    **dict.fromkeys(("folder.js", "merge.js", "dom.js", "geometry.js"), "topomerge.studio.page"),
+    **dict.fromkeys(("report.css", "plan.js", "camera.js", "cells.js", "scene.js"), "topomerge.viz.template"),
 }
 TYPES = {".js": "text/javascript", ".css": "text/css", ".html": "text/html"}
 log = logging.getLogger(__name__)
@@ -160,8 +161,6 @@ class Studio:
     async def log_in(self, request: Request) -> Response:
         """Let in who knows the password; those who guess wait."""
         given = (await _read_body(request)).decode("utf-8", "replace")
-        from urllib.parse import parse_qs
-
         async with self._login:
             if self.access.is_password(parse_qs(given).get("password", [""])[0]):
                 return self.access.grant()
@@ -215,17 +214,20 @@ class Studio:
         return JSONResponse({"job": job.describe()}, 202)
 
     def _build_job(self, kind: str, paths: list[Path]) -> Job:
-        names = [f"./{self.folder.name(path)}" for path in paths]
+        names = [self.folder.format_word(path) for path in paths]
         title = " + ".join(path.name for path in paths)
         if kind == "extract" and len(paths) == 1:
-            output = self.folder.name(self.folder.find_map_path(paths[0]))
-            return self.jobs.add(kind, title, ("extract", names[0], "-o", f"./{output}"), output)
+            output = self.folder.find_map_path(paths[0])
+            words = ("extract", names[0], "-o", self.folder.format_word(output))
+            return self.jobs.add(kind, title, words, self.folder.name(output))
         if kind == "merge" and len(paths) > 1:
-            output = self.folder.find_free(" + ".join(path.stem for path in paths)[:100]).name
-            return self.jobs.add(kind, title, ("merge", *names, "-o", f"./{output}"), output, (0, 2))
+            output = self.folder.find_free(" + ".join(path.stem for path in paths)[:100])
+            words = ("merge", *names, "-o", self.folder.format_word(output))
+            return self.jobs.add(kind, title, words, output.name, (0, 2))
         if kind == "compare" and len(paths) == 2:
-            output = self.folder.find_free(f"{paths[0].stem} to {paths[1].stem}.html"[:100]).name
-            return self.jobs.add(kind, title, ("diff", *names, "--report", f"./{output}"), output, (0, 2))
+            output = self.folder.find_free(f"{paths[0].stem[:50]} to {paths[1].stem[:50]}.html")
+            words = ("diff", *names, "--report", self.folder.format_word(output))
+            return self.jobs.add(kind, title, words, output.name, (0, 2))
         raise InputError(f"{kind[:40]}: of {len(paths)} files can't be done; choose others")
 
     async def cancel_job(self, request: Request) -> Response:
@@ -247,7 +249,9 @@ class Studio:
 
     async def send_scene(self, request: Request) -> Response:
         """The cells of a map, for the 3D view."""
-        return Response(await run_in_threadpool(self.maps.render_scene, self._resolve_map(request)), media_type="application/json")
+        return Response(
+            await run_in_threadpool(self.maps.render_scene, self._resolve_map(request)), media_type="application/json"
+        )
 
     async def send_report(self, request: Request) -> Response:
         """The page of a map, to be sent to others."""
@@ -283,7 +287,7 @@ class Studio:
     async def decide_merge(self, request: Request) -> Response:
         """Accept or reject a merge, or place a map of it: a line of its journal; then it is merged anew."""
         path, wish = self._resolve_merge(request), await _read_json(request)
-        words = await run_in_threadpool(list_merge_words, self.folder, path, wish)
+        words = await run_in_threadpool(decide, self.folder, path, wish)
         self.hub.publish("merge", path=self.folder.name(path))
         job = self.jobs.add("merge", path.name, words, self.folder.name(path), (0, 2)) if words else None
         return JSONResponse({"job": job.describe() if job else None}, 202)
@@ -329,8 +333,9 @@ async def _read_body(request: Request) -> bytes:
 
 
 async def _read_json(request: Request) -> Mapping[str, Any]:
+    body = await _read_body(request)
     try:
-        wish = json.loads(await _read_body(request))
+        wish = json.loads(body)
     except (ValueError, RecursionError) as error:
         raise InputError(f"the request is no JSON ({str(error)[:80]})") from error
     if not isinstance(wish, dict):
@@ -363,7 +368,9 @@ def serve_studio(studio: Studio, port: int, tell: Callable[[str], object]) -> No
         listening.bind((host, port))
         listening.listen(128)
     except OSError as error:
-        raise InputError(f"--port {port}: {host} can't be used ({error.strerror or error}); leave it out for a free one") from error
+        raise InputError(
+            f"--port {port}: {host} can't be used ({error.strerror or error}); leave it out for a free one"
+        ) from error
     settings = uvicorn.Config(
         studio.app, log_level="error", access_log=False, server_header=False, timeout_graceful_shutdown=SHUTDOWN, lifespan="on"
     )

@@ -69,10 +69,9 @@ export class PlanCanvas {
   resize() {
     const ratio = Math.min(devicePixelRatio || 1, 2), { clientWidth: w, clientHeight: h } = this.canvas;
     if (!w || !h) return;
-    const first = !this.ratio;
     Object.assign(this.canvas, { width: Math.round(w * ratio), height: Math.round(h * ratio) });
     this.ratio = ratio;
-    if (first && this.home) this.fit(this.home);
+    if (this.home && !this.touched) this.fit(this.home);
     this.refresh();
   }
 
@@ -315,6 +314,10 @@ export class PlanCanvas {
   drawRulers(pen) {
     const cm = roundLength(130 / this.view.scale), { ratio } = this, h = this.canvas.height / ratio;
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+    pen.globalAlpha = 0.75;
+    pen.fillStyle = this.colour("--paper");
+    pen.fillRect(6, h - 28, 54 + cm * this.view.scale, 22);
+    pen.globalAlpha = 1;
     pen.lineWidth = 1.5;
     pen.strokeStyle = pen.fillStyle = this.colour("--ink");
     pen.beginPath();
@@ -416,7 +419,7 @@ export class PlanCanvas {
   }
 
   moved() {
-    this.moving = true;
+    this.moving = this.touched = true;
     clearTimeout(this.timer);
     this.timer = setTimeout(() => { this.moving = false; this.ask(); }, REST);
     this.ask();
