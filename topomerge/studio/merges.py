@@ -8,19 +8,23 @@ from typing import Any
 
 import numpy as np
 
+from topomerge.edits.draft import find_room_place
 from topomerge.edits.journal import append_edits, build_edit, find_journal, read_journal, select_effective
 from topomerge.errors import InputError
+from topomerge.fusion.decisions import build_acceptance
 from topomerge.fusion.pipeline import format_probability
-from topomerge.registration.pipeline import register
+from topomerge.registration.by_hand import place_by_hand
+from topomerge.registration.posterior import WORDS
+from topomerge.registration.prepared import prepare
 from topomerge.studio.folder import StudioFolder, read_listing
 from topomerge.studio.maps import OpenMap, OpenMaps
-from topomerge.studio.plans import lift_places
-from topomerge.types import Array, Deformation, Sim3, TopometricMap, convert_pose_to_maps
+from topomerge.types import Deformation, Sim3, TopometricMap, convert_pose_to_maps
 from topomerge.viz.merge_plan import CUT_HEIGHT, deform_path
 
+LONGEST_NAME = 64  # characters of who decided
 MOST_PAIRS = 200  # of rooms that are one
+LEAST_SHOWN = 0.005  # probability of an alternative that is listed
 MOST_SHOWN = 20  # lines of one kind of evidence
-VERDICTS = {"accept": "accept_merge", "reject": "reject_merge"}
 DECISIONS = {
     "accept_merge": "accepted",
     "reject_merge": "rejected",
@@ -86,7 +90,7 @@ def describe_merge(folder: StudioFolder, maps: OpenMaps, path: Path) -> dict[str
         "facts": facts,
         "maps": described,
         "proposed": bool(transforms),
-        "alternatives": sorted((listing.get("alternatives") or {}).items(), key=lambda one: -one[1]),
+        "alternatives": _list_alternatives(listing.get("alternatives") or {}),
         "landmarks": [str(one.get("words", one)) for one in (landmarks.get("witnesses") or [])[:MOST_SHOWN]],
         "contradictions": [str(one.get("words", one)) for one in (listing.get("contradictions") or [])[:MOST_SHOWN]],
         "settle": [str(one.get("words", one)) for one in (listing.get("settle") or [])[:MOST_SHOWN]],
@@ -94,6 +98,12 @@ def describe_merge(folder: StudioFolder, maps: OpenMaps, path: Path) -> dict[str
         "report": folder.name(path / "report.html") if (path / "report.html").is_file() else None,
         "joined": folder.name(path / "map.tmap") if (path / "map.tmap").is_file() else None,
     }
+
+
+def _list_alternatives(each: Mapping[str, float]) -> list[tuple[str, float]]:
+    """What else it could be, in words, with its probability; the most probable first."""
+    ranked = sorted(each.items(), key=lambda one: -one[1])
+    return [(WORDS.get(name, name), float(p)) for name, p in ranked if p >= LEAST_SHOWN]
 
 
 def _format_residual(rmse: float | None) -> str:
@@ -140,53 +150,70 @@ def decide(folder: StudioFolder, path: Path, wish: Mapping[str, Any]) -> tuple[s
     Raises:
         InputError: there is nothing to decide.
     """
-    listing = read_listing(path / "merge.json")
-    sources, verdict, by = find_sources(folder, path, listing), wish.get("verdict"), str(wish.get("by", ""))[:64]
-    if verdict not in VERDICTS or len(sources) != 2 or None in sources:
+    sources = find_sources(folder, path, read_listing(path / "merge.json"))
+    found, verdict, by = [s for s in sources if s is not None], wish.get("verdict"), str(wish.get("by", ""))[:LONGEST_NAME]
+    if verdict not in ("accept", "reject") or len(found) != 2 or len(sources) != 2:
         raise InputError(f"{path.name}: only a merge of two maps of the folder can be accepted or rejected")
-    values: dict[str, Any] = {"maps": [0, 1]}
     if verdict == "accept":
-        transforms = listing.get("transforms") or {}
-        if "1" not in transforms:
-            raise InputError(f"{path.name}: has no pose that could be accepted; match the maps by hand")
-        values["matrix"] = transforms["1"]["matrix"]
-    append_edits(find_journal(path), [build_edit(VERDICTS[verdict], by, **values)])
-    names = [folder.format_word(source) for source in sources if source is not None]
-    return ("merge", *names, "-o", folder.format_word(path))
+        edit = build_acceptance(path, (0, 1), by)
+    else:
+        edit = build_edit("reject_merge", by, maps=[0, 1], sources=[s.name for s in found])
+    append_edits(find_journal(path), [edit])
+    return ("merge", *(folder.format_word(source) for source in found), "-o", folder.format_word(path))
 
 
-def place_pair(maps: OpenMaps, paths: Sequence[Path], wish: Mapping[str, Any]) -> dict[str, Any]:
-    """Place the second map on the first: by pairs of places that are one, or by a pose; then refine it by the walls.
+def accept_placed(maps: OpenMaps, paths: Sequence[Path], place: Path, wish: Mapping[str, Any]) -> None:
+    """Begin the folder of a merge with what somebody decided: where two maps lie, and which of their rooms are one.
 
     Args:
         maps: that are open.
         paths: of the two maps.
-        wish: `pairs`: [{at: [[x, y], [x, y]], storeys: [s, t]}], two or more; or `matrix`: T_ab.
-
-    Returns:
-        `matrix` (T_ab) and `words`: what speaks for it.
+        place: the folder, which is made.
+        wish: `matrix`: T_ab; perhaps `rooms`: pairs of numbers; and `by`.
 
     Raises:
-        InputError: not two maps, too few pairs, or no matrix.
+        InputError: not two maps, or no such pose or rooms.
     """
+    a, b = _load_two(maps, paths)
+    by, sources = str(wish.get("by", ""))[:LONGEST_NAME], [path.name for path in paths]
+    pairs = _parse_rooms(wish.get("rooms") or [], a, b)
+    places = [[find_room_place(map, room).round(3).tolist() for map, room in zip((a, b), two, strict=True)] for two in pairs]
+    edits = [build_edit("match_rooms", by, maps=[0, 1], at=at, sources=sources) for at in places]
+    edits.append(build_edit("accept_merge", by, maps=[0, 1], matrix=_parse_pose(wish["matrix"]).matrix, sources=sources))
+    place.mkdir()
+    append_edits(find_journal(place), edits)
+
+
+def place_pair(maps: OpenMaps, paths: Sequence[Path], wish: Mapping[str, Any]) -> dict[str, Any]:
+    """Place the second map on the first: by rooms that are one, or by a pose; both are refined by the walls that are near.
+
+    Args:
+        maps: that are open.
+        paths: of the two maps.
+        wish: `rooms`: two pairs of numbers or more; or `matrix`: T_ab.
+
+    Returns:
+        `matrix` (T_ab), `probability`, and `words`: what speaks for it.
+
+    Raises:
+        InputError: not two maps, or no such rooms or pose.
+    """
+    a, b = _load_two(maps, paths)
+    start = _parse_pose(wish["matrix"]) if "matrix" in wish else _parse_rooms(wish.get("rooms"), a, b)
+    placed = place_by_hand(prepare(a), prepare(b), start)
+    words = ["The walls near it moved it there." if placed.snapped else "There are no walls near it that it could snap to."]
+    if placed.registration is not None:
+        words.append(placed.registration.reason)
+    words.append(f"Probability, by what the maps show: {format_probability(placed.probability)}")
+    words += [f"Surfaces are {100 * placed.rmse:.1f} cm apart."] if np.isfinite(placed.rmse) else []
+    return {"matrix": placed.pose.matrix.tolist(), "words": words, "probability": placed.probability}
+
+
+def _load_two(maps: OpenMaps, paths: Sequence[Path]) -> tuple[TopometricMap, TopometricMap]:
     if len(paths) != 2 or any(path.suffix.lower() != ".tmap" for path in paths):
         raise InputError("two maps are placed at a time; choose two")
     a, b = (maps.load(path).map for path in paths)
-    if "matrix" in wish:
-        pose = _parse_pose(wish["matrix"])
-    else:
-        sides = _parse_pairs(wish.get("pairs"))
-        pose = fit_level_pose(*(_lift_side(m, side) for m, side in zip((a, b), sides, strict=True)))
-    found = register(a, b, proposed=[pose], searched=False)
-    placed = found.transform or pose
-    shift = float(np.linalg.norm(placed.apply(b.grid.bounds[0][None]) - pose.apply(b.grid.bounds[0][None])))
-    words = [found.reason, f"Probability {format_probability(found.probability)}", f"Refined by {shift:.2f} m."]
-    return {"matrix": placed.matrix.tolist(), "words": words, "probability": found.probability}
-
-
-def _lift_side(map: TopometricMap, side: Array) -> Array:
-    """(n, 3) m of places x, y and storey."""
-    return np.concatenate([lift_places(map, place[None, :2], int(place[2])) for place in side])
+    return a, b
 
 
 def _parse_pose(listed: Any) -> Sim3:
@@ -196,21 +223,13 @@ def _parse_pose(listed: Any) -> Sim3:
         raise InputError(f"the pose is none ({error})") from error
 
 
-def _parse_pairs(listed: Any) -> tuple[Array, Array]:
-    """(n, 3) x, y and storey of the places in the one and in the other map."""
+def _parse_rooms(listed: Any, a: TopometricMap, b: TopometricMap) -> list[tuple[int, int]]:
+    """Pairs of rooms, of which both maps have theirs."""
+    counts = len(a.rooms), len(b.rooms)
     try:
-        sides = np.array([[[*place, storey] for place, storey in zip(p["at"], p["storeys"], strict=True)] for p in listed], float)
-    except (TypeError, KeyError, ValueError) as error:
-        raise InputError("pairs of places are wanted: at and storeys of each") from error
-    if sides.ndim != 3 or sides.shape[1:] != (2, 3) or not 2 <= len(sides) <= MOST_PAIRS or not np.isfinite(sides).all():
-        raise InputError(f"two to {MOST_PAIRS} pairs of places are wanted")
-    return sides[:, 0], sides[:, 1]
-
-
-def fit_level_pose(ours: Array, theirs: Array) -> Sim3:
-    """Fit the level pose that takes places (n, 3) of one map to those of another with least squares (Umeyama 1991)."""
-    middle, other = ours.mean(axis=0), theirs.mean(axis=0)
-    p, q = (theirs - other)[:, :2], (ours - middle)[:, :2]
-    yaw = float(np.arctan2((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum(), (p * q).sum()))
-    turned = Sim3(yaw).apply(other[None])[0]
-    return Sim3(yaw, tuple((middle - turned).tolist()))
+        pairs = [(int(i), int(j)) for i, j in listed]
+    except (TypeError, ValueError) as error:
+        raise InputError("pairs of rooms are wanted: a number of each map") from error
+    if len(pairs) > MOST_PAIRS or any(not (0 <= i < counts[0] and 0 <= j < counts[1]) for i, j in pairs):
+        raise InputError(f"up to {MOST_PAIRS} pairs of rooms that the maps have are wanted")
+    return pairs

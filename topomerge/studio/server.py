@@ -27,7 +27,7 @@ from topomerge.studio.folder import StudioFolder, UploadError, UploadLimits
 from topomerge.studio.guard import REPORT_POLICY, Access, Guard
 from topomerge.studio.jobs import Job, JobError, JobQueue
 from topomerge.studio.maps import OpenMaps
-from topomerge.studio.merges import decide, describe_merge, place_pair
+from topomerge.studio.merges import accept_placed, decide, describe_merge, place_pair
 
 LARGEST_REQUEST = 1 << 20  # bytes of JSON
 LOOK_EVERY = 2.0  # s between two looks at the folder
@@ -210,10 +210,12 @@ class Studio:
         """Extract, merge or compare."""
         wish = await _read_json(request)
         paths = [self.folder.resolve(path) for path in _check_paths(wish.get("paths"))]
-        job = self._build_job(str(wish.get("kind")), paths)
-        return JSONResponse({"job": job.describe()}, 202)
+        kind, place = str(wish.get("kind")), self.folder.find_free(" + ".join(path.stem for path in paths)[:100])
+        if kind == "merge" and "matrix" in wish:
+            await run_in_threadpool(accept_placed, self.maps, paths, place, wish)
+        return JSONResponse({"job": self._add_job(kind, paths, place).describe()}, 202)
 
-    def _build_job(self, kind: str, paths: list[Path]) -> Job:
+    def _add_job(self, kind: str, paths: list[Path], place: Path) -> Job:
         names = [self.folder.format_word(path) for path in paths]
         title = " + ".join(path.name for path in paths)
         if kind == "extract" and len(paths) == 1:
@@ -221,9 +223,7 @@ class Studio:
             words = ("extract", names[0], "-o", self.folder.format_word(output))
             return self.jobs.add(kind, title, words, self.folder.name(output))
         if kind == "merge" and len(paths) > 1:
-            output = self.folder.find_free(" + ".join(path.stem for path in paths)[:100])
-            words = ("merge", *names, "-o", self.folder.format_word(output))
-            return self.jobs.add(kind, title, words, output.name, (0, 2))
+            return self.jobs.add(kind, title, ("merge", *names, "-o", self.folder.format_word(place)), place.name, (0, 2))
         if kind == "compare" and len(paths) == 2:
             output = self.folder.find_free(f"{paths[0].stem[:50]} to {paths[1].stem[:50]}.html")
             words = ("diff", *names, "--report", self.folder.format_word(output))

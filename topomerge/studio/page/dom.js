@@ -10,7 +10,7 @@ export function el(name, settings = {}, ...content) {
     else if (key in element && key !== "list") element[key] = value;
     else element.setAttribute(key, value === true ? "" : value);
   }
-  element.append(...content.flat().filter((part) => part !== null && part !== undefined && part !== false));
+  element.append(...content.flat(Infinity).filter((part) => part !== null && part !== undefined && part !== false));
   return element;
 }
 

@@ -114,10 +114,10 @@ export class MergeView {
       } catch (error) { toast(error.message, "bad"); }
     }, settings);
     const pair = merge.maps.length === 2 && merge.maps.every((one) => one.path) ? merge.maps.map((one) => encodeURIComponent(one.path)).join("/") : null;
-    return el("div", {},
+    return el("div", { class: "stack" },
       el("div", { class: `verdict ${merge.status === "merged" ? "" : "refused"}` }, el("b", {}, merge.status === "merged" ? "Merged" : merge.status === "abstained" ? "Not merged" : merge.status), el("p", {}, merge.reason)),
       el("dl", { class: "facts" }, merge.facts.map(([name, value]) => [el("dt", {}, name), el("dd", {}, value)])),
-      ...list("What else it could be", merge.alternatives.map(([name, share]) => `${name}: ${formatPercent(share)}`)), ...list("Signs and tags", merge.landmarks), ...list("Contradictions", merge.contradictions), ...list("What would settle it", merge.settle), ...list("Decisions", merge.decisions),
+      ...list("What it could be", merge.alternatives.map(([name, share]) => `${name}: ${formatPercent(share)}`)), ...list("Signs and tags", merge.landmarks), ...list("Contradictions", merge.contradictions), ...list("What would settle it", merge.settle), ...list("Decisions", merge.decisions),
       el("div", { class: "row" }, merge.joined ? el("a", { class: "as-button primary", href: `#/map/${encodePath(merge.joined)}` }, "Open the joined map") : null, merge.report ? el("a", { class: "as-button", href: `/files/${encodePath(merge.report)}`, target: "_blank", rel: "noopener" }, "Report") : null),
       el("div", { class: "row" }, merge.maps.length === 2 ? [decide("Accept", "accept", { disabled: !merge.proposed, title: "They belong together, as shown" }), decide("Reject", "reject", { class: "danger", title: "They do not belong together" })] : null, pair ? el("a", { class: "as-button", href: `#/match/${pair}` }, "Match by hand") : null));
   }
@@ -164,7 +164,7 @@ export class MatchView {
   pick(k, point) {
     const canvas = this.canvases[k], room = canvas.roomAt(point);
     if (!room) return;
-    this.open[k] = { i: room.i, at: canvas.toMetres([room.x, room.y]), paper: [room.x, room.y], storey: canvas.storey };
+    this.open[k] = { i: room.i, paper: [room.x, room.y], storey: canvas.storey };
     if (this.open[0] && this.open[1]) {
       this.pairs.push(this.open);
       this.open = [null, null];
@@ -261,7 +261,9 @@ export class MatchView {
     event.preventDefault();
   }
 
-  place_() { return this.compute({ pairs: this.pairs.map(([a, b]) => ({ at: [a.at, b.at], storeys: [a.storey, b.storey] })) }); }
+  place_() { return this.compute({ rooms: this.rooms() }); }
+
+  rooms() { return this.pairs.map((pair) => pair.map(({ i }) => i)); }
 
   snap() { return this.compute({ matrix: this.matrix }); }
 
@@ -275,7 +277,7 @@ export class MatchView {
 
   async accept() {
     try {
-      await post("/api/jobs", { kind: "merge", paths: this.paths, matrix: this.matrix, by: localStorage.getItem("topomerge-name") || "" });
+      await post("/api/jobs", { kind: "merge", paths: this.paths, matrix: this.matrix, rooms: this.rooms(), by: localStorage.getItem("topomerge-name") || "" });
       toast("Accepted: the maps are merged.");
       location.hash = "#/";
     } catch (error) { toast(error.message, "bad"); }

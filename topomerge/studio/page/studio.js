@@ -12,7 +12,7 @@ let view = null;
 function route() {
   view?.close();
   const [, kind = "", ...rest] = location.hash.split("/"), path = rest.map(decodeURIComponent).join("/");
-  place.className = kind || "home-view";
+  place.className = `view-${kind || "folder"}`;
   for (const name of Object.keys(place.dataset)) delete place.dataset[name];
   place.replaceChildren();
   const names = { map: path, merge: path, match: rest.map(decodeURIComponent).join(" and ") };
