@@ -39,11 +39,13 @@ from topomerge.cli.console import (
     write_all,
 )
 from topomerge.cli.dataset import DATASET, FINETUNE
+from topomerge.cli.edit import EDIT
 from topomerge.cli.export import EXPORT
 from topomerge.cli.extract import EMBED, EXPORT_EMBEDDER, EXTRACT, INFO
+from topomerge.cli.inputs import load_stored_map
 from topomerge.cli.landmarks import FIND, MARK
 from topomerge.cli.merge import MATCH, MERGE
-from topomerge.cli.options import build_output_option, build_quiet_option, collect_given, parse_whole_number
+from topomerge.cli.options import NO_EDITS, build_output_option, build_quiet_option, collect_given, parse_whole_number
 from topomerge.errors import InputError, make_printable
 
 KINDS_OF_BUILDINGS = ("office", "openplan", "apartment", "hotel", "hospital", "school", "lab", "house")  # of datasets/buildings
@@ -143,10 +145,9 @@ def _prepare_page(args: argparse.Namespace, scratch: str | None = None) -> Path:
         return path
     if path.suffix.lower() != ".tmap":
         raise InputError(f"{path}: can't be shown; give a .tmap (of `topomerge extract`), the folder of a merge or an .html")
-    from topomerge.io.maps import load_map
     from topomerge.viz.report import save_report
 
-    topomap = load_map(path)
+    topomap = load_stored_map(path, args)
     if args.output is not None:
         place = Path(args.output)
     else:  # a browser reads it after this program has ended: only what is served is deleted
@@ -195,6 +196,7 @@ VIEW = Command(
             metavar="PORT",
             help="serve it on this machine until Ctrl-C (default: any free port)",
         ),
+        NO_EDITS,
     ),
     paths=("input", "output"),
     description="Show the report of a merge, an atlas or a map in the browser.",
@@ -204,6 +206,7 @@ VIEW = Command(
 COMMANDS = (
     EXTRACT,
     INFO,
+    EDIT,
     MARK,
     FIND,
     EMBED,
@@ -229,7 +232,16 @@ exit status:
   141  what read the output went away (`| head`)
   143  terminated
 Set TOPOMERGE_DEBUG=1, or give -v twice, to see the traceback of a failure."""
-SIGNED_OPTIONS = ("--origin", "--up", "--at")  # their value may start with a dash
+SIGNED_OPTIONS = (
+    "--origin",
+    "--up",
+    "--at",
+    "--to",
+    "--line",
+    "--add-door",
+    "--delete-landmark",
+    "--sill",
+)  # their value may start with a dash
 
 
 class _Parser(argparse.ArgumentParser):
