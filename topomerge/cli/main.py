@@ -32,6 +32,7 @@ from topomerge.cli.console import (
     write_all,
 )
 from topomerge.cli.dataset import DATASET, FINETUNE
+from topomerge.cli.edit import EDIT
 from topomerge.cli.export import EXPORT
 from topomerge.cli.extract import EMBED, EXPORT_EMBEDDER, EXTRACT, INFO
 from topomerge.cli.landmarks import FIND, MARK
@@ -102,6 +103,7 @@ SIMULATE = Command(
 COMMANDS = (
     EXTRACT,
     INFO,
+    EDIT,
     MARK,
     FIND,
     EMBED,
@@ -128,7 +130,16 @@ exit status:
   141  what read the output went away (`| head`)
   143  terminated
 Set TOPOMERGE_DEBUG=1, or give -v twice, to see the traceback of a failure."""
-SIGNED_OPTIONS = ("--origin", "--up", "--at")  # their value may start with a dash
+SIGNED_OPTIONS = (
+    "--origin",
+    "--up",
+    "--at",
+    "--to",
+    "--line",
+    "--add-door",
+    "--delete-landmark",
+    "--sill",
+)  # their value may start with a dash
 
 
 class _Parser(argparse.ArgumentParser):

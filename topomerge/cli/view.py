@@ -22,7 +22,8 @@ from topomerge.cli.console import (
     warn,
     write_all,
 )
-from topomerge.cli.options import parse_whole_number
+from topomerge.cli.inputs import load_stored_map
+from topomerge.cli.options import NO_EDITS, parse_whole_number
 from topomerge.errors import InputError
 
 PASSWORD_VARIABLE = "TOPOMERGE_STUDIO_PASSWORD"
@@ -68,10 +69,9 @@ def _prepare_page(args: argparse.Namespace, scratch: str | None = None) -> Path:
         return path
     if path.suffix.lower() != ".tmap":
         raise InputError(f"{path}: can't be shown; give a .tmap (of `topomerge extract`), the folder of a merge or an .html")
-    from topomerge.io.maps import load_map
     from topomerge.viz.report import save_report
 
-    topomap = load_map(path)
+    topomap = load_stored_map(path, args)
     if args.output is not None:
         place = Path(args.output)
     else:  # a browser reads it after this program has ended: only what is served is deleted
@@ -120,6 +120,7 @@ VIEW = Command(
             metavar="PORT",
             help="serve it on this machine until Ctrl-C (default: any free port)",
         ),
+        NO_EDITS,
     ),
     paths=("input", "output"),
     description="Show the report of a merge, an atlas or a map in the browser.",

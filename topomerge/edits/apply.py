@@ -16,11 +16,10 @@ from topomerge.errors import InputError
 from topomerge.extraction.attributes import USUAL_WIDTH
 from topomerge.extraction.landmarks import AT_DOORS, load_map_with_landmarks
 from topomerge.extraction.topology import DOOR_MOST_WIDTH, SAME_DOOR_DISTANCE
-from topomerge.types import EDGE_DTYPE, LANDMARK_KINDS, Array, TopometricMap, build_landmarks, join_landmarks
+from topomerge.types import EDGE_DTYPE, EDITED, LANDMARK_KINDS, Array, TopometricMap, build_landmarks, join_landmarks
 
 BY_HAND = "by hand"  # source of landmarks that edits add
 OF_ROOMS = ("name", "use", "area")  # kinds that are said of a room
-EDITED = "edits"  # parameter of a corrected map: how many edits made it
 SIDE_REACH, SIDE_STEP = 1.2, 0.05  # m on both sides of a door within which its rooms are looked for
 WAYS = np.radians(np.arange(0, 180, 7.5))  # directions in which they are
 LANDMARK_REACH = 1.0  # m between a landmark and where it is said to be
@@ -97,28 +96,25 @@ def apply_edits(map: TopometricMap, edits: Iterable[Edit]) -> EditedMap:
     return EditedMap(edited, tuple(applied), tuple(refused))
 
 
-def load_corrected_map(path: str | Path, corrected: bool = True) -> TopometricMap:
+def load_corrected_map(path: str | Path, lines: int | None = None) -> TopometricMap:
     """Read a `.tmap` with the landmarks and the journal beside it.
 
     Warnings of the map say which lines of the journal do not apply.
 
     Args:
         path: of the map.
-        corrected: apply the journal?
+        lines: how many of the journal are applied; None: all, 0: the map as it was extracted.
 
     Raises:
         InputError: one of the files can't be read.
     """
     map = load_map_with_landmarks(path)
-    if not corrected:
-        return map
-    journal = read_journal(find_journal(path))
-    return correct_map(map, journal) if journal.edits or journal.warnings else map
+    return map if lines == 0 else correct_map(map, read_journal(find_journal(path)), lines)
 
 
-def correct_map(map: TopometricMap, journal: Journal) -> TopometricMap:
-    """Apply a journal; warnings of the map say what does not apply."""
-    done = apply_edits(map, journal.edits)
+def correct_map(map: TopometricMap, journal: Journal, lines: int | None = None) -> TopometricMap:
+    """Apply a journal, or its first lines; warnings of the map say what does not apply."""
+    done = apply_edits(map, journal.edits[:lines])
     told = (*journal.warnings, *(f"{journal.path}: {refused}" for refused in done.refused))
     return replace(done.map, warnings=(*done.map.warnings, *told)) if told else done.map
 

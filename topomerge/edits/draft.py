@@ -305,6 +305,21 @@ class Draft:
         return map if stays.all() else select_rooms(map, stays)
 
 
+def find_room_place(map: TopometricMap, room: int) -> Array:
+    """Find a place (3,) m on the floor of a room, as far from its walls as there is."""
+    rows = np.flatnonzero(map.navigable_room == room)
+    cells = map.navigable.cells[rows]
+    low = cells[:, :2].min(axis=0) - 1
+    plan = np.zeros(cells[:, :2].max(axis=0) - low + 2, bool)
+    plan[tuple((cells[:, :2] - low).T)] = True
+    inward = ndimage.distance_transform_edt(plan)[tuple((cells[:, :2] - low).T)]
+    middle = cells[:, :2].mean(axis=0)
+    off = ((cells[:, :2] - middle) ** 2).sum(axis=1)
+    at = np.lexsort((cells[:, 2], off, -np.round(inward, 6)))[0]
+    out: Array = map.navigable.compute_centroids(cells[at : at + 1])[0]
+    return out
+
+
 def format_place(place: Array) -> str:
     """Return a place as text, m."""
     return f"({', '.join(f'{v:.2f}' for v in place)})"

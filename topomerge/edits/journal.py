@@ -28,6 +28,7 @@ MOST_EDITS, LONGEST_LINE = 100_000, 1 << 16  # lines of a journal, bytes of a li
 MOST_PLACES = 1000  # of one edit
 FARTHEST = 1e9  # m, of a coordinate
 WIDEST = 1000.0  # m, of a door
+LONGEST_PATH = 4096  # characters
 LONGEST_WORD = 64  # characters of an id, a time or a name of an author
 log = logging.getLogger(__name__)
 
@@ -85,6 +86,10 @@ WORD: tuple[Check, str] = (lambda v: _is_text(v, LONGEST_WORD), f"a word of 1 to
 PAIR: tuple[Check, str] = (_is_pair, "two numbers of maps, the smaller first")
 INDEX: tuple[Check, str] = (_is_index, "the number of a map")
 POSE: tuple[Check, str] = (_is_pose, "a 4x4 matrix that keeps the vertical")
+SOURCES: tuple[Check, str] = (
+    lambda v: isinstance(v, list) and len(v) == 2 and all(isinstance(name, str) and len(name) <= LONGEST_PATH for name in v),
+    "the names of both files",
+)
 # The vocabulary: op -> its fields; a question mark stands after those that may be left out.
 MAP_OPS: dict[str, dict[str, tuple[Check, str]]] = {
     "split_room": {"at": PLACE, "line": LINE},
@@ -103,9 +108,9 @@ MAP_OPS: dict[str, dict[str, tuple[Check, str]]] = {
     "delete_landmark": {"at": PLACE, "kind?": KIND, "value?": TEXT},
 }
 MERGE_OPS: dict[str, dict[str, tuple[Check, str]]] = {  # of a folder of a merge
-    "match_rooms": {"maps": PAIR, "at": TWO_PLACES},
-    "accept_merge": {"maps": PAIR, "matrix": POSE},
-    "reject_merge": {"maps": PAIR},
+    "match_rooms": {"maps": PAIR, "at": TWO_PLACES, "sources?": SOURCES},
+    "accept_merge": {"maps": PAIR, "matrix": POSE, "sources?": SOURCES},
+    "reject_merge": {"maps": PAIR, "sources?": SOURCES},
     "place_map": {"map": INDEX, "matrix": POSE},
 }
 TAKE_BACK = ("undo", "redo")

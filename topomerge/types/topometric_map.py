@@ -13,6 +13,7 @@ from topomerge.errors import InputError
 from topomerge.types.grid import Array, Sim3, VoxelGrid, require
 from topomerge.types.landmarks import Landmarks
 
+EDITED = "edits"  # parameter of a corrected map: how many edits made it
 LEVELLED = "levelled"  # parameter of a map whose cloud was tilted: the matrix, row by row
 ROUNDING = 1e-9  # by which a rotation in a file may miss one
 
