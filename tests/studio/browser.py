@@ -1,4 +1,4 @@
-"""The studio in a real browser: a server of its own, Debian's Chromium driven by playwright, and where things lie on its plans."""
+"""The studio in a real browser: a server of its own, Chromium driven by playwright, and where things lie on its plans."""
 
 from __future__ import annotations
 
@@ -16,6 +16,10 @@ from tests.viz.chromium import browser
 
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 WAIT = 60_000  # ms, for a machine that does much else
+STOREY = """() => {
+  const { rooms, doors, windows, landmarks } = studio.canvas.data;
+  return { rooms: rooms.map(({ path, rings, ...one }) => one), doors, windows, landmarks };
+}"""
 STORED = "document.getElementById('view').dataset"
 
 
@@ -90,9 +94,7 @@ class MapPage:
     @property
     def storey(self) -> dict[str, Any]:
         """What the page has of the storey that it shows."""
-        listed: dict[str, Any] = self.page.evaluate(
-            "() => (({ rooms, doors, windows, landmarks }) => ({ rooms: rooms.map(({ path, rings, ...one }) => one), doors, windows, landmarks }))(studio.canvas.data)"
-        )
+        listed: dict[str, Any] = self.page.evaluate(STOREY)
         return listed
 
     def room(self, i: int) -> dict[str, Any]:

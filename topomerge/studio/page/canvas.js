@@ -339,16 +339,18 @@ export class PlanCanvas {
     return this.data.rooms.find(({ box, path }) => point[0] >= box[0] && point[0] <= box[2] && point[1] >= box[1] && point[1] <= box[3] && pen.isPointInPath(path, ...point, "evenodd")) || null;
   }
 
-  near(list, point, reach = 12) { // the nearest of doors or windows, within so many pixels
+  get reach() { return Math.max(Math.min(this.px(12), 40), this.px(3)); } // cm: of small rooms most are clicked between their doors
+
+  near(list, point) { // the nearest of doors or windows
     const far = ({ line }) => distance(point, nearestOnSegment(point, line.slice(0, 2), line.slice(2)));
     const best = list.reduce((a, b) => (a && far(a) <= far(b) ? a : b), null);
-    return best && far(best) <= this.px(reach) ? best : null;
+    return best && far(best) <= this.reach ? best : null;
   }
 
   markAt(point) {
     const far = (mark) => distance(point, [mark.x, mark.y]);
     const best = this.data.landmarks.reduce((a, b) => (a && far(a) <= far(b) ? a : b), null);
-    return best && far(best) <= this.px(12) ? best : null;
+    return best && far(best) <= this.reach ? best : null;
   }
 
   // Pointers: one pans or drags, two pinch, a click is told.

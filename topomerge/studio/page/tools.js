@@ -4,6 +4,8 @@ import { crosses, distance, nearestOnSegment } from "./geometry.js";
 import { ask } from "./dom.js";
 
 const SNAP = 10; // pixels within which a corner or a wall attracts
+const THICKEST = 80; // cm of a wall that has a door
+const IN_LINE = 40; // cm that the pointer may leave the line of a wall
 const UPRIGHT = 6; // degrees within which a line is drawn along the walls
 const KINDS = ["", "office", "corridor", "hall", "meeting room", "kitchen", "toilet", "stairs", "lift", "storage", "bedroom", "bathroom", "living room", "technical", "balcony"];
 export const ROOM_KINDS = KINDS;
@@ -38,13 +40,18 @@ export function snap(canvas, point, from, free) {
   return best ? best.place : aligned;
 }
 
-// Where a door stands: in the middle of the wall between the room that was clicked and the nearest other one.
-export function snapToWall(canvas, point) {
+// Where a door stands: in the middle of the wall between the two rooms that are nearest; one that is moved stays in its wall's line.
+export function snapToWall(canvas, point, line) {
+  if (line) {
+    const [x1, y1, x2, y2] = line, long = Math.hypot(x2 - x1, y2 - y1) || 1, [u, v] = [(x2 - x1) / long, (y2 - y1) / long];
+    const along = (point[0] - x1) * u + (point[1] - y1) * v, off = Math.abs((point[0] - x1) * v - (point[1] - y1) * u);
+    if (off < IN_LINE) return [x1 + along * u, y1 + along * v];
+  }
   const nearest = (room) => room.rings.flatMap((ring) => ring.map((corner, k) => nearestOnSegment(point, corner, ring[(k + 1) % ring.length])))
     .reduce((a, b) => (distance(a, point) <= distance(b, point) ? a : b));
   const near = canvas.data.rooms.filter(({ box }) => point[0] > box[0] - 150 && point[0] < box[2] + 150 && point[1] > box[1] - 150 && point[1] < box[3] + 150)
     .map(nearest).filter((place) => distance(place, point) < 150).sort((a, b) => distance(a, point) - distance(b, point));
-  return near.length > 1 ? [(near[0][0] + near[1][0]) / 2, (near[0][1] + near[1][1]) / 2] : near[0] || point;
+  return near.length > 1 && distance(near[0], near[1]) < THICKEST ? [(near[0][0] + near[1][0]) / 2, (near[0][1] + near[1][1]) / 2] : near[0] || point;
 }
 
 function drawLine(pen, canvas, a, b) {
@@ -122,10 +129,11 @@ export const TOOLS = {
       if (state.held) return false;
       const door = canvas.near(canvas.data.doors, point), window = canvas.near(canvas.data.windows, point);
       state.held = door ? { op: "move_door", at: door.at } : window ? { op: "move_opening", at: window.at } : null;
+      state.line = (door || window)?.line;
       state.from = state.held && point;
       return Boolean(state.held);
     },
-    drag(editor, point) { editor.state.to = snapToWall(editor.canvas, point); editor.canvas.ask(); },
+    drag(editor, point) { editor.state.to = snapToWall(editor.canvas, point, editor.state.line); editor.canvas.ask(); },
     drop(editor, point) {
       const { state, canvas } = editor;
       if (distance(point, state.from) > canvas.px(8)) this.place(editor, point);
@@ -135,11 +143,11 @@ export const TOOLS = {
       else if (!this.grab(editor, point)) editor.tell("There is no door or window here.");
     },
     place(editor, point) {
-      const { held } = editor.state;
+      const { held, line } = editor.state;
       editor.state = {};
-      editor.edit({ ...held, to: snapToWall(editor.canvas, point) });
+      editor.edit({ ...held, to: snapToWall(editor.canvas, point, line) });
     },
-    hover(editor, point) { if (editor.state.held) editor.state.to = snapToWall(editor.canvas, point); },
+    hover(editor, point) { if (editor.state.held) editor.state.to = snapToWall(editor.canvas, point, editor.state.line); },
     draw(editor, pen) { if (editor.state.held && editor.state.to) dot(pen, editor.canvas, editor.state.to); },
   },
   mark: {
