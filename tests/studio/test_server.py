@@ -83,7 +83,7 @@ def test_the_token_becomes_a_cookie_that_no_script_reads(studio: Studio) -> None
         answer = client.get(f"/?token={studio.access.token}")
         assert answer.status_code == 303 and answer.headers["location"] == "/"
         cookie = answer.headers["set-cookie"]
-        assert "HttpOnly" in cookie and "SameSite=strict" in cookie and studio.access.token not in cookie
+        assert "HttpOnly" in cookie and "SameSite=lax" in cookie and studio.access.token not in cookie
         assert client.get("/").status_code == 200
 
 
@@ -109,6 +109,9 @@ def test_a_page_from_elsewhere_can_not_even_ask() -> None:
     assert find_refusal(access, "GET", "/api/folder", headers) is None
     assert find_refusal(access, "GET", "/api/folder", {**headers, "sec-fetch-site": "cross-site"}) is not None
     assert find_refusal(access, "GET", "/api/folder", {**headers, "cookie": f"{access.cookie}=x"}) is not None
+    elsewhere = {**headers, "sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate"}  # pages of an atlas link to each other
+    assert find_refusal(access, "GET", "/files/house/report.html", elsewhere) is None
+    assert find_refusal(access, "GET", "/api/report/house.tmap", elsewhere) is not None
 
 
 def test_a_password_is_asked_for_when_others_can_reach_it(folder: Path) -> None:

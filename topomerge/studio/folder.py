@@ -22,6 +22,7 @@ LONGEST_NAME = 120  # characters of the name of a file that is added
 MOST_ENTRIES = 5000  # of a folder, that are listed
 KEPT_FREE = 1 << 30  # bytes of the disk that uploads leave
 NOT_ALLOWED = re.compile(r"[^\w .()+=@-]")  # in names of files that are added; \w knows all alphabets
+DIFF_PAGE = "diff.html"  # in the folder of a comparison
 TABLES = (".json", ".csv", ".txt", ".yaml", ".yml")  # may be scans, but mostly lie beside one
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 
@@ -201,6 +202,8 @@ def _describe_folder(path: Path, about: dict[str, Any]) -> dict[str, Any] | None
             words = {key: listing.get(key) for key in ("status", "probability", "reason")}
             maps = [str(one.get("source", "")) for one in listing.get("maps", []) if isinstance(one, dict)]
             return {"kind": kind, **about, **words, "maps": [Path(m).name for m in maps]}
+    if (path / DIFF_PAGE).is_file():
+        return {"kind": "page", **about, "page": DIFF_PAGE}
     try:
         if any(p.suffix.lower() in list_suffixes() and p.suffix.lower() not in TABLES for p in path.iterdir()):
             return {"kind": "scan", **about, "format": detect_format(path).name}

@@ -18,6 +18,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 LOOPBACK = "127.0.0.1"
 LOOPBACK_NAMES = frozenset({LOOPBACK, "localhost", "[::1]"})
 READING = ("GET", "HEAD")
+OPENED = "/files/"  # pages, which have links to each other
 PUBLIC = ("/login", "/page/report.css", "/page/studio.css")  # with a password: what the page that asks for it needs
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
@@ -76,7 +77,7 @@ class Access:
     def grant(self) -> Response:
         """Lead to the page, with the cookie: the token does not stay in the address bar."""
         answer = RedirectResponse("/", status_code=303)
-        answer.set_cookie(self.cookie, self.session, httponly=True, samesite="strict", path="/")
+        answer.set_cookie(self.cookie, self.session, httponly=True, samesite="lax", path="/")
         return answer
 
     def format_address(self, port: int) -> str:
@@ -108,7 +109,8 @@ def find_refusal(access: Access, method: str, path: str, headers: Mapping[str, s
         return 403, "A change needs an Origin.\n"
     if origin is not None and origin != f"http://{host}":
         return 403, "A page from elsewhere may not use the studio.\n"
-    if headers.get("sec-fetch-site", "none") == "cross-site" and path != "/":
+    opened = path.startswith(OPENED) and headers.get("sec-fetch-mode") == "navigate"  # by a link elsewhere, which reads nothing
+    if headers.get("sec-fetch-site", "none") == "cross-site" and path != "/" and not opened:
         return 403, "A page from elsewhere may not use the studio.\n"
     if not access.is_session(headers.get("cookie", "")) and not (access.password and path in PUBLIC):
         return 403, NO_TOKEN

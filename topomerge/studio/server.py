@@ -23,7 +23,7 @@ from starlette.routing import Route
 
 from topomerge.edits.journal import ConflictError
 from topomerge.errors import InputError, make_printable
-from topomerge.studio.folder import StudioFolder, UploadError, UploadLimits
+from topomerge.studio.folder import DIFF_PAGE, StudioFolder, UploadError, UploadLimits
 from topomerge.studio.guard import REPORT_POLICY, Access, Guard
 from topomerge.studio.jobs import Job, JobError, JobQueue
 from topomerge.studio.maps import OpenMaps
@@ -225,9 +225,9 @@ class Studio:
         if kind == "merge" and len(paths) > 1:
             return self.jobs.add(kind, title, ("merge", *names, "-o", self.folder.format_word(place)), place.name, (0, 2))
         if kind == "compare" and len(paths) == 2:
-            output = self.folder.find_free(f"{paths[0].stem[:50]} to {paths[1].stem[:50]}.html")
-            words = ("diff", *names, "--report", self.folder.format_word(output))
-            return self.jobs.add(kind, title, words, output.name, (0, 2))
+            output = self.folder.find_free(f"{paths[0].stem[:50]} to {paths[1].stem[:50]}")
+            words = ("diff", *names, "-o", self.folder.format_word(output))
+            return self.jobs.add(kind, title, words, f"{output.name}/{DIFF_PAGE}")
         raise InputError(f"{kind[:40]}: of {len(paths)} files can't be done; choose others")
 
     async def cancel_job(self, request: Request) -> Response:

@@ -103,7 +103,7 @@ export class FolderView {
     return this.row(one, [one.maps.join(" + "), sure].filter(Boolean).join(" · "), link, badge);
   }
 
-  showPage(one) { return this.row(one, formatBytes(one.bytes), `/files/${encodePath(one.path)}`); }
+  showPage(one) { return this.row(one, one.page ? "what has changed" : formatBytes(one.bytes), `/files/${encodePath(one.page ? `${one.path}/${one.page}` : one.path)}`); }
 
   showActions() {
     const paths = [...this.chosen], maps = paths.every((path) => path.endsWith(".tmap"));
