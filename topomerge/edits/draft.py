@@ -132,7 +132,8 @@ class Draft:
         occupied = np.flatnonzero(self.room == room)
         above, back = np.unique(self.grid.cells[occupied, :2], axis=0, return_inverse=True)
         nearest = tree.query((above + 0.5) * self.grid.edge + self.grid.origin[:2])[1]
-        self.room[occupied[side[nearest][back.ravel()]]] = other
+        beyond = side[nearest][back.ravel()]
+        self.room[occupied[beyond]] = other
         self.rooms = np.append(self.rooms, self.rooms[room])
         self._cut_areas(room, other, rows, on_side)
 
@@ -149,9 +150,8 @@ class Draft:
         if len(placed):
             marks["room"][placed[is_other(marks["position"][placed])]] = other
         self.landmarks = replace(self.landmarks, table=marks)
-        for part in (room, other):
-            self._measure(part)
-            self.rooms["confidence"][part] = 1.0
+        self._measure(room, rows[~on_side], occupied[~beyond])
+        self._measure(other, rows[on_side], occupied[beyond])
         self.edges = np.append(self.edges, self._find_meeting(room, other, rows))
         return other
 
@@ -170,9 +170,12 @@ class Draft:
         old = self.rooms[members]
         weight = np.maximum(old["area"], 1e-9)
         self._add_narrows(members)
-        for labels in (self.room, self.floor_room):
-            for other in others:
-                labels[labels == other] = room
+        cells = []
+        for labels in (self.floor_room, self.room):
+            rows = [np.flatnonzero(labels == member) for member in members]
+            for moved in rows[1:]:
+                labels[moved] = room
+            cells.append(np.sort(np.concatenate(rows)))
         self.areas["room"][np.isin(self.areas["room"], others)] = room
         for name in ("edges", "windows"):
             table = getattr(self, name)
@@ -182,19 +185,23 @@ class Draft:
         marks["room"][np.isin(marks["room"], others)] = room
         self.landmarks = replace(self.landmarks, table=marks)
         self.gone |= set(others)
-        self._measure(room)
+        self._measure(room, *cells)
         for name in WEIGHED:
             self.rooms[name][room] = np.clip((old[name] * weight).sum() / weight.sum(), 0, 1)
         self.rooms["entered"][room] = old["entered"].max()
         self.rooms["glimpsed"][room] = old["entered"].max() < 0.5
-        self.rooms["confidence"][room] = 1.0
         return room
 
-    def _measure(self, room: int) -> None:
-        """Measure a room again."""
-        rows = self.select_floor(np.flatnonzero(self.floor_room == room))
+    def _measure(self, room: int, rows: Array, occupied: Array) -> None:
+        """Measure a room again; that it is one is certain now.
+
+        Args:
+            rows: of its cells in the navigable volume.
+            occupied: rows of its occupied cells.
+        """
+        rows = self.select_floor(rows)
         above = measure_floor_to_ceiling(self.grid, self.navigable.select_cells(rows), self.standing_height)
-        occupied = np.flatnonzero(self.room == room)
+        self.rooms["confidence"][room] = 1.0
         for name, value in measure_room(self.grid, self.navigable, rows, occupied, above, self.body_width).items():
             self.rooms[name][room] = value
 

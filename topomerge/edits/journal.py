@@ -20,6 +20,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from topomerge.archive import convert_to_plain
 from topomerge.errors import InputError
 from topomerge.types import LANDMARK_KINDS, LONGEST_VALUE, Sim3
 
@@ -205,9 +206,7 @@ def build_edit(op: str, by: str = "", **values: Any) -> Edit:
     Raises:
         InputError: as `Edit`.
     """
-    plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
-    plain = {name: json.loads(json.dumps(value)) for name, value in plain.items()}  # tuples as lists
-    return Edit(op, plain, uuid.uuid4().hex[:16], datetime.now(UTC).isoformat(timespec="seconds"), by)
+    return Edit(op, convert_to_plain(values), uuid.uuid4().hex[:16], datetime.now(UTC).isoformat(timespec="seconds"), by)
 
 
 @dataclass(frozen=True)
