@@ -8,7 +8,7 @@
     python evaluate.py task=merges data=test data.limit=40
 
 Without `task=`: embedders and descriptors. Tasks of what the library makes: rooms, doors, windows, walls, merges, joined,
-bending, atlases, retrieval (topomerge/evaluation). All others are learned parts.
+bending, atlases, retrieval, edits (topomerge/evaluation). All others are learned parts.
 
 Predictions go to disk first (`runs/eval/<name>/predictions`), then they are scored: a run that was killed goes on where it was.
 Keys: configs/evaluate.yaml and configs/data/*.yaml; of a learned part configs/task/<task>.yaml, whose `heldout` data

@@ -17,6 +17,7 @@ RANKS = {
     "code_digest": 0,
     "registry": 0.5,
     "writers": 0,
+    "progress": 0,
     "kernels": 0,
     "types": 1,
     "archive": 1.2,
@@ -25,12 +26,14 @@ RANKS = {
     "numpy_nn": 2,
     "networks": 1.9,  # pictures of plans are read by one
     "extraction": 3,
+    "edits": 3.5,  # maps as somebody corrected them: what all else reads
     "embedding": 4,
     "matching": 5,
     "landmarks": 5.2,  # testimony beyond walls
     "registration": 5.5,
     "fusion": 6,
     "viz": 7,
+    "studio": 7.5,
     "models": 8,
     "configs": 8,
     "config": 8,

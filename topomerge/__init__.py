@@ -15,6 +15,12 @@ from typing import TYPE_CHECKING, Any
 from topomerge.writers import WRITERS
 
 if TYPE_CHECKING:
+    from topomerge.edits.apply import apply_edits as apply_edits
+    from topomerge.edits.apply import load_corrected_map as load_corrected_map
+    from topomerge.edits.journal import Edit as Edit
+    from topomerge.edits.journal import append_edits as append_edits
+    from topomerge.edits.journal import build_edit as build_edit
+    from topomerge.edits.journal import read_journal as read_journal
     from topomerge.embedding.learned import load_embedder as load_embedder
     from topomerge.errors import InputError as InputError
     from topomerge.extraction.extract import extract as extract
@@ -47,6 +53,12 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "AtlasResult": "topomerge.fusion.atlas.result",
+    "Edit": "topomerge.edits.journal",
+    "append_edits": "topomerge.edits.journal",
+    "apply_edits": "topomerge.edits.apply",
+    "build_edit": "topomerge.edits.journal",
+    "load_corrected_map": "topomerge.edits.apply",
+    "read_journal": "topomerge.edits.journal",
     "find": "topomerge.fusion.atlas.find",
     "InputError": "topomerge.errors",
     "MergeResult": "topomerge.fusion.result",

@@ -29,6 +29,7 @@ from topomerge.cli.inputs import check_cloud_options, iter_input_maps, load_inpu
 from topomerge.cli.options import (
     ATLAS_OPTIONS,
     CLOUD_OPTIONS,
+    NO_EDITS,
     build_json_option,
     build_output_option,
     build_quiet_option,
@@ -59,7 +60,7 @@ def run_atlas(args: argparse.Namespace) -> int:
     """`topomerge atlas add|remove|list|find DIR …`. Status 2 of the first two: no maps are connected."""
     if args.verb in ("add", "find"):
         return _add(args) if args.verb == "add" else _find(args)
-    return _remove(args) if args.verb == "remove" else _list(args)
+    return {"remove": _remove, "list": _list, "update": _update}[args.verb](args)
 
 
 def _add(args: argparse.Namespace) -> int:
@@ -97,6 +98,15 @@ def _remove(args: argparse.Namespace) -> int:
         names = ", ".join(e.name for e in read_atlas(args.folder).entries)
         raise InputError(f"{args.folder}: name the maps to take out; it holds {names or 'none'}")
     return _report_result(remove(args.folder, args.items, render_atlas_html), args)
+
+
+def _update(args: argparse.Namespace) -> int:
+    from topomerge.fusion.atlas.store import update
+    from topomerge.viz.atlas_report import render_atlas_html
+
+    if args.items:
+        raise InputError(f"{args.items[0]}: update takes the folder only")
+    return _report_result(update(args.folder, render_atlas_html), args)
 
 
 def _find(args: argparse.Namespace) -> int:
@@ -166,13 +176,14 @@ def _format_listing(listing: Mapping[str, Any]) -> str:
 ATLAS = Command(
     "atlas",
     run_atlas,
-    "keep many maps together: add, remove, list, find",
+    "keep many maps together: add, remove, list, find, update",
     "topomerge atlas add house/ ground.ply cellar.tmap attic.las",
     (
         build_option(
             "verb",
-            choices=("add", "remove", "list", "find"),
-            help="add maps (a new folder becomes an atlas), remove or list them, or find which of them a new map shows",
+            choices=("add", "remove", "list", "find", "update"),
+            help="add maps (a new folder becomes an atlas), remove or list them, find which of them a new map shows, or update "
+            "what was put together with the edits in maps/",
         ),
         build_option("folder", metavar="DIR", help="the atlas"),
         build_option("items", nargs="*", metavar="MAP", help="add, find: clouds or .tmap; remove: names as `list` prints them"),
@@ -188,6 +199,7 @@ ATLAS = Command(
             "--cluster", default="", metavar="ADDRESS", help="add: register pairs on a Dask cluster, e.g. tcp://host:8786"
         ),
         *ATLAS_OPTIONS,
+        NO_EDITS,
         *CLOUD_OPTIONS,
         build_json_option("list: print atlas.json; find: print maps and rooms as JSON"),
         build_quiet_option("print nothing but warnings and what stands apart; find: only the table"),

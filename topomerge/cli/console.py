@@ -17,6 +17,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, TextIO
 
 from topomerge.errors import InputError, is_memory_short, make_printable
+from topomerge.progress import build_progress_teller, is_progress_asked
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -58,7 +59,9 @@ class ProgressBars:
                 self._shown.stop()
 
     def start_task(self, title: str) -> Report | None:
-        """Return a callable that moves the bar of one task, or None where no bar will be shown."""
+        """Return a callable that moves the bar of one task, or tells who started this process; None where nobody will see it."""
+        if is_progress_asked():
+            return build_progress_teller(title)
         if not self.enabled:
             return None
 

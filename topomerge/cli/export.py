@@ -13,25 +13,23 @@ from topomerge.cli.console import (
     check_outputs,
     open_output_folder,
     print_line,
-    warn,
     write_all,
 )
-from topomerge.cli.options import build_quiet_option, collect_given, parse_share, parse_whole_number
+from topomerge.cli.inputs import load_stored_map
+from topomerge.cli.options import NO_EDITS, build_quiet_option, collect_given, parse_share, parse_whole_number
 from topomerge.errors import InputError
 
 
 def run_export(args: argparse.Namespace) -> int:
     """`topomerge export`: a map in the formats of other tools."""
     from topomerge.io.exports import parse_formats, prepare_outputs
-    from topomerge.io.maps import load_map
     from topomerge.types import filter_confident
 
     names = parse_formats(args.to)
     options = _collect_export_options(args, names)
     source = _find_map_file(args.input)
     path, folder = _choose_output_path(args, names, source)
-    topomap = load_map(source)
-    warn(topomap.warnings)
+    topomap = load_stored_map(source, args)
     topomap = filter_confident(topomap, getattr(args, "min_confidence", 0.0))
     with open_output_folder(path.parent):
         files = [file for name in names for file in prepare_outputs(topomap, name, path, folder, **options)]
@@ -148,6 +146,7 @@ EXPORT = Command(
             metavar="P",
             help="leave out rooms, doors, stairs and windows that are less likely than P, 0 to 1 (default 0: none)",
         ),
+        NO_EDITS,
         build_quiet_option(),
     ),
     paths=("input", "output"),

@@ -6,6 +6,7 @@ import argparse
 import shutil
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import topomerge
 from topomerge.cli.console import (
@@ -22,11 +23,12 @@ from topomerge.cli.console import (
     write_all,
     write_out,
 )
-from topomerge.cli.inputs import check_cloud_options, load_input_map
+from topomerge.cli.inputs import check_cloud_options, load_input_map, load_stored_map
 from topomerge.cli.options import (
     CLOUD_OPTIONS,
     CONTEXT_STEPS,
     DESCRIPTOR,
+    NO_EDITS,
     ONE_FRAME,
     TEXT,
     UNIT,
@@ -40,6 +42,9 @@ from topomerge.cli.options import (
     parse_positive,
 )
 from topomerge.errors import InputError
+
+if TYPE_CHECKING:
+    from topomerge.types import TopometricMap
 
 OTHER_OUTPUTS = "--json, --ply, --figure, --report"
 FIGURE_FORMATS = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
@@ -60,14 +65,24 @@ def run_extract(args: argparse.Namespace) -> int:
         reading = collect_given(args, *lengths, *others)
         chunks = read_chunks(args.input, **reading, progress=bars.start_task("read"))
         choices = collect_given(args, "voxel_size", "preset")
-        topomap = extract(chunks, **choices, name=args.input, progress=bars.start_task("extract"))
-        write_all([(path, partial(getattr(topomerge, writer), topomap)) for path, writer in outputs])
+        extracted = extract(chunks, **choices, name=args.input, progress=bars.start_task("extract"))
+        topomap = _replay_journal(extracted, args)
+        maps = [extracted, *[topomap] * (len(outputs) - 1)]  # the .tmap is the extraction: its journal stays beside it
+        write_all([(path, partial(getattr(topomerge, writer), map)) for (path, writer), map in zip(outputs, maps, strict=True)])
     warn(topomap.warnings)
     if not args.quiet:
         from topomerge.io.listing import format_map
 
         print_text(format_map(topomap))
     return 0
+
+
+def _replay_journal(extracted: TopometricMap, args: argparse.Namespace) -> TopometricMap:
+    """The map with the corrections of an earlier extraction to the same file."""
+    from topomerge.edits.apply import correct_map
+    from topomerge.edits.journal import find_journal, read_journal
+
+    return correct_map(extracted, read_journal(find_journal(args.output)), getattr(args, "edits", None))
 
 
 def _list_outputs(args: argparse.Namespace) -> list[tuple[str, str]]:
@@ -130,6 +145,7 @@ EXTRACT = Command(
             "in a bag tf, then odometry)",
         ),
         build_option("--topic", metavar="NAME", help="topic to read, where a bag has points of several sensors, or maps as well"),
+        NO_EDITS,
         build_quiet_option("no table, no progress; only warnings"),
     ),
     paths=("input", "output", "json", "ply", "figure", "report", "poses"),
@@ -141,10 +157,8 @@ EXTRACT = Command(
 def run_info(args: argparse.Namespace) -> int:
     """`topomerge info`: print the rooms, storeys, doors and times of a map, as tables or as JSON."""
     from topomerge.io.listing import convert_map_to_json, format_json, format_map
-    from topomerge.io.maps import load_map
 
-    topomap = load_map(args.input)
-    warn(topomap.warnings)
+    topomap = load_stored_map(args.input, args)
     if args.json:
         write_out(format_json(convert_map_to_json(topomap)))
     else:
@@ -157,7 +171,7 @@ INFO = Command(
     run_info,
     "print what a map holds",
     "topomerge info a.tmap",
-    (build_option("input", metavar="A.tmap", help="a map that `topomerge extract` wrote"), build_json_option()),
+    (build_option("input", metavar="A.tmap", help="a map that `topomerge extract` wrote"), NO_EDITS, build_json_option()),
     paths=("input",),
     description="Print the rooms, storeys, doors and times of a map.",
 )
@@ -197,6 +211,7 @@ EMBED = Command(
         build_output_option("A.npy", "NumPy array with a row for each room, or one for each of its quarter turns"),
         DESCRIPTOR,
         CONTEXT_STEPS,
+        NO_EDITS,
         *CLOUD_OPTIONS,
         build_quiet_option(),
     ),

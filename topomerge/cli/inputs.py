@@ -73,6 +73,19 @@ def is_map(path: str) -> bool:
     return Path(path).suffix.lower() == ".tmap"
 
 
+def load_stored_map(path: str | Path, args: argparse.Namespace) -> TopometricMap:
+    """Load a `.tmap` with its corrections, unless `NO_EDITS` was given, and print its warnings.
+
+    Raises:
+        InputError: it can't be read.
+    """
+    from topomerge.edits.apply import load_corrected_map
+
+    topomap = load_corrected_map(path, getattr(args, "edits", None))
+    warn(topomap.warnings)
+    return topomap
+
+
 def load_input_map(path: str, args: argparse.Namespace) -> TopometricMap:
     """Load the map of one input (`iter_input_maps`)."""
     return next(iter_input_maps([path], args)).map
@@ -127,12 +140,12 @@ def _load_map(path: str, args: argparse.Namespace, start_task: Starter) -> Loade
     Raises:
         InputError: as `iter_input_maps`.
     """
-    from topomerge.extraction.landmarks import load_map_with_landmarks
+    from topomerge.edits.apply import load_corrected_map
 
     began = time.perf_counter()
     try:
         if is_map(path):
-            topomap = load_map_with_landmarks(path)
+            topomap = load_corrected_map(path, getattr(args, "edits", None))
         else:
             from topomerge.extraction.extract import extract
             from topomerge.io.points import read_chunks

@@ -32,6 +32,7 @@ def run_mark(args: argparse.Namespace) -> int:
     _check_words(args)
     map = load_map(args.input)
     _check_place(args, map)
+    _check_journal(args)
     if args.list:
         write_out(format_landmark_table(map.landmarks.select(_select_rows(args, map.landmarks))))
         return 0
@@ -70,6 +71,15 @@ def _check_words(args: argparse.Namespace) -> None:
         raise InputError(f"{args.input}: say what to mark: give --text, --tag, --name or --object, or --from a file")
     if not args.remove and not place:
         raise InputError(f"{args.input}: say where it is: give --room, --at or --storey")
+
+
+def _check_journal(args: argparse.Namespace) -> None:
+    """Refuse numbers of rooms where a journal numbers them anew: landmarks are written into the map as it was extracted."""
+    from topomerge.edits.journal import find_journal, read_journal
+
+    journal = read_journal(find_journal(args.input))
+    if hasattr(args, "room") and not args.list and journal.edits:
+        raise InputError(f"--room: {journal.path} numbers the rooms of {args.input} anew; give --at, or `topomerge edit` it")
 
 
 def _check_place(args: argparse.Namespace, map: TopometricMap) -> None:

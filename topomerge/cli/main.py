@@ -9,43 +9,38 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import tempfile
 import traceback
 from collections.abc import Sequence
-from functools import partial
-from pathlib import Path
 from typing import Any, NoReturn
 
 from topomerge import __version__
 from topomerge.cli.atlas import ATLAS, WATCH
 from topomerge.cli.completion import COMPLETION
 from topomerge.cli.console import (
-    PAGE_SUFFIXES,
     Command,
     PrintError,
     build_option,
-    check_inputs,
     check_memory_limit,
     check_outputs,
-    check_suffix,
     exit_on_signals,
     find_signal,
     format_failure,
     guard_printing,
     open_output_folder,
     print_line,
-    print_text,
     show_log,
     write_all,
 )
 from topomerge.cli.dataset import DATASET, FINETUNE
+from topomerge.cli.edit import EDIT
 from topomerge.cli.export import EXPORT
 from topomerge.cli.extract import EMBED, EXPORT_EMBEDDER, EXTRACT, INFO
 from topomerge.cli.landmarks import FIND, MARK
 from topomerge.cli.merge import MATCH, MERGE
 from topomerge.cli.move import MOVE
 from topomerge.cli.options import build_output_option, build_quiet_option, collect_given, parse_whole_number
-from topomerge.errors import InputError, make_printable
+from topomerge.cli.view import STUDIO, VIEW
+from topomerge.errors import make_printable
 
 KINDS_OF_BUILDINGS = ("office", "openplan", "apartment", "hotel", "hospital", "school", "lab", "house")  # of datasets/buildings
 
@@ -106,105 +101,10 @@ SIMULATE = Command(
 )
 
 
-def run_view(args: argparse.Namespace) -> int:
-    """`topomerge view`: a report in the browser."""
-    if args.serve is None:
-        page = _prepare_page(args)
-        if args.open:
-            _show(page.resolve().as_uri(), str(page))
-        else:
-            print_text(str(page))
-        return 0
-    from topomerge.viz.report import serve
-
-    with tempfile.TemporaryDirectory(prefix="topomerge-") as scratch:
-        serve(_prepare_page(args, scratch), args.serve, _show if args.open else _print_address)
-    return 0
-
-
-def _print_address(address: str) -> None:
-    with guard_printing():
-        print(address, flush=True)
-
-
-def _prepare_page(args: argparse.Namespace, scratch: str | None = None) -> Path:
-    """The report to show; that of a map is made first."""
-    path = Path(args.input)
-    if path.is_dir():
-        page = path / "report.html"
-        if page.is_file() and args.output is None:
-            return page
-        if not (path / "map.tmap").is_file():
-            raise InputError(f"{path}: holds no report.html; give the folder of a merge or an atlas, a .tmap or an .html")
-        path = path / "map.tmap"
-    check_inputs([str(path)])
-    if path.suffix.lower() in PAGE_SUFFIXES:
-        if args.output is not None:
-            raise InputError(f"{args.output}: -o is for the report of a .tmap, and {path} is a page already; leave it out")
-        return path
-    if path.suffix.lower() != ".tmap":
-        raise InputError(f"{path}: can't be shown; give a .tmap (of `topomerge extract`), the folder of a merge or an .html")
-    from topomerge.io.maps import load_map
-    from topomerge.viz.report import save_report
-
-    topomap = load_map(path)
-    if args.output is not None:
-        place = Path(args.output)
-    else:  # a browser reads it after this program has ended: only what is served is deleted
-        place = Path(scratch or tempfile.mkdtemp(prefix="topomerge-")) / f"{path.stem}.html"
-    check_outputs([place], [path])
-    check_suffix("-o", str(place), PAGE_SUFFIXES)
-    write_all([(place, partial(save_report, topomap))])
-    return place
-
-
-def _show(address: str, name: str = "") -> None:
-    """Open an address in the browser, and say where it is for those who have none."""
-    import webbrowser
-
-    _print_address(name or address)
-    try:
-        opened = webbrowser.open(address)
-    except (webbrowser.Error, OSError):
-        opened = False
-    if not opened:
-        print("topomerge: no browser could be opened here; open this in one", file=sys.stderr)
-
-
-def _parse_port(text: str) -> int:
-    number = parse_whole_number(text)
-    if number > 65535:
-        raise argparse.ArgumentTypeError(f"must be a port from 0 to 65535, not {text}")
-    return number
-
-
-VIEW = Command(
-    "view",
-    run_view,
-    "show a report in the browser",
-    "topomerge view merged/",
-    (
-        build_option("input", metavar="PATH", help="folder of a merge or an atlas, a .tmap (a report is made of it) or an .html"),
-        build_option("-o", "--output", metavar="A.html", default=None, help="keep the report of a .tmap here"),
-        build_option("--no-open", dest="open", action="store_false", default=True, help="only print where the report is"),
-        build_option(
-            "--serve",
-            nargs="?",
-            const=0,
-            default=None,
-            type=_parse_port,
-            metavar="PORT",
-            help="serve it on this machine until Ctrl-C (default: any free port)",
-        ),
-    ),
-    paths=("input", "output"),
-    description="Show the report of a merge, an atlas or a map in the browser.",
-)
-
-
 COMMANDS = (
     EXTRACT,
     INFO,
+    EDIT,
     MARK,
     FIND,
     EMBED,
@@ -218,6 +118,7 @@ COMMANDS = (
     EXPORT,
     EXPORT_EMBEDDER,
     VIEW,
+    STUDIO,
     DATASET,
     FINETUNE,
 )
@@ -231,7 +132,16 @@ exit status:
   141  what read the output went away (`| head`)
   143  terminated
 Set TOPOMERGE_DEBUG=1, or give -v twice, to see the traceback of a failure."""
-SIGNED_OPTIONS = ("--origin", "--up", "--at")  # their value may start with a dash
+SIGNED_OPTIONS = (
+    "--origin",
+    "--up",
+    "--at",
+    "--to",
+    "--line",
+    "--add-door",
+    "--delete-landmark",
+    "--sill",
+)  # their value may start with a dash
 
 
 class _Parser(argparse.ArgumentParser):

@@ -34,6 +34,7 @@ from topomerge.cli.options import (
     CONTEXT_STEPS,
     DESCRIPTOR,
     JOBS,
+    NO_EDITS,
     build_json_option,
     build_output_option,
     build_quiet_option,
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from topomerge.fusion.result import MergeResult
+    from topomerge.types import Sim3, TopometricMap
 
 
 def choose_point_files(inputs: Sequence[str], folder: Path) -> dict[int, Path]:
@@ -157,7 +159,8 @@ def _merge(args: argparse.Namespace, folder: Path, files: Mapping[int, Path]) ->
     loaded = list(iter_input_maps(args.inputs, args))
     maps = [replace(one.map, source=path) for one, path in zip(loaded, args.inputs, strict=True)]
     choices = collect_given(args, "force", "rigid")
-    result = topomerge.merge(maps, scale=args.scale_of_b, embedder=args.descriptor, poses=args.poses, **choices, **belief)
+    poses = _read_decisions(maps, folder, args) or args.poses
+    result = topomerge.merge(maps, scale=args.scale_of_b, embedder=args.descriptor, poses=poses, **choices, **belief)
     seconds = {"read": sum(one.read_seconds for one in loaded), "extract": sum(one.extract_seconds for one in loaded)}
     result = replace(result, seconds={**result.seconds, **seconds})
     warn(result.warnings)
@@ -174,6 +177,24 @@ def _merge(args: argparse.Namespace, folder: Path, files: Mapping[int, Path]) ->
     elif not result.merged:
         print_line(f"topomerge: {result.reason}", sys.stderr)
     return 0 if result.merged else 2
+
+
+def _read_decisions(
+    maps: Sequence[TopometricMap], folder: Path, args: argparse.Namespace
+) -> Mapping[tuple[int, int], Sim3 | None]:
+    """What somebody decided of an earlier merge into the folder; lines that do not apply are told."""
+    from topomerge.edits.journal import find_journal, read_journal
+    from topomerge.fusion.decisions import find_decisions
+
+    journal = read_journal(find_journal(folder))
+    if getattr(args, "edits", None) == 0 or not journal.edits:
+        return {}
+    if args.poses != "search":
+        reason = f"{journal.path} says what was decided by hand; leave --poses out, or give --no-edits"
+        raise InputError(f"--poses {args.poses}: {reason}")
+    decisions = find_decisions(maps, journal.edits)
+    warn([*journal.warnings, *(f"{journal.path}: {refused}" for refused in decisions.refused)])
+    return decisions.poses
 
 
 def _check_choices(args: argparse.Namespace) -> None:
@@ -234,6 +255,7 @@ MERGE = Command(
         ),
         *BELIEF_OPTIONS,
         DESCRIPTOR,
+        NO_EDITS,
         *CLOUD_OPTIONS,
         JOBS,
         build_quiet_option("print nothing but warnings and a refusal"),
@@ -300,6 +322,7 @@ MATCH = Command(
         ),
         DESCRIPTOR,
         CONTEXT_STEPS,
+        NO_EDITS,
         *CLOUD_OPTIONS,
         JOBS,
     ),

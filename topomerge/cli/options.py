@@ -171,6 +171,13 @@ JOBS = build_option(
     metavar="N",
     help="extract at most N large clouds at once (default: what cores and memory allow)",
 )
+NO_EDITS = build_option(
+    "--no-edits",
+    dest="edits",
+    action="store_const",
+    const=0,
+    help="read maps as they were extracted, without the corrections in A.edits.jsonl beside A.tmap",
+)
 CONTEXT_STEPS = build_option(
     "--k", type=parse_whole_number, default=0, metavar="K", help="steps of context around each room (default 0)"
 )

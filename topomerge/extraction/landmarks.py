@@ -56,7 +56,7 @@ def assign_landmarks(map: TopometricMap, landmarks: Landmarks) -> Landmarks:
         rows = np.flatnonzero(open_rows & (table["storey"] == storey))
         table["room"][rows] = _find_nearest_rooms(map, storey, table["position"][rows, :2])
         rows = rows[landmarks.is_kind(*AT_DOORS)[rows]]
-        table["room"][rows] = _find_rooms_of_doors(map, storey, table["position"][rows, :2], table["room"][rows])
+        table["room"][rows] = find_rooms_of_doors(map, storey, table["position"][rows, :2], table["room"][rows])
     return replace(landmarks, table=table)
 
 
@@ -70,7 +70,7 @@ def _find_nearest_rooms(map: TopometricMap, storey: int, places: Array) -> Array
     return np.where(np.isfinite(far), np.append(map.navigable_room[own], -1)[nearest], -1)
 
 
-def _find_rooms_of_doors(map: TopometricMap, storey: int, places: Array, here: Array) -> Array:
+def find_rooms_of_doors(map: TopometricMap, storey: int, places: Array, here: Array) -> Array:
     """(n,) room to which the door beside each place (n, 2) leads; the room where it is, `here`, where no door is within reach."""
     level = np.isin(map.edges["kind"], LEVEL_KINDS)
     doors = map.edges[level & (map.rooms["storey"][map.edges["rooms"]] == storey).all(axis=1)]

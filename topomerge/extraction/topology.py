@@ -332,17 +332,38 @@ def _measure_rooms(grid: VoxelGrid, room: Array, floor: Floor, label: Array, abo
     order = np.argsort(room, kind="stable")
     cells_of = np.split(order, np.searchsorted(room[order], np.arange(count + 1)))[1:-1]
     for r in range(count):
-        rows, occupied = floor_of[r], grid.cells[cells_of[r]]
+        rows = floor_of[r]
         rooms["storey"][r] = np.bincount(floor.storey[rows]).argmax()
-        rooms["centroid"][r] = cells.compute_centroids(cells.cells[rows]).mean(axis=0)
-        rooms["area"][r] = _measure_area(cells.cells[rows, :2], cells.edge, floor.body_width)
-        rooms["height"][r] = estimate_ceiling_height(above[rows])
-        rooms["volume"][r] = rooms["area"][r] * rooms["height"][r]
-        box = occupied if len(occupied) else cells.cells[rows]
-        rooms["lo"][r] = grid.origin + box.min(axis=0) * grid.edge
-        rooms["hi"][r] = grid.origin + (box.max(axis=0) + 1) * grid.edge
-        rooms["cells"][r] = len(occupied)
+        for name, value in measure_room(grid, cells, rows, cells_of[r], above[rows], floor.body_width).items():
+            rooms[name][r] = value
     return rooms
+
+
+def measure_room(
+    grid: VoxelGrid, navigable: VoxelGrid, floor: Array, occupied: Array, above: Array, body_width: float
+) -> dict[str, Any]:
+    """Measure a room: those columns of ROOM_DTYPE that its cells tell.
+
+    Args:
+        grid: occupied cells.
+        navigable: the navigable volume.
+        floor: rows of those of its cells that are the floor of the room.
+        occupied: rows of the occupied cells of the room.
+        above: m of empty space above each cell of the floor, 0 where nothing was seen.
+        body_width: m, how much wider than its cells the room is.
+    """
+    cells = navigable.cells[floor]
+    area, height = _measure_area(cells[:, :2], navigable.edge, body_width), estimate_ceiling_height(above)
+    box = grid.cells[occupied] if len(occupied) else cells
+    return {
+        "centroid": navigable.compute_centroids(cells).mean(axis=0),
+        "area": area,
+        "height": height,
+        "volume": area * height,
+        "lo": grid.origin + box.min(axis=0) * grid.edge,
+        "hi": grid.origin + (box.max(axis=0) + 1) * grid.edge,
+        "cells": len(occupied),
+    }
 
 
 def _measure_area(columns: Array, edge: float, body_width: float) -> float:

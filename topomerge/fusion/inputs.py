@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from topomerge.edits.apply import load_corrected_map
 from topomerge.errors import InputError
-from topomerge.extraction.landmarks import load_map_with_landmarks
 from topomerge.registration.posterior import find_threshold
 from topomerge.registration.verify import load_model
 from topomerge.types import TopometricMap
@@ -39,7 +39,7 @@ def load_input(map: object) -> TopometricMap:
         InputError: the file can't be read, or it is no map, as a cloud or the file of one.
     """
     if isinstance(map, str | Path) and Path(map).suffix.lower() == ".tmap":
-        return load_map_with_landmarks(map)
+        return load_corrected_map(map)
     if not isinstance(map, TopometricMap):
         name = str(map) if isinstance(map, str | Path) else type(map).__name__
         raise InputError(f"{name}: merge takes maps and .tmap files; make a map of points with extract")

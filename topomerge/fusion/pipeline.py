@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -19,6 +19,7 @@ from topomerge.embedding.learned import DEFAULT, get_descriptor_name
 from topomerge.embedding.learned import build_embedder as make_embedder
 from topomerge.embedding.quarter_turns import Descriptor, Rows
 from topomerge.extraction.stopwatch import Stopwatch
+from topomerge.fusion.atlas.maps import hash_map
 from topomerge.fusion.atlas.solve import AtlasSettings, RegistrationsByPair, solve
 from topomerge.fusion.fuse import fuse, match_common_rooms
 from topomerge.fusion.inputs import (
@@ -44,6 +45,7 @@ from topomerge.registration.surfaces import check_open3d, estimate_room_poses
 from topomerge.types import Deformation, Sim3, TopometricMap
 
 Row = tuple[str, str, str]  # evidence, value, meaning
+BY_HAND = 1 - 1e-6  # probability of a pose that somebody decided
 LEFT_OPEN = 0.15  # probability of another alternative, from which on it is told what would rule it out
 
 
@@ -186,7 +188,7 @@ def merge(
     force: bool = False,
     threshold: float | None = None,
     embedder: str | Descriptor = DEFAULT,
-    poses: str = "search",
+    poses: str | Mapping[tuple[int, int], Sim3 | None] = "search",
     rigid: bool = False,
     same: str = "nothing",
 ) -> MergeResult:
@@ -204,7 +206,8 @@ def merge(
             map -> (R, D), for the matching of rooms.
         poses: "search": of walls and, where the best one is not believed, of matched rooms (default); "rooms": of matched rooms
             alone; "surfaces": of each matched pair of rooms by its surfaces, as the thesis does (with `embedder="shapedna"` its
-            whole way). The last two are for two maps, the last one for maps of one scale.
+            whole way). The last two are for two maps, the last one for maps of one scale. Or what somebody decided: pairs i < j
+            of maps with the pose T_ij that is fixed, or None where they do not belong together; others are searched.
         rigid: do not bend the maps.
         same: "nothing", "building" or "storey": all maps are known to be of one, so that nothing else has to be ruled out.
 
@@ -214,16 +217,18 @@ def merge(
             install topomerge[open3d]`).
     """
     check_list(maps, "merge")
+    decided = {} if isinstance(poses, str) else dict(poses)
+    poses = poses if isinstance(poses, str) else "search"
     check_poses(poses, len(maps), scale)
     if poses == "surfaces":
         check_open3d()
     check_scale(scale)
     check_same(same)
-    config = MergeConfig(scale, threshold, embedder, rigid, same, force, poses)
+    config = MergeConfig(scale, threshold, embedder, rigid, same, force, poses, decided)
     loaded_maps = [load_input(map) for map in maps]
     began = time.perf_counter()
     placed = (_place_pair if len(loaded_maps) == 2 else _place_set)(loaded_maps, config)
-    result = replace(_join(placed), descriptor=get_descriptor_name(embedder))
+    result = replace(_join(replace(placed, decided=decided)), descriptor=get_descriptor_name(embedder))
     return replace(result, seconds=_split_seconds(placed.seconds, time.perf_counter() - began))
 
 
@@ -233,6 +238,7 @@ class MergeConfig(AtlasSettings):
 
     force: bool = False
     poses: str = "search"
+    decided: Mapping[tuple[int, int], Sim3 | None] = field(default_factory=dict)
 
 
 def _place_pair(maps: Sequence[TopometricMap], config: MergeConfig) -> MergeResult:
@@ -242,17 +248,22 @@ def _place_pair(maps: Sequence[TopometricMap], config: MergeConfig) -> MergeResu
     threshold = resolve_threshold(config.threshold)
     watch = Stopwatch()
     describe = _TimedDescriptor(config.embedder or DEFAULT, watch, config.poses == "rooms")
-    searched = config.poses == "search"
+    fixed = config.decided.get((0, 1))
+    searched = config.poses == "search" and fixed is None
     proposals = FallbackProposals(partial(_propose_room_poses, a, b, config, describe), threshold if searched else np.inf)
-    choices: dict[str, Any] = {"rigid": config.rigid, "same": config.same}
-    registration = register(a, b, scale=config.scale, proposed=proposals, searched=searched, **choices)
+    choices: dict[str, Any] = {"rigid": config.rigid or fixed is not None, "same": config.same}
+    tried = proposals if fixed is None else [fixed]
+    registration = register(a, b, scale=config.scale, proposed=tried, searched=searched, **choices)
     accepted = registration.transform is not None and registration.probability >= threshold
+    if (0, 1) in config.decided:
+        accepted = fixed is not None
+        registration = registration if fixed is None else replace(registration, transform=fixed)
     transforms = {1: registration.transform} if registration.transform and (accepted or config.force) else {}
     deformations = registration.bend.deformations if registration.bend and transforms else ()
     return MergeResult(
         "merged" if accepted else "abstained",
         registration.probability,
-        explain_verdict(registration, threshold, config.force),
+        _explain_pair(registration, threshold, config),
         transforms=transforms,
         bends={k: d for k, d in enumerate(deformations) if len(d)},
         seconds=watch.seconds,
@@ -263,11 +274,20 @@ def _place_pair(maps: Sequence[TopometricMap], config: MergeConfig) -> MergeResu
     )
 
 
+def _explain_pair(registration: Registration, threshold: float, config: MergeConfig) -> str:
+    """One sentence: what was decided by hand, or the verdict."""
+    if (0, 1) not in config.decided:
+        return explain_verdict(registration, threshold, config.force)
+    words = "not merged: rejected by hand" if config.decided[0, 1] is None else "merged: accepted by hand"
+    forced = "; joined anyway (--force)" if config.decided[0, 1] is None and config.force else ""
+    return f"{words}; by what the maps show, the probability is {format_probability(registration.probability)}{forced}"
+
+
 def _find_observations(a: TopometricMap, b: TopometricMap, registration: Registration, accepted: bool) -> list[Observation]:
     """What would settle a merge that is refused, or of which another alternative is left."""
     each = registration.posterior
     left = max((p for name, p in each.items() if name != "here"), default=0.0)
-    if registration.transform is None or (accepted and left < LEFT_OPEN):
+    if registration.transform is None or not registration.posterior or (accepted and left < LEFT_OPEN):
         return []
     if compute_registration_order(b) < compute_registration_order(a):  # as registration: nothing may depend on which comes first
         turned = find_observations(b, a, registration.transform.inverse(), each, registration.landmarks.inverse().witnesses)
@@ -283,7 +303,7 @@ def _iter_rigid_reasons(registration: Registration) -> Iterator[str]:
 
 def _place_set(maps: Sequence[TopometricMap], config: MergeConfig) -> MergeResult:
     """Bring together with the first map what belongs to it; the reason names the maps that stand apart."""
-    registrations: RegistrationsByPair = {}
+    registrations = _list_decided(maps, config)
     if config.embedder == DEFAULT:  # of sets, the default only says which pairs to try first
         config = replace(config, embedder=None)
     atlas = solve(maps, config, registrations)
@@ -307,6 +327,17 @@ def _place_set(maps: Sequence[TopometricMap], config: MergeConfig) -> MergeResul
     )
 
 
+def _list_decided(maps: Sequence[TopometricMap], config: MergeConfig) -> RegistrationsByPair:
+    """Registrations of the pairs that somebody decided: one certain hypothesis, or none."""
+    keys = [hash_map(map) for map in maps] if config.decided else []
+    registrations: RegistrationsByPair = {}
+    for (i, j), pose in config.decided.items():
+        pair = (keys[i], keys[j]) if keys[i] < keys[j] else (keys[j], keys[i])
+        turned = pose if pose is None or keys[i] < keys[j] else pose.inverse()
+        registrations[pair] = () if turned is None else (PoseHypothesis(turned, probability=BY_HAND),)
+    return registrations
+
+
 def _join(result: MergeResult) -> MergeResult:
     """Fuse the maps that have a place, and match their rooms."""
     if not result.transforms:
@@ -316,7 +347,8 @@ def _join(result: MergeResult) -> MergeResult:
     matches: list[RoomMatch] = []
     for k, m in combinations(poses, 2):
         pose = poses[m] if k == 0 else poses[k].inverse() @ poses[m]
-        matches += _iter_room_matches(result.maps, (k, m), pose, result.probability, result.bends)
+        sure = 1.0 if result.decided.get((k, m)) is not None else result.probability
+        matches += _iter_room_matches(result.maps, (k, m), pose, sure, result.bends)
     told = tuple(w for w in joined.warnings if w.startswith(CONTRADICTING))
     return replace(result, matches=tuple(matches), map=joined, warnings=(*result.warnings, *told))
 

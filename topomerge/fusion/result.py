@@ -192,6 +192,7 @@ class MergeResult:
         bends: k -> how map k is bent in its own frame, before its transform is applied; rigid ones are left out.
         points: k -> name of the file beside merge.json that holds the points of map k, of those that `merge --points` wrote.
         settle: of two maps of which not everything is sure, what to look at next, the best first.
+        decided: what somebody decided: maps i < j -> the pose that was fixed, or None where they do not belong together.
     """
 
     status: str
@@ -209,6 +210,7 @@ class MergeResult:
     bends: Mapping[int, Deformation] = field(default_factory=dict)
     points: Mapping[int, str] = field(default_factory=dict)
     settle: tuple[Observation, ...] = ()
+    decided: Mapping[tuple[int, int], Sim3 | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.status not in ("merged", "abstained"):
@@ -261,6 +263,7 @@ def serialise_merge(result: MergeResult) -> dict[str, Any]:
         "transforms": transforms,
         "bend": {str(k): serialise_bend(result.maps[k], p) for k, p in result.placements.items() if p.bend is not None},
         "matches": [{"maps": m.maps, "rooms": m.rooms, "probability": round(m.probability, 4)} for m in result.matches],
+        "decided": [{"maps": pair, "accepted": pose is not None} for pair, pose in sorted(result.decided.items())],
         "seconds": {step: round(float(result.seconds.get(step, 0.0)), 4) for step in MERGE_STEPS},
         "points": {str(k): name for k, name in sorted(result.points.items())},
         "alternatives": {name: round(p, 6) for name, p in registration.posterior.items()} if registration else {},

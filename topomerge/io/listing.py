@@ -36,7 +36,7 @@ import numpy as np
 
 from topomerge.archive import convert_to_plain, replace_on_success
 from topomerge.io.landmarks import serialise_landmarks
-from topomerge.types import LANDMARK_KINDS, ROOM_ODDS, Landmarks, TopometricMap, find_room_names
+from topomerge.types import EDITED, LANDMARK_KINDS, ROOM_ODDS, Landmarks, TopometricMap, find_room_names
 
 LISTING_FORMAT = 1
 EDGE_FACTS = ("kind", "open", "half", "confidence", "lower", "upper")
@@ -192,6 +192,8 @@ def format_map(map: TopometricMap) -> str:
     counts += [_format_count(kinds["ramp"], "ramp")] if kinds["ramp"] else []
     counts += [_format_count(len(map.windows), "window")] if len(map.windows) else []
     counts += [describe_landmarks(map.landmarks)] if len(map.landmarks) else []
+    edited = map.parameters.get(EDITED, 0)
+    counts += [_format_count(edited, "edit")] if isinstance(edited, int) and edited else []
     names = find_room_names(map.landmarks, len(map.rooms))
     columns = ("room", "storey", "area m²", "height m", "cells", "doors", *(("name",) if any(names) else ()), "leads to")
     steps = [(f"{s:.2f}", step) for step, s in map.seconds.items()]

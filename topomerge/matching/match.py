@@ -35,7 +35,7 @@ from topomerge.matching.assignment import (
 from topomerge.matching.consistency import compute_match_probability, find_voted_pose, propose_hypotheses
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.matching.room_matcher import RoomOdds, combine_turn_certainties, compute_room_odds, find_best_scale
-from topomerge.types import LEVELLED, Array, Sim3, TopometricMap, convert_pose_to_files, is_level
+from topomerge.types import EDITED, LEVELLED, Array, Sim3, TopometricMap, convert_pose_to_files, is_level
 
 
 def _build_empty_rooms() -> Array:
@@ -284,9 +284,10 @@ def serialise_matching(matching: Matching, a: TopometricMap, b: TopometricMap) -
 
 
 def describe_map(map: TopometricMap) -> dict[str, Any]:
-    """Describe a map for a listing of several: its file, its rooms and storeys, and how it was levelled."""
+    """Describe a map for a listing of several: its file, rooms and storeys, its corrections, and how it was levelled."""
     levelled = {} if is_level(map.levelling) else {LEVELLED: map.levelling.tolist()}
-    return {"source": map.source, "rooms": len(map.rooms), "storeys": len(map.storeys), **levelled}
+    edited = {EDITED: map.parameters[EDITED]} if EDITED in map.parameters else {}
+    return {"source": map.source, "rooms": len(map.rooms), "storeys": len(map.storeys), **edited, **levelled}
 
 
 def _serialise_hypothesis(h: PoseHypothesis, matrix: Array) -> dict[str, Any]:

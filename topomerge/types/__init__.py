@@ -22,6 +22,7 @@ from topomerge.types.placement import Deformation, Placement
 from topomerge.types.topometric_map import (
     AREA_DTYPE,
     EDGE_DTYPE,
+    EDITED,
     JOINED,
     LEVELLED,
     OLDER_EDGE_DTYPE,
@@ -46,6 +47,7 @@ from topomerge.types.topometric_map import (
 __all__ = [
     "AREA_DTYPE",
     "EDGE_DTYPE",
+    "EDITED",
     "JOINED",
     "LANDMARK_DTYPE",
     "LANDMARK_KINDS",

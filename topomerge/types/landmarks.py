@@ -9,7 +9,7 @@ import numpy as np
 
 from topomerge.types.grid import Array, Sim3, require
 
-LANDMARK_KINDS = ("text", "tag", "radio", "pressure", "object", "name")
+LANDMARK_KINDS = ("text", "tag", "radio", "pressure", "object", "name", "use", "area")  # of a room: what it is for, its area
 MOST_LANDMARKS = 2_000_000  # of a map: a walk of a day reads radio a million times
 LONGEST_VALUE = 200  # characters of a text, a tag, an address, a class or a name
 FARTHEST = 1e9  # m, of a coordinate

@@ -13,6 +13,7 @@ from topomerge.errors import InputError
 from topomerge.types.grid import Array, Sim3, VoxelGrid, require
 from topomerge.types.landmarks import Landmarks
 
+EDITED = "edits"  # parameter of a corrected map: how many edits made it
 LEVELLED = "levelled"  # parameter of a map whose cloud was tilted: the matrix, row by row
 ROUNDING = 1e-9  # by which a rotation in a file may miss one
 
@@ -265,7 +266,7 @@ class TopometricMap:
         not above it."""
         if not len(self.storeys):
             return np.full(len(self.grid), -1, np.int32)
-        z = self.grid.compute_centroids()[:, 2]
+        z = self.grid.origin[2] + (self.grid.cells[:, 2] + 0.5) * self.grid.edge
         by_height = np.searchsorted(self.storeys["floor"] - 2 * self.grid.edge, z) - 1
         storey = np.clip(by_height, 0, None).astype(np.int32)
         with_room = self.room >= 0

@@ -37,6 +37,7 @@ from topomerge.viz.tables import (
 )
 
 SCRIPTS = ("plan.js", "tables.js", "camera.js", "cells.js", "scene.js", "merge.js", "places.js", "stamp.js", "page.js")
+MODULE_WORDS = re.compile(r"^(?:import .*;\n|export )", re.MULTILINE)  # elsewhere they are modules, here one script
 BESIDE = " 'self' file:"  # what a page that looks for a newer one may read: a style sheet that lies beside it, never a script
 
 
@@ -83,7 +84,7 @@ def render_page(
         stamp: of the page; an open one loads itself anew when `report_stamp.css` beside it holds another one. Empty: never.
         stamped: the name under which that file holds it.
     """
-    script = "".join(_read_template(name) for name in SCRIPTS)
+    script = "".join(MODULE_WORDS.sub("", _read_template(name)) for name in SCRIPTS)
     mark = [build_element("i", id="stamp", data_stamp=stamp, data_name=stamped, hidden=True)] if stamp else []
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
     parts = {

@@ -20,9 +20,10 @@ from typing import Any
 import numpy as np
 from filelock import FileLock, Timeout
 
+from topomerge.edits.journal import find_journal
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.solve import AtlasSettings
-from topomerge.types import Array, Sim3, convert_pose_to_maps, read_levelling
+from topomerge.types import EDITED, Array, Sim3, convert_pose_to_maps, read_levelling
 
 NEW, NEXT, LOCK, GONE = ".new", ".next", ".lock", "gone.json"
 LOCK_POLL = 0.1  # s between two looks at a lock that another process holds
@@ -153,6 +154,7 @@ class Entry:
         source: the file that it came from.
         frame: its pose in the frame of the map that it replaced, for good.
         levelling: (4, 4) that takes points of its file into its frame (`read_levelling`).
+        edits: lines of its journal that the key and the rooms are of.
     """
 
     name: str
@@ -162,6 +164,7 @@ class Entry:
     storeys: int
     frame: Sim3 = field(default_factory=Sim3)
     levelling: Array = field(default_factory=lambda: np.eye(4), compare=False)
+    edits: int = 0
 
     @property
     def file(self) -> str:
@@ -185,7 +188,9 @@ class StoredAtlas:
     def list_files(self) -> list[str]:
         """Return all that belongs to the atlas but atlas.json."""
         kinds, components = ("map", "ply", "page", "tiles"), (self.listing or {}).get("components", [])
-        return [e.file for e in self.entries] + [name for component in components for name in files_of(component, kinds)]
+        journals = [find_journal(e.file).as_posix() for e in self.entries if e.edits]
+        made = [name for component in components for name in files_of(component, kinds)]
+        return [e.file for e in self.entries] + journals + made
 
     def find_name(self, key: str) -> str | None:
         """Return the name of the map with this content, None if there is none."""
@@ -290,8 +295,9 @@ def read_finished(folder: Path) -> StoredAtlas:
 
 def _entry(listed: Mapping[str, Any]) -> Entry:
     frame = Sim3.from_matrix(np.array(listed["frame"], np.float64)) if "frame" in listed else Sim3()
-    levelling = read_levelling(listed)
-    return Entry(listed["name"], listed["key"], listed["source"], int(listed["rooms"]), int(listed["storeys"]), frame, levelling)
+    counts = int(listed["rooms"]), int(listed["storeys"])
+    levelling, edits = read_levelling(listed), int(listed.get(EDITED, 0))
+    return Entry(listed["name"], listed["key"], listed["source"], *counts, frame, levelling, edits)
 
 
 def files_of(component: Mapping[str, Any], kinds: Sequence[str]) -> list[str]:

@@ -13,16 +13,17 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from topomerge.edits.apply import load_corrected_map
+from topomerge.edits.journal import find_journal
 from topomerge.embedding.learned import DEFAULT
 from topomerge.embedding.learned import build_embedder as make_embedder
 from topomerge.embedding.quarter_turns import Descriptor, Rows
 from topomerge.fusion.inputs import Extent
-from topomerge.io.maps import load_map
 from topomerge.matching.match import embed_rooms
 from topomerge.registration.bend.bend import bend_together
 from topomerge.registration.prepared import Prepared, prepare
 from topomerge.registration.refine import build_surface
-from topomerge.types import Array, Deformation, Sim3, TopometricMap
+from topomerge.types import EDITED, Array, Deformation, Sim3, TopometricMap
 
 LOADED_AT_ONCE = 3  # maps in memory, of those that are files
 PREPARED_AT_ONCE = 64  # maps whose plans are in memory
@@ -53,7 +54,7 @@ class Memory:
 
     def __init__(self, coarse: MutableMapping[tuple[str, str], float] | None = None) -> None:
         self.coarse = {} if coarse is None else coarse
-        self._facts: dict[Path, tuple[tuple[int, int, int], MapSummary]] = {}  # of files, with what tells whether they changed
+        self._facts: dict[Path, tuple[tuple[int, ...], MapSummary]] = {}  # of files, with what tells whether they changed
         self._sources: dict[str, TopometricMap | str | Path] = {}
         self._loaded: OrderedDict[str, TopometricMap] = OrderedDict()
         self._prepared: OrderedDict[str, Any] = OrderedDict()
@@ -82,10 +83,12 @@ class Memory:
         try:
             stat = path.stat()
         except OSError:
-            return _summarise_map(load_map(path))  # says what is wrong with it
-        stamp = (stat.st_ino, stat.st_size, stat.st_mtime_ns)
+            return _summarise_map(load_corrected_map(path))  # says what is wrong with it
+        journal = find_journal(path)
+        edited = journal.stat().st_size if journal.exists() else 0  # a journal only grows
+        stamp = (stat.st_ino, stat.st_size, stat.st_mtime_ns, edited)
         if path not in self._facts or self._facts[path][0] != stamp:
-            self._facts[path] = (stamp, _summarise_map(load_map(path)))
+            self._facts[path] = (stamp, _summarise_map(load_corrected_map(path)))
         return self._facts[path][1]
 
     def load(self, key: str) -> TopometricMap:
@@ -93,7 +96,7 @@ class Memory:
         source = self._sources[key]
         if isinstance(source, TopometricMap):
             return source
-        return _get_recent(self._loaded, key, LOADED_AT_ONCE, lambda: load_map(source))
+        return _get_recent(self._loaded, key, LOADED_AT_ONCE, lambda: load_corrected_map(source))
 
     def get_file(self, key: str) -> Path | None:
         """Return the file that a map is loaded from; None of one that is given as it is."""
@@ -127,7 +130,7 @@ def _summarise_map(map: TopometricMap) -> MapSummary:
 
 
 def hash_map(map: TopometricMap) -> str:
-    """16 hexadecimal digits of a hash of cells, rooms, free space and landmarks."""
+    """16 hexadecimal digits of a hash of cells, rooms, free space and landmarks; of a corrected map of its doors, too."""
     digest = hashlib.sha256()
     for grid in (map.grid, map.navigable, map.free):
         if grid is not None:
@@ -135,6 +138,8 @@ def hash_map(map: TopometricMap) -> str:
     digest.update(map.room.tobytes() + map.navigable_room.tobytes() + map.rooms.tobytes())
     if len(map.landmarks):
         digest.update(map.landmarks.table.tobytes() + repr(map.landmarks.values).encode(errors="replace"))
+    if EDITED in map.parameters:
+        digest.update(map.edges.tobytes() + map.windows.tobytes())
     return digest.hexdigest()[:16]
 
 
@@ -223,7 +228,7 @@ class MapFiles(Mapping[int, TopometricMap]):
         self._files = dict(files)
 
     def __getitem__(self, n: int) -> TopometricMap:
-        return load_map(self._files[n])
+        return load_corrected_map(self._files[n])
 
     def __iter__(self) -> Iterator[int]:
         return iter(self._files)

@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 
 from topomerge import archive
+from topomerge.edits.apply import load_corrected_map
 from topomerge.embedding.learned import DEFAULT
 from topomerge.embedding.quarter_turns import Descriptor, Rows, TurnedRows, get_rows
 from topomerge.embedding.weights import read_embedder_card
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.folder import Entry, StoredAtlas
 from topomerge.fusion.atlas.partners import ROOM_NEIGHBOURS, compute_vectors, list_owners
-from topomerge.io.maps import load_map
 from topomerge.matching.match import embed_rooms
 from topomerge.types import Array
 
@@ -134,7 +134,7 @@ class RoomRows:
             if entry.key in arrays:
                 made |= {name: arrays[name] for name in (entry.key, places) if name in arrays}
             else:
-                rows = embed_rooms(describe, load_map(stored.folder / entry.file))
+                rows = embed_rooms(describe, load_corrected_map(stored.folder / entry.file, entry.edits))
                 made[entry.key] = get_rows(rows).astype(np.float32)
                 made |= {places: rows.places} if isinstance(rows, TurnedRows) else {}
         return made

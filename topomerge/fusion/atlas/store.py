@@ -32,6 +32,8 @@ from scipy.spatial import cKDTree
 
 from topomerge import __version__
 from topomerge.archive import convert_to_plain
+from topomerge.edits.apply import load_corrected_map
+from topomerge.edits.journal import find_journal, read_journal
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.folder import (
     ATLAS_FORMAT,
@@ -65,7 +67,7 @@ from topomerge.io.listing import format_json
 from topomerge.io.maps import save_map
 from topomerge.io.rooms_ply import save_rooms_ply
 from topomerge.landmarks.fuse import describe_listed
-from topomerge.types import LEVELLED, Array, Sim3, TopometricMap, convert_pose_to_files, is_level
+from topomerge.types import EDITED, LEVELLED, Array, Sim3, TopometricMap, convert_pose_to_files, is_level
 
 TILE_CELLS = 1_000_000  # cells of a tile, at most, but for a single room
 NEAREST_BY = 0.5  # m: the raster in which the nearest room is looked for
@@ -100,6 +102,7 @@ def serialise_atlas(atlas: AtlasResult, stored: StoredAtlas, components: Sequenc
     maps = [
         {"name": e.name, "file": e.file, "key": e.key, "source": e.source, "rooms": e.rooms, "storeys": e.storeys}
         | ({} if e.frame == Sim3() else {"frame": e.frame.matrix.tolist()})
+        | ({EDITED: e.edits} if e.edits else {})
         | ({} if is_level(e.levelling) else {LEVELLED: e.levelling.tolist()})
         for e in stored.entries
     ]
@@ -279,6 +282,28 @@ def build_entry(name: str, map: TopometricMap, stored: StoredAtlas) -> Entry:
     return Entry(free_name, hash_map(map), source, *counts, levelling=map.levelling)
 
 
+def _follow_journal(folder: Path, entry: Entry) -> Entry:
+    """The entry of a map with the corrections that its journal has by now."""
+    version = read_journal(find_journal(folder / entry.file)).version
+    if version == entry.edits:
+        return entry
+    map = load_corrected_map(folder / entry.file)
+    return replace(entry, key=hash_map(map), rooms=len(map.rooms), edits=version)
+
+
+def update(folder: str | Path, report: Report) -> AtlasResult:
+    """Put an atlas together again with the corrections of its maps. Waits for other processes that change the atlas.
+
+    Args:
+        report: as of `add`.
+
+    Raises:
+        InputError: the folder is no atlas, or a journal is damaged.
+    """
+    read_atlas(folder)
+    return change(folder, Change, report)
+
+
 def _find_free_name(name: str, entries: Iterable[Entry]) -> str:
     taken = {e.name.lower() for e in entries}
     name = "".join(c if c.isalnum() or c in "-_. " else "_" for c in name).strip(". ")[:80] or "map"
@@ -310,7 +335,8 @@ def change(
     with change_folder(folder, gone) as place:
         before = read_finished_folder(folder)
         requested = make(before)
-        stored = requested.stored
+        followed = tuple(e if e.name in requested.new else _follow_journal(folder, e) for e in requested.stored.entries)
+        stored = replace(requested.stored, entries=followed)
         (place / "maps").mkdir()
         for entry in stored.entries:
             new = requested.new.get(entry.name)

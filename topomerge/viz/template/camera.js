@@ -1,12 +1,13 @@
 // A camera that orbits a target, z up. Matrices are column-major, as WebGL wants them.
 
-const HALF = Math.tan(0.42); // of half of the field of view, across the shorter side
+import { startDrag } from "./plan.js";
+export const HALF = Math.tan(0.42); // of half of the field of view, across the shorter side
 
-function makeCamera(centre, size, turn, storeys) { // `turn`: what stands upright on paper does here, too
+export function makeCamera(centre, size, turn, storeys) { // `turn`: what stands upright on paper does here, too
   return { target: [...centre], distance: size * (0.72 + 0.24 * Math.min(storeys - 1, 4)), yaw: -Math.PI / 2 - turn, pitch: storeys > 1 ? 0.75 : 0.95, size };
 }
 
-function eyeOf(camera) {
+export function eyeOf(camera) {
   const flat = Math.cos(camera.pitch);
   const way = [flat * Math.cos(camera.yaw), flat * Math.sin(camera.yaw), Math.sin(camera.pitch)];
   return camera.target.map((value, i) => value + camera.distance * way[i]);
@@ -19,7 +20,7 @@ function axesOf(camera) { // right, up and back, of length 1
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
-function matrixOf(camera, aspect) {
+export function matrixOf(camera, aspect) {
   const axes = axesOf(camera), eye = eyeOf(camera);
   const near = Math.max(camera.distance * 0.02, 0.05), far = camera.distance + camera.size * 3 + 10;
   const f = 1 / HALF;
@@ -34,7 +35,7 @@ function matrixOf(camera, aspect) {
   return m;
 }
 
-function project(matrix, point, width, height) { // pixels and depth, or null behind the eye
+export function project(matrix, point, width, height) { // pixels and depth, or null behind the eye
   const row = (i) => matrix[i] * point[0] + matrix[4 + i] * point[1] + matrix[8 + i] * point[2] + matrix[12 + i];
   const w = row(3);
   return w > 0 ? [(row(0) / w + 1) * 0.5 * width, (1 - row(1) / w) * 0.5 * height, w] : null;
@@ -55,7 +56,7 @@ function dolly(camera, factor) {
   camera.distance = Math.min(Math.max(camera.distance * factor, camera.size * 0.01 + 0.2), camera.size * 6 + 5);
 }
 
-function startCamera(area, camera, changed) {
+export function startCamera(area, camera, changed) {
   let panning = false;
   area.addEventListener("contextmenu", (event) => event.preventDefault());
   area.addEventListener("pointerdown", (event) => { panning = event.button > 0 || event.shiftKey || event.ctrlKey; });

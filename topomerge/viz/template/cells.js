@@ -42,7 +42,7 @@ void main() { pixel = vec4(min(colour, 1.0), 1.0); }`;
 const pause = () => new Promise((go) => setTimeout(go));
 
 // Four 16-bit numbers a cell, storey after storey, each in an order without a pattern. The page can be used meanwhile.
-async function decode(data) {
+export async function decode(data) {
   const text = atob(data.data);
   const [, ny, nz] = data.shape;
   const storeys = data.storeys.map(() => 0);
@@ -89,7 +89,7 @@ async function shuffle(cells) { // two words each; so that the first part of the
   }
 }
 
-function program(gl) {
+export function program(gl) {
   const made = gl.createProgram();
   for (const [kind, text] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
     const shader = gl.createShader(kind);
@@ -102,7 +102,7 @@ function program(gl) {
   return made;
 }
 
-function upload(gl, { cells, rows }) {
+export function upload(gl, { cells, rows }) {
   gl.activeTexture(gl.TEXTURE1);
   gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
   gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16UI, ROW, rows, 0, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT, cells);
@@ -110,7 +110,7 @@ function upload(gl, { cells, rows }) {
   gl.activeTexture(gl.TEXTURE0);
 }
 
-function makeRoom(gl, hidden, width, height) { // a framebuffer of this size for a picture with smooth edges
+export function makeRoom(gl, hidden, width, height) { // a framebuffer of this size for a picture with smooth edges
   if (hidden.width === width && hidden.height === height) return;
   const samples = Math.min(gl.getParameter(gl.MAX_SAMPLES), 4);
   for (const buffer of hidden.buffers || []) gl.deleteRenderbuffer(buffer);
@@ -125,15 +125,15 @@ function makeRoom(gl, hidden, width, height) { // a framebuffer of this size for
   Object.assign(hidden, { width, height, buffers });
 }
 
-function show(gl, hidden, width, height) {
+export function show(gl, hidden, width, height) {
   gl.bindFramebuffer(gl.READ_FRAMEBUFFER, hidden.frame);
   gl.blitFramebuffer(0, 0, width, height, 0, 0, width, height, gl.COLOR_BUFFER_BIT, gl.NEAREST);
   gl.bindFramebuffer(gl.READ_FRAMEBUFFER, null);
 }
 
-const rgb = (hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16));
+export const rgb = (hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16));
 
-function paint(gl, texture, colours) {
+export function paint(gl, texture, colours) {
   const rows = Math.max(Math.ceil(colours.length / 256), 1);
   const pixels = new Uint8Array(256 * rows * 4);
   colours.forEach((colour, i) => pixels.set([...colour, 255], 4 * i));

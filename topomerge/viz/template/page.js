@@ -27,4 +27,4 @@ startPlaces(document.getElementById("places"));
 startStamp(document.getElementById("stamp"));
 // The page is shown before the cells are read; that there is no 3D is said only once it is known.
 document.querySelectorAll("[data-scene]").forEach((place) => place.classList.add("waiting"));
-setTimeout(() => document.querySelectorAll("[data-scene]").forEach(openScene), 50);
+setTimeout(() => document.querySelectorAll("[data-scene]").forEach((place) => openScene(place)), 50);

@@ -16,9 +16,9 @@ function indexPlaces() {
   }
 }
 
-let lit = null;
+export let lit = null;
 
-function light(place) {
+export function light(place) {
   if (place === lit) return;
   for (const element of places.get(lit) || []) element.classList.remove("on");
   lit = place;
@@ -68,7 +68,7 @@ function wordsOf(place) {
   }).join(" · ");
 }
 
-function roundLength(most) {
+export function roundLength(most) {
   const ten = 10 ** Math.floor(Math.log10(most));
   return [5, 2, 1].map((step) => step * ten).find((length) => length <= most);
 }
@@ -208,7 +208,7 @@ function startPlan(view) {
 }
 
 // Dragging with a mouse, one finger or two: move(pointers, dx, dy, pinch, event), in pixels.
-function startDrag(area, move) {
+export function startDrag(area, move) {
   const held = new Map();
   const spread = () => {
     const [a, b] = [...held.values()];

@@ -1,5 +1,9 @@
 // The 3D view of a map's cells: its controls, and what is drawn when.
 
+import { lit } from "./plan.js";
+import { HALF, eyeOf, makeCamera, matrixOf, project, startCamera } from "./camera.js";
+import { decode, makeRoom, paint, program, rgb, show, upload } from "./cells.js";
+
 // While the view moves, cells are left out (down to FEWEST) so that a picture comes every QUICK ms; once it rests, all are
 // drawn behind the screen, in passes of about LONGEST ms, so that the page never stands still.
 const QUICK = 60, LONGEST = 150;
@@ -14,10 +18,10 @@ function control(kind, words, settings, changed) {
   return label;
 }
 
-async function openScene(place) {
+export async function openScene(place, data = JSON.parse(document.getElementById(place.dataset.scene).textContent)) {
   const missing = place.querySelector(".missing");
   try {
-    if (!(await startScene(place))) place.replaceChildren(missing);
+    if (!(await startScene(place, data))) place.replaceChildren(missing);
     place.dataset.state = place.contains(missing) ? "missing" : "shown";
   } catch (error) { // a driver that compiles nothing
     place.replaceChildren(missing);
@@ -26,8 +30,7 @@ async function openScene(place) {
   place.classList.remove("waiting");
 }
 
-async function startScene(place) {
-  const data = JSON.parse(document.getElementById(place.dataset.scene).textContent);
+async function startScene(place, data) {
   const stage = document.createElement("div"), canvas = document.createElement("canvas"), words = document.createElement("canvas");
   stage.className = "stage";
   words.className = "words";
@@ -36,7 +39,7 @@ async function startScene(place) {
   const gl = canvas.getContext("webgl2", { antialias: false, preserveDrawingBuffer: true, powerPreference: "high-performance" });
   if (!gl || !data.drawn) return false; // the words that stand there say why
   const missing = place.querySelector(".missing");
-  canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); stopped(place, missing); });
+  canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); stopped(place, missing, data); });
   const made = program(gl), at = (name) => gl.getUniformLocation(made, name);
   const cells = await decode(data), texture = gl.createTexture();
   upload(gl, cells);
@@ -253,15 +256,15 @@ async function startScene(place) {
   return true;
 }
 
-function stopped(place, missing) {
+function stopped(place, missing, data) {
   const again = document.createElement("button");
   again.type = "button";
   again.textContent = "Show it again";
-  again.addEventListener("click", () => openScene(place));
+  again.addEventListener("click", () => openScene(place, data));
   missing.replaceChildren("The browser stopped the 3D view. ", again);
   place.replaceChildren(missing);
 }
 
-function hexOf(name) {
+export function hexOf(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 }
