@@ -15,6 +15,9 @@ from typing import TYPE_CHECKING, Any
 from topomerge.writers import WRITERS
 
 if TYPE_CHECKING:
+    from topomerge.changes.compare import Changes as Changes
+    from topomerge.changes.compare import align_maps as align_maps
+    from topomerge.changes.compare import compare_maps as compare_maps
     from topomerge.embedding.learned import load_embedder as load_embedder
     from topomerge.errors import InputError as InputError
     from topomerge.extraction.extract import extract as extract
@@ -47,6 +50,9 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "AtlasResult": "topomerge.fusion.atlas.result",
+    "Changes": "topomerge.changes.compare",
+    "align_maps": "topomerge.changes.compare",
+    "compare_maps": "topomerge.changes.compare",
     "find": "topomerge.fusion.atlas.find",
     "InputError": "topomerge.errors",
     "MergeResult": "topomerge.fusion.result",

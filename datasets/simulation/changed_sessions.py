@@ -101,7 +101,9 @@ def make_changed_pair(
         if rng.random() < 0.5:
             days, done = (later, base), [replace(c, kind=_REVERSED[c.kind]) for c in done]
     frames = Sim3(float(rng.uniform(-3, 3)), (3.0, -2.0, 0.4)), Sim3(float(rng.uniform(-3, 3)), (-5.0, 1.0, -0.3))
-    scans = [scan_building(day, name, _find_reachable(day, visited), rng, spacing) for day, name in zip(days, sensors, strict=True)]
+    scans = [
+        scan_building(day, name, _find_reachable(day, visited), rng, spacing) for day, name in zip(days, sensors, strict=True)
+    ]
     done = [replace(c, seen=_is_seen(c, scans, days)) for c in done]
     clouds = transform_cloud(scans[0], frames[0]), transform_cloud(scans[1], frames[1])
     return ChangedPair(days[0], clouds, frames, tuple(done))
@@ -183,7 +185,9 @@ def _alter(base: Building, visited: Sequence[int], rng: np.random.Generator) -> 
 Masonry = tuple[tuple[float, ...], tuple[float, ...], float]  # centre, size, yaw
 
 
-def _draw_wall(building: Building, room: int, rng: np.random.Generator) -> tuple[list[Masonry], shapely.Polygon, shapely.Polygon] | None:
+def _draw_wall(
+    building: Building, room: int, rng: np.random.Generator
+) -> tuple[list[Masonry], shapely.Polygon, shapely.Polygon] | None:
     """Boxes of a wall with a doorway across a room, its outline and that of the doorway."""
     about = building.rooms[room]
     shape = shapely.Polygon(about.polygon)

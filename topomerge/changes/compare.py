@@ -11,9 +11,10 @@ import numpy as np
 from topomerge.blas import limit_blas_threads
 from topomerge.changes.doors import DoorReader, find_door_changes
 from topomerge.changes.elements import find_furniture_changes, find_wall_changes
-from topomerge.changes.layers import CHANGE_CELL, PlacedMap, StoreyLayers, build_storey_layers
+from topomerge.changes.layers import CHANGE_CELL, PlacedMap, RelativePlacement, StoreyLayers, build_storey_layers
 from topomerge.changes.rooms import find_room_changes
 from topomerge.errors import InputError
+from topomerge.fusion.pipeline import MergeConfig, place_pair
 from topomerge.types import Array, Placement, Sim3, TopometricMap
 
 LEAST_PROBABILITY = 0.5
@@ -92,6 +93,26 @@ class Changes:
         """Count the changes of each kind there is, in the order of `KINDS`."""
         kinds = [c.kind for c in self.changes]
         return {kind: kinds.count(kind) for kind in KINDS if kind in kinds}
+
+
+def align_maps(old: TopometricMap, new: TopometricMap, **choices: Any) -> tuple[PlacedMap | None, str, tuple[str, ...]]:
+    """Align two maps as `merge` does.
+
+    Args:
+        old, new: any maps.
+        choices: keywords of `merge`: threshold, same, scale, rigid.
+
+    Returns:
+        Where the new map lies in the frame of the old one, None where that is not believed; why, in words; and warnings.
+
+    Raises:
+        InputError: as `merge`.
+    """
+    result = place_pair((old, new), MergeConfig(**choices))
+    placements = result.placements if result.merged else {}
+    if 1 not in placements:
+        return None, result.reason.replace("not merged", "not aligned", 1), result.warnings
+    return RelativePlacement(placements[0], placements[1]), result.reason.replace("merged", "aligned", 1), result.warnings
 
 
 @limit_blas_threads

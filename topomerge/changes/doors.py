@@ -110,9 +110,7 @@ def find_door_changes(layers: StoreyLayers, reader: DoorReader, walls: Sequence[
         own = [edges[k] if k >= 0 else None for edges, k in ((a, i), (b, j))]
         best = own[0] if own[0] is not None else own[1]
         assert best is not None
-        states = [
-            read_state(layers, layer, best, own[k], reader.points[k]) for k, layer in enumerate((layers.old, layers.new))
-        ]
+        states = [read_state(layers, layer, best, own[k], reader.points[k]) for k, layer in enumerate((layers.old, layers.new))]
         walled = max((w.probability for w in walls if _is_in_wall(best, w)), default=0.0)
         kind, probability = _decide(states[0], states[1], walled)
         evidence = {f"{when} {n}": p for when, s in zip(("old", "new"), states, strict=True) for n, p in s.items()}
@@ -182,14 +180,15 @@ def read_state(layers: StoreyLayers, map: MapLayer, door: Array, own: Array | No
     normal = np.array([np.cos(door["direction"]), np.sin(door["direction"])])
     along = np.array([-normal[1], normal[0]])
     at = (door["centre"][:2] + u[:, None, None] * along + v[None, :, None] * normal).reshape(-1, 2)
-    standing = layers.sample(map.standing, at).astype(bool).reshape(len(u), len(v))
-    free = layers.sample(map.free, at).astype(bool).reshape(len(u), len(v))
+    standing = layers.sample(map.filled, at).astype(bool).reshape(len(u), len(v))
+    open_ground = layers.sample(map.free | (map.standing & ~map.filled), at).astype(bool).reshape(len(u), len(v))
     blocked = standing.any(axis=1)
-    passed = ~blocked & (free.mean(axis=1) > 0.6)
+    passed = ~blocked & (open_ground.mean(axis=1) > 0.6)
     inner, jambs = np.abs(u) < width / 2 - 0.12, np.abs(u) > width / 2 + 0.05
     way, shut = float(passed[inner].mean()), float(blocked[inner].mean())
     told = 0.0 if own is None else OWN_DOOR * (1 if own["open"] else -1) * float(own["confidence"])
-    through = float(1 / (1 + np.exp(-(WAY_ODDS * (way - 0.5) + told))))
+    share = way / max(way + shut, 1e-6)
+    through = float(1 / (1 + np.exp(-(WAY_ODDS * (share - 0.5) + told))))
     bare = float(1 / (1 + np.exp(-WAY_ODDS * (passed[jambs].mean() - 0.7))))
     if own is not None and own["kind"] == "door":
         bare *= 0.2

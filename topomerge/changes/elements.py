@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from scipy import ndimage
 
-from topomerge.changes.layers import CHANGE_CELL, MapLayer, StoreyLayers, list_runs
+from topomerge.changes.layers import CHANGE_CELL, MOST_SLACK, MapLayer, StoreyLayers, list_runs
 from topomerge.structure.lines import Line, detect_lines
 from topomerge.types import Array
 
@@ -151,8 +151,7 @@ def _measure_wall(
     layers: StoreyLayers, kind: str, one: MapLayer, other: MapLayer, changed: Array, stretch: tuple[float, float, Line]
 ) -> WallChange:
     """A wall with its probability: how long it is, how much of it was seen, how empty its ground was, how high it goes."""
-    start, end, line = stretch
-    part = replace(line, start=start, end=end)
+    part = replace(stretch[2], start=stretch[0], end=stretch[1])
     own = _find_pixels(changed, part)
     off = ((own + 0.5) * CHANGE_CELL - part.middle) @ part.across
     low, high = (float(np.quantile(off, q)) for q in (0.03, 0.97)) if len(off) else (0.0, 0.0)
@@ -162,18 +161,44 @@ def _measure_wall(
     seen = _count_bins(other.free | other.standing, part, low, high) & covered
     margin = float(np.median(other.to_standing[at] / layers.slack[at])) if len(own) else 0.0
     evidence = {
-        "length": float(np.log(max(end - start, 0.1))),
+        "length": float(np.log(max(part.length, 0.1))),
         "support": float(support.mean()),
         "clear": float(support[seen].mean()) if seen.any() else 0.0,
         "tall": float(one.tall[at].mean()) if len(own) else 0.0,
         "margin": min(margin - 1.0, 3.0),
+        "apart": min(float(np.median(other.to_wall[at])), 1.5) if len(own) else 0.0,
+        "entered": float(np.maximum(one.entered, other.entered)[_ring(own, one.entered.shape)].mean()) if len(own) else 0.0,
     }
-    corners = [(start, low), (end, low), (end, high), (start, high)]
-    half = CHANGE_CELL / 2
-    corners = [(t, v - half if v == low else v + half) for t, v in corners]
+    start, end = _lengthen(one, other, part, low, high)
+    near, far = low - CHANGE_CELL / 2, high + CHANGE_CELL / 2
+    corners = [(start, near), (end, near), (end, far), (start, far)]
     local = np.array([part.middle + t * part.along + v * part.across for t, v in corners])
     outline = (layers.low + local) @ layers.axes
     return WallChange(kind, outline, end - start, compute_probability(WALL_ODDS, evidence), evidence)
+
+
+def _ring(pixels: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:
+    """Pixels 0.5 m around some, within a raster: walls themselves are of no room."""
+    steps = round(0.5 / CHANGE_CELL) * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    around = (pixels[:, None] + steps).reshape(-1, 2).clip(0, np.array(shape) - 1)
+    return around[:, 0], around[:, 1]
+
+
+def _lengthen(one: MapLayer, other: MapLayer, line: Line, low: float, high: float) -> tuple[float, float]:
+    """Start and end of a wall that changed, m along its line, each up to the wall of both maps that it meets: what is near that
+    one does not count as changed, but belongs to it."""
+    ends = []
+    for tip, sign in ((line.start, -1), (line.end, 1)):
+        step = 0
+        while step * CHANGE_CELL < MOST_SLACK:
+            at = line.middle + (tip + sign * (step + 0.5) * CHANGE_CELL) * line.along + (low + high) / 2 * line.across
+            i, j = np.floor(at / CHANGE_CELL).astype(int).tolist()
+            inside = 0 <= i < one.wall.shape[0] and 0 <= j < one.wall.shape[1]
+            if not inside or one.to_wall[i, j] > (high - low) / 2 + CHANGE_CELL or other.to_wall[i, j] <= CHANGE_CELL / 2:
+                break
+            step += 1
+        ends.append(tip + sign * step * CHANGE_CELL)
+    return ends[0], ends[1]
 
 
 def _find_pixels(mask: Array, line: Line) -> Array:
@@ -216,7 +241,7 @@ def find_furniture_changes(
     for kind, one, other in (("furniture new", layers.new, layers.old), ("furniture gone", layers.old, layers.new)):
         own_wall = one.to_wall <= BESIDE_WALL
         wall_of_both = own_wall & (other.to_wall <= layers.slack + BESIDE_WALL)
-        changed = one.standing & other.clear & (other.to_standing > layers.slack) & ~wall_of_both & ~taken
+        changed = one.thing & other.clear & (other.to_standing > layers.slack) & ~wall_of_both & ~taken
         changed &= other.to_wall > layers.slack
         solid = ndimage.binary_opening(changed, np.ones((2, 2), bool))
         groups, count = ndimage.label(_widen(solid, CHANGE_CELL))
@@ -256,6 +281,7 @@ def _measure_thing(layers: StoreyLayers, kind: str, one: MapLayer, other: MapLay
         "margin": min(float(np.max(other.to_standing[at] / layers.slack[at])) - 1.0, 3.0),
         "solid": area / max(float(sides[0] * sides[1]), 1e-6),
         "thick": min(float(sides[0]) / 0.3, 2.0) - 1.0,
+        "entered": float(min(one.entered[_ring(pixels, one.entered.shape)].mean(), other.entered[at].mean())),
         "height": float(np.quantile(one.top[at], 0.9)),
         "m2": area,
     }

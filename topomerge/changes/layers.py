@@ -21,6 +21,7 @@ from topomerge.types import Array, Placement, Sim3, TopometricMap
 
 CHANGE_CELL = 0.05  # m
 FLOOR_BAND = (-0.25, 0.25)  # m above the floor
+LOW_BAND, MANY_BANDS = (0.25, 1.0), 4  # m above the floor, where furniture stands; of 0.25 m that other things fill
 HIGH_BAND = (2.25, 2.5)  # m above the floor: walls reach up to there, cupboards do not
 MISFIT_REACH = 0.4  # m: walls that are farther apart are not one wall that is a little off
 MISFIT_WINDOW = 2.0  # m, standard deviation of the window over which misfit is averaged
@@ -71,8 +72,11 @@ class MapLayer:
 
     Args:
         wall, standing, tall: bool; a wall by the rule of plans, anything at the height of a body, and what reaches `HIGH_BAND`.
+        thing: bool; what stands on the floor or fills several heights: points between two surfaces hang in the air.
+        filled: bool; half of the heights of a body, at least.
         free, clear: bool; empty ground under a ceiling or on a floor, and such whose floor was seen.
         room: int32 room of the map, -1 none.
+        entered: float, probability that the map was made from within the room of a pixel, 0 outside rooms.
         top: m above the floor, of what stands.
         furnished: does the map show furniture at all? Drawings and slices do not.
         edge: m of a cell of the map.
@@ -81,9 +85,12 @@ class MapLayer:
     wall: Array
     standing: Array
     tall: Array
+    thing: Array
+    filled: Array
     free: Array
     clear: Array
     room: Array
+    entered: Array
     top: Array
     furnished: bool
     edge: float
@@ -210,6 +217,7 @@ def _draw_map(
     inside = ((cells >= 0) & (cells < plan.wall.shape)).all(axis=1)
     i, j = np.where(inside[:, None], cells, 0).T
     mask = plan.profile.dtype.type(observed)
+    bodies = max((observed & plan.bands.build_mask(*BODY_HEIGHTS)).bit_count(), 1)
     body = plan.profile & mask & plan.profile.dtype.type(plan.bands.build_mask(*BODY_HEIGHTS))
     standing = (body != 0) | plan.wall
     floor = plan.is_occupied(*FLOOR_BAND)
@@ -221,10 +229,15 @@ def _draw_map(
         out: Array = np.where(inside, raster[i, j], nothing).reshape(shape)
         return out
 
-    rasters = [plan.wall, standing, plan.wall & high, free, free & floor, _draw_rooms(map, plan)]
+    many = np.bitwise_count(body)
+    low = plan.profile & mask & plan.profile.dtype.type(plan.bands.build_mask(*LOW_BAND))
+    thing, filled = standing & ((low != 0) | (many >= MANY_BANDS)), plan.wall | (many >= bodies / 2)
+    rasters = [plan.wall, standing, plan.wall & high, thing, filled, free, free & floor, _draw_rooms(map, plan)]
     bits = [lookup(r) for r in rasters[:-1]]
     room = lookup(rasters[-1], -1)
-    return MapLayer(*(b.astype(bool) for b in bits), room.astype(np.int32), lookup(top), furnished, float(map.grid.edge))
+    room = room.astype(np.int32)
+    entered = np.append(map.rooms["entered"], 0.0)[room]
+    return MapLayer(*(b.astype(bool) for b in bits), room, entered, lookup(top), furnished, float(map.grid.edge))
 
 
 def _draw_rooms(map: TopometricMap, plan: StoreyPlan) -> Array:

@@ -39,6 +39,7 @@ from topomerge.cli.console import (
     write_all,
 )
 from topomerge.cli.dataset import DATASET, FINETUNE
+from topomerge.cli.diff import DIFF
 from topomerge.cli.export import EXPORT
 from topomerge.cli.extract import EMBED, EXPORT_EMBEDDER, EXTRACT, INFO
 from topomerge.cli.landmarks import FIND, MARK
@@ -209,6 +210,7 @@ COMMANDS = (
     EMBED,
     MATCH,
     MERGE,
+    DIFF,
     SIMULATE,
     COMPLETION,
     ATLAS,
@@ -224,7 +226,7 @@ exit status:
   0    done
   1    bad input or a wrong command line: one line on stderr says which file and why; no output is written
   2    no trustworthy merge: the reason is printed and stands in merge.json; of finetune: it did not help;
-       of find: nothing was found
+       of find: nothing was found; of diff: the maps could not be aligned
   130  interrupted
   141  what read the output went away (`| head`)
   143  terminated
