@@ -29,7 +29,8 @@ THICKNESS, DOORWAY, LINTEL = 0.12, 0.9, 2.05  # m, of the walls that are put up
 ROOM_AREA, FROM_DOOR = 14.0, 0.8  # m2 of a room that is divided, m between its doors and the new wall
 PLACES_TRIED = 30
 EXTRA_DOOR = 2.4  # m of wall that two rooms share, from which on they get a door
-SMALL_THING, NUDGE = 0.25, 0.3  # m2 of a footprint, m of a move: less is not counted
+SMALL_THING, NUDGE = 0.25, 0.3  # m2 of a footprint, m of a move: what is less neither has to be found nor is it wrong
+STAYS = 0.03  # m
 KEPT_APART = ("leaf", "lamp", "beam")
 SEEN_POINTS, SEEN_SHARE = 25, 0.6  # points on what stands; share of its ground that the other session saw
 GROUND_CELL = 0.15  # m
@@ -43,7 +44,7 @@ class TrueChange:
         kind: as `topomerge.changes.compare.KINDS`; furniture that moved is gone in one place and new in another.
         place: (2,) m.
         outline: of it from above, m.
-        seen: could both sessions have seen it?
+        seen: could both sessions have seen it, and is it large enough to be judged?
     """
 
     kind: str
@@ -104,7 +105,7 @@ def make_changed_pair(
     scans = [
         scan_building(day, name, _find_reachable(day, visited), rng, spacing) for day, name in zip(days, sensors, strict=True)
     ]
-    done = [replace(c, seen=_is_seen(c, scans, days)) for c in done]
+    done = [replace(c, seen=c.seen and _is_seen(c, scans, days)) for c in done]
     clouds = transform_cloud(scans[0], frames[0]), transform_cloud(scans[1], frames[1])
     return ChangedPair(days[0], clouds, frames, tuple(done))
 
@@ -322,9 +323,10 @@ def _list_furniture(old: Building, new: Building, visited: Sequence[int]) -> lis
     for kind, own, others in (("furniture gone", tables[0], tables[1]), ("furniture new", tables[1], tables[0])):
         for thing in own:
             alike = others[(others["kind"] == thing["kind"]) & (np.abs(others["size"] - thing["size"]).max(axis=1) < 1e-6)]
-            stays = len(alike) and np.linalg.norm(alike["centre"][:, :2] - thing["centre"][:2], axis=1).min() < NUDGE
-            if not stays and thing["size"][0] * thing["size"][1] >= SMALL_THING:
-                out.append(_describe(kind, _outline_thing(thing)))
+            apart = np.linalg.norm(alike["centre"][:, :2] - thing["centre"][:2], axis=1).min(initial=np.inf)
+            if apart > STAYS:
+                judged = apart >= NUDGE and thing["size"][0] * thing["size"][1] >= SMALL_THING
+                out.append(replace(_describe(kind, _outline_thing(thing)), seen=bool(judged)))
     return out
 
 

@@ -145,7 +145,7 @@ def compare_maps(
 
 
 def _find_storey_changes(layers: StoreyLayers, reader: DoorReader) -> Iterator[Change]:
-    walls = find_wall_changes(layers)
+    walls = find_wall_changes(layers, reader.list_places(layers))
     doors = find_door_changes(layers, reader, walls)
     for wall in walls:
         yield _build_change(layers, wall.kind, wall.outline, wall.length, wall.probability, wall.evidence)

@@ -21,11 +21,12 @@ PLANE_REACH = 0.2  # m on either side of the middle of its wall
 RECESS = (0.0, 0.02), (0.08, 0.035)  # m and standard deviation, by which a wall and a leaf stand back from the wall beside them
 LEAST_POINTS = 12  # to measure that
 BLIND_LEAF = 0.85  # of what blocks a door and was seen from one side: it is a leaf
-OWN_DOOR = 3.0  # log odds by which a map's own door speaks for how it says that the door stands
+OWN_OPEN, OWN_SHUT = 6.0, 3.0  # log odds by which a map's own door speaks for how it says that the door stands
+OWN_LEAF = 4.0  # odds of a leaf against a wall, where the map has a door that it calls shut
 WAY_ODDS = 10.0  # log odds per share of a door's width that is passable
 # How much rarer than no change each change is, before anything was seen: old state, new state.
 PRIOR = {
-    ("open", "leaf"): 0.4, ("leaf", "open"): 0.4, ("open", "wall"): 0.06, ("leaf", "wall"): 0.04, ("wall", "open"): 0.06,
+    ("open", "leaf"): 0.25, ("leaf", "open"): 0.25, ("open", "wall"): 0.06, ("leaf", "wall"): 0.04, ("wall", "open"): 0.06,
     ("wall", "leaf"): 0.02, ("open", "none"): 0.05, ("leaf", "none"): 0.05, ("none", "open"): 0.05, ("none", "leaf"): 0.05,
     ("wall", "none"): 0.05, ("none", "wall"): 0.05,
 }  # fmt: skip
@@ -186,7 +187,7 @@ def read_state(layers: StoreyLayers, map: MapLayer, door: Array, own: Array | No
     passed = ~blocked & (open_ground.mean(axis=1) > 0.6)
     inner, jambs = np.abs(u) < width / 2 - 0.12, np.abs(u) > width / 2 + 0.05
     way, shut = float(passed[inner].mean()), float(blocked[inner].mean())
-    told = 0.0 if own is None else OWN_DOOR * (1 if own["open"] else -1) * float(own["confidence"])
+    told = 0.0 if own is None else (OWN_OPEN if own["open"] else -OWN_SHUT) * float(own["confidence"])
     share = way / max(way + shut, 1e-6)
     through = float(1 / (1 + np.exp(-(WAY_ODDS * (share - 0.5) + told))))
     bare = float(1 / (1 + np.exp(-WAY_ODDS * (passed[jambs].mean() - 0.7))))
@@ -207,8 +208,8 @@ def _is_beside_seen(layers: StoreyLayers, map: MapLayer, door: Array, normal: Ar
 
 def _estimate_leaf(door: Array, own: Array | None, points: Array, floor: float) -> float:
     """Probability that what blocks a door is a leaf and no wall: leaves stand back from the wall beside them on one side."""
-    if own is not None and own["kind"] == "door":
-        return 0.5 + 0.48 * float(own["confidence"])
+    own_leaf = own is not None and own["kind"] == "door"
+    blind = 0.5 + 0.48 * float(own["confidence"]) if own is not None and own_leaf else BLIND_LEAF
     width, reach = float(door["width"]), float(door["width"]) / 2 + 0.6
     apart = points[:, :2] - door["centre"][:2]
     high = points[:, 2] - floor
@@ -219,13 +220,14 @@ def _estimate_leaf(door: Array, own: Array | None, points: Array, floor: float) 
     inner = v[flat & (np.abs(u) < width / 2 - 0.12)]
     beside = v[flat & (np.abs(u) > width / 2 + 0.08) & (np.abs(u) < width / 2 + 0.5)]
     if min(len(inner), len(beside)) < LEAST_POINTS:
-        return BLIND_LEAF
+        return blind
     low, high_side = np.quantile(beside, [0.1, 0.9])
     if high_side - low < 0.07:  # the wall was seen from one side
-        return BLIND_LEAF
+        return blind
     first, last = np.quantile(inner, [0.1, 0.9])
     recess = max(float(high_side - last), float(first - low))
     likelihood = [np.exp(-0.5 * ((recess - mean) / sigma) ** 2) / sigma for mean, sigma in RECESS]
     if recess > RECESS[1][0]:
         likelihood[1] = 1 / RECESS[1][1]
-    return float((likelihood[1] + 0.02) / (sum(likelihood) + 0.04))
+    leaf, wall = (OWN_LEAF if own_leaf else 1.0) * (likelihood[1] + 0.02), likelihood[0] + 0.02
+    return float(leaf / (leaf + wall))

@@ -20,9 +20,10 @@ ONE_WALL = 0.45  # m between the faces of one wall, at most
 LEAST_WALL = 0.7  # m
 SUPPORT_BIN = 0.1  # m along a wall
 DOOR_GAP = 1.3  # m: a wider gap parts two walls
-WALL_ODDS = {"bias": -5.6, "length": 1.6, "support": 3.0, "clear": 2.0, "tall": 3.0, "margin": 0.7}
+# Fitted on the candidates of 24 pairs of sessions of training seeds (`evaluation.changes`, data=dev).
+WALL_ODDS = {"bias": -20.3, "length": 1.6, "clear": 8.4, "tall": 2.9, "margin": 0.6, "apart": 1.1, "entered": 7.5}
 LEAST_THING = 0.12  # m2
-THING_ODDS = {"bias": -1.2, "area": 1.3, "margin": 0.8, "solid": 1.0, "thick": 1.0}
+THING_ODDS = {"bias": -2.6, "area": 1.9, "margin": -0.2, "solid": 6.4, "thick": -0.1, "entered": 3.0, "ring": -1.4, "height": -0.7}
 BESIDE_WALL = 0.12  # m beside a wall, whose noise is no furniture
 LEAF_THICKNESS = 0.3  # m: what stands thinner than that beside a door may be its leaf
 LEAF_REACH = 0.35  # m beyond the width of its door
@@ -74,8 +75,11 @@ def compute_probability(odds: dict[str, float], evidence: dict[str, float]) -> f
     return float(1 / (1 + np.exp(-total)))
 
 
-def find_wall_changes(layers: StoreyLayers) -> list[WallChange]:
-    """Find the walls that are new or gone, whatever their probability."""
+Doors = Sequence[tuple[Array, float]]  # middle (2,) m and width
+
+
+def find_wall_changes(layers: StoreyLayers, doors: Doors = ()) -> list[WallChange]:
+    """Find the walls that are new or gone, whatever their probability; what fills a door and no more is its leaf."""
     found = []
     for kind, one, other in (("wall new", layers.new, layers.old), ("wall gone", layers.old, layers.new)):
         changed = one.wall & other.free & (other.to_wall > layers.slack) & (other.to_standing > layers.slack)
@@ -88,7 +92,14 @@ def find_wall_changes(layers: StoreyLayers) -> list[WallChange]:
         for low, high, line in _merge_faces(lines):  # of all groups: a door parts a wall into two
             runs = _split_runs(changed, line, low, high)
             found += [_measure_wall(layers, kind, one, other, changed, (*run, line)) for run in runs]
-    return _drop_repeated(found)
+    return [wall for wall in _drop_repeated(found) if not any(_fills_door(wall, *door) for door in doors)]
+
+
+def _fills_door(wall: WallChange, centre: Array, width: float) -> bool:
+    along = (wall.ends[1] - wall.ends[0]) / max(wall.length, 1e-9)
+    apart = wall.ends.mean(axis=0) - centre
+    off, shift = abs(float(apart[0] * along[1] - apart[1] * along[0])), abs(float(apart @ along))
+    return off < LEAF_THICKNESS and shift + wall.length / 2 < width / 2 + 2 * LEAF_REACH
 
 
 def _widen(mask: Array, metres: float) -> Array:
@@ -224,7 +235,7 @@ def _drop_repeated(walls: Sequence[WallChange]) -> list[WallChange]:
 
 
 def find_furniture_changes(
-    layers: StoreyLayers, walls: Sequence[WallChange], doors: Sequence[tuple[Array, float]], least: float = 0.5
+    layers: StoreyLayers, walls: Sequence[WallChange], doors: Doors, least: float = 0.5
 ) -> list[ThingChange]:
     """Find furniture that is new, gone or moved, where both maps show furniture at all.
 
@@ -282,6 +293,7 @@ def _measure_thing(layers: StoreyLayers, kind: str, one: MapLayer, other: MapLay
         "solid": area / max(float(sides[0] * sides[1]), 1e-6),
         "thick": min(float(sides[0]) / 0.3, 2.0) - 1.0,
         "entered": float(min(one.entered[_ring(pixels, one.entered.shape)].mean(), other.entered[at].mean())),
+        "ring": _measure_ring(one, pixels),
         "height": float(np.quantile(one.top[at], 0.9)),
         "m2": area,
     }
@@ -290,7 +302,18 @@ def _measure_thing(layers: StoreyLayers, kind: str, one: MapLayer, other: MapLay
     return ThingChange(kind, outline, float(sides[1]), compute_probability(THING_ODDS, evidence), evidence, room, area)
 
 
-def _is_leaf(thing: ThingChange, doors: Sequence[tuple[Array, float]]) -> bool:
+def _measure_ring(one: MapLayer, pixels: Array) -> float:
+    """Share of the ground 0.2 m around a thing that is floor: a floor that has drifted upwards has no other one around it."""
+    low = (pixels.min(axis=0) - 6).clip(0)
+    high = pixels.max(axis=0) + 7
+    box = tuple(slice(a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True))
+    own = np.zeros(one.clear[box].shape, bool)
+    own[tuple((pixels - low).T)] = True
+    around = _widen(own, 4 * CHANGE_CELL) & ~_widen(own, 2 * CHANGE_CELL)
+    return float(one.clear[box][around].mean()) if around.any() else 0.0
+
+
+def _is_leaf(thing: ThingChange, doors: Doors) -> bool:
     """May it be the leaf of a door that stands otherwise?"""
     sides = np.linalg.norm(np.diff(thing.outline[:3], axis=0), axis=1)
     if sides.min() > LEAF_THICKNESS:

@@ -48,6 +48,7 @@ MODULES = {
     "retrieval": "retrieval",
     "radio": "radio",
     "landmarks": "landmarks",
+    "changes": "changes",
 }
 
 

@@ -81,7 +81,7 @@ def _render_summary(changes: Changes) -> Markup:
 
 def _render_view(changes: Changes) -> Markup:
     place = changes.placement
-    bends, pose, to_paper = {}, place.pose, lambda points: points
+    bends, pose, to_paper = {}, place.pose, lambda points: points  # drawn as they lie, bent
     if isinstance(place, RelativePlacement):
         bends = {k: p.bend for k, p in enumerate((place.old, place.new)) if p.bend is not None}
         to_paper = place.old.transform_points

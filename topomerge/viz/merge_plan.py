@@ -231,7 +231,7 @@ def render_blend_view(
         _OverlaySide("b", b, sheet_b, plans_b, pose, bent.get(1)),
     ]
     paper = _compute_enclosing_sheet(sheet_a, sheet_b, pose)
-    factor = choose_arrow_factor([PieceShifts.from_deformation(side.bend) for side in sides], paper)
+    factor = 0 if overlay else choose_arrow_factor([PieceShifts.from_deformation(side.bend) for side in sides], paper)
     figures, captions = [], []
     for k, storeys in enumerate(pair_storeys(a, b, pose)):
         layers = [_render_layer(side, s, paper, factor) for side, s in zip(sides, storeys, strict=True) if s is not None]
@@ -248,13 +248,13 @@ def render_blend_view(
     bar = _render_sliders((a, b), names, overlay is not None)
     groups = [
         bar,
-        *([render_deformation_controls()] if bent else []),
+        *([render_deformation_controls()] if bent and factor else []),
         *([build_element("div", *choices, class_="choices")] if choices else []),
     ]
     controls = build_element("div", *groups, build_element("div", *render_zoom_buttons(), class_="zoom"), class_="controls")
     told = "Point at a change." if overlay else "Walls of one map on walls of the other support the merge."
     hint = build_element("p", told, class_="told", aria_live="polite")
-    words = [build_element("p", describe_deformation(len(bent), factor), class_="note")] if bent else []
+    words = [build_element("p", describe_deformation(len(bent), factor), class_="note")] if bent and factor else []
     return build_element(
         "div", controls, build_element("div", *figures, class_="sheet", tabindex=0), hint, *words, class_="plan-view"
     )
@@ -329,7 +329,9 @@ def _render_layer(side: _OverlaySide, storey: int, paper: Sheet, factor: int) ->
     plan, sheet = side.plans[storey], side.sheet
     ground = [_render_outline(d, side, storey, "ground") for d in trace_rooms(plan, sheet).values()]
     signs = (
-        [] if side.bend is None else [render_arrows(side.name, PieceShifts.from_deformation(side.bend), storey, sheet, factor)]
+        []
+        if side.bend is None or not factor
+        else [render_arrows(side.name, PieceShifts.from_deformation(side.bend), storey, sheet, factor)]
     )
     matrix = "matrix(" + " ".join(f"{v:.6g}" for v in compute_sheet_transform(sheet, paper, side.pose).T.ravel()) + ")"
     walls = _render_outline(trace_walls(plan, sheet), side, storey)
