@@ -18,7 +18,9 @@ SAME_DOOR = 0.6  # m
 DOOR_HEIGHTS = (0.4, 1.8)  # m above the floor, in which a leaf stands back from its wall
 JAMB = 0.35  # m beside a door
 PLANE_REACH = 0.2  # m on either side of the middle of its wall
-RECESS = (0.0, 0.02), (0.08, 0.035)  # m and standard deviation, by which a wall and a leaf stand back from the wall beside them
+FACE_SPAN, FACE_BIN, FACE_REACH = 0.4, 0.01, 0.03  # m across a wall, in which its faces are looked for, and about them
+LEAST_THICK, MOST_THICK, SECOND_FACE = 0.07, 0.35, 0.25  # m between them; share of the points of the stronger one
+FLUSH = 0.15, 0.03  # share of what blocks a door that lies in the weaker face, from which on it is a wall; its softness
 LEAST_POINTS = 12  # to measure that
 BLIND_LEAF = 0.85  # of what blocks a door and was seen from one side: it is a leaf
 OWN_OPEN, OWN_SHUT = 6.0, 3.0  # log odds by which a map's own door speaks for how it says that the door stands
@@ -207,7 +209,8 @@ def _is_beside_seen(layers: StoreyLayers, map: MapLayer, door: Array, normal: Ar
 
 
 def _estimate_leaf(door: Array, own: Array | None, points: Array, floor: float) -> float:
-    """Probability that what blocks a door is a leaf and no wall: leaves stand back from the wall beside them on one side."""
+    """Probability that what blocks a door is a leaf and no wall: a leaf lies in one face of
+    the wall beside it at most, masonry in both."""
     own_leaf = own is not None and own["kind"] == "door"
     blind = 0.5 + 0.48 * float(own["confidence"]) if own is not None and own_leaf else BLIND_LEAF
     width, reach = float(door["width"]), float(door["width"]) / 2 + 0.6
@@ -216,18 +219,26 @@ def _estimate_leaf(door: Array, own: Array | None, points: Array, floor: float) 
     near = (np.abs(apart) < reach).all(axis=1) & (high > DOOR_HEIGHTS[0]) & (high < DOOR_HEIGHTS[1])
     normal = np.array([np.cos(door["direction"]), np.sin(door["direction"])])
     v, u = apart[near] @ normal, apart[near] @ np.array([-normal[1], normal[0]])
-    flat = np.abs(v) < 0.4
+    flat = np.abs(v) < FACE_SPAN
     inner = v[flat & (np.abs(u) < width / 2 - 0.12)]
     beside = v[flat & (np.abs(u) > width / 2 + 0.08) & (np.abs(u) < width / 2 + 0.5)]
     if min(len(inner), len(beside)) < LEAST_POINTS:
         return blind
-    low, high_side = np.quantile(beside, [0.1, 0.9])
-    if high_side - low < 0.07:  # the wall was seen from one side
+    faces = _find_faces(beside)
+    if len(faces) < 2:  # the wall was seen from one side
         return blind
-    first, last = np.quantile(inner, [0.1, 0.9])
-    recess = max(float(high_side - last), float(first - low))
-    likelihood = [np.exp(-0.5 * ((recess - mean) / sigma) ** 2) / sigma for mean, sigma in RECESS]
-    if recess > RECESS[1][0]:
-        likelihood[1] = 1 / RECESS[1][1]
-    leaf, wall = (OWN_LEAF if own_leaf else 1.0) * (likelihood[1] + 0.02), likelihood[0] + 0.02
-    return float(leaf / (leaf + wall))
+    flush = min(float((np.abs(inner - face) < FACE_REACH).mean()) for face in faces)
+    odds = np.exp((FLUSH[0] - flush) / FLUSH[1]) * (OWN_LEAF if own_leaf else 1.0)
+    return float(odds / (1 + odds))
+
+
+def _find_faces(off: Array) -> list[float]:
+    """The two faces of a wall, m across it, of points that lie on it and beside it; one where only one was seen."""
+    count = np.bincount(np.floor((off + FACE_SPAN) / FACE_BIN).astype(int), minlength=round(2 * FACE_SPAN / FACE_BIN))
+    smooth = np.convolve(count, np.ones(3), "same")
+    at = (np.arange(len(smooth)) + 0.5) * FACE_BIN - FACE_SPAN
+    first = int(smooth.argmax())
+    apart = np.abs(at - at[first])
+    others = np.where((apart >= LEAST_THICK) & (apart <= MOST_THICK), smooth, 0)
+    second = int(others.argmax())
+    return [float(at[first])] + ([float(at[second])] if others[second] >= SECOND_FACE * smooth[first] else [])

@@ -23,7 +23,16 @@ DOOR_GAP = 1.3  # m: a wider gap parts two walls
 # Fitted on the candidates of 24 pairs of sessions of training seeds (`evaluation.changes`, data=dev).
 WALL_ODDS = {"bias": -20.3, "length": 1.6, "clear": 8.4, "tall": 2.9, "margin": 0.6, "apart": 1.1, "entered": 7.5}
 LEAST_THING = 0.12  # m2
-THING_ODDS = {"bias": -2.6, "area": 1.9, "margin": -0.2, "solid": 6.4, "thick": -0.1, "entered": 3.0, "ring": -1.4, "height": -0.7}
+THING_ODDS = {
+    "bias": -2.6,
+    "area": 1.9,
+    "margin": -0.2,
+    "solid": 6.4,
+    "thick": -0.1,
+    "entered": 3.0,
+    "ring": -1.4,
+    "height": -0.7,
+}
 BESIDE_WALL = 0.12  # m beside a wall, whose noise is no furniture
 LEAF_THICKNESS = 0.3  # m: what stands thinner than that beside a door may be its leaf
 LEAF_REACH = 0.35  # m beyond the width of its door

@@ -35,7 +35,7 @@ MAKERS = ("topomerge.changes.compare", "topomerge.changes.model", "topomerge.ext
           "topomerge.datasets.simulation.changed_sessions")  # fmt: skip
 TEST_SEEDS, DEV_SEEDS = 905_300, 5_930  # first seeds
 SENSORS = (("tls", "depth"), ("lidar", "tls"), ("depth", "lidar"))
-UNCHANGED = 3  # every third pair has no change
+UNCHANGED = 3  # every third pair has no change, each kind of building and each pair of sensors as often
 PLACED = 0.8  # m between a change and a true one that it is
 TRUTH_KINDS = {"door cut": "door new"}
 GROUPS = {
@@ -75,7 +75,7 @@ def draw_cases(development: bool) -> list[Case]:
     """Draw each kind of building by each pair of sensors."""
     first = DEV_SEEDS if development else TEST_SEEDS
     made = [(kind, sensors) for kind in BUILDING_KINDS for sensors in SENSORS]
-    cases = [Case(kind, first + i, sensors, i % UNCHANGED != 0) for i, (kind, sensors) in enumerate(made, 1)]
+    cases = [Case(kind, first + i, sensors, (i + i // len(SENSORS)) % UNCHANGED != 0) for i, (kind, sensors) in enumerate(made)]
     models = MODELS["dev" if development else ""]
     return cases + [Case(name, k, (sensor,)) for name in models for k, sensor in enumerate(MODEL_SENSORS)]
 
