@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import shapely
+from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
 from topomerge.changes.compare import Change, Changes, compare_maps
@@ -25,7 +26,9 @@ FARTHEST_SHIFT, SHIFT_BIN = 0.3, 0.01  # m
 FACE_BIN = 0.12  # m, of the cells of a face
 FLAT, SAME_NORMAL = 0.2, 0.97  # |z| of the normal of an upright face; cosine
 SUPPORT_REACH = 0.025  # m about a shift, within which the scan supports it
-STAYS = 0.12  # share by which a shift must be better supported than none
+STAYS = 0.6  # share by which a shift must be better supported than none: one face of a wall may lie where the other one was
+EXPLAINED, BESIDE = 0.03, 0.1  # m off a face and beside its nearest sample: such points of the scan are of that face
+NEIGHBOURS = 6  # samples that are asked
 LEAST_SEEN, LEAST_CELLS = 0.2, 12  # share of the cells of an element, and how many
 GONE = 0.5  # share of an element's ground that was seen empty
 TOLERANCE = 0.01  # m: less is how things are built
@@ -93,15 +96,51 @@ def compare_with_model(
     """
     found = compare_maps(model, scan, placement, least)
     layers, reader = build_storey_layers(model, scan, placement), DoorReader(model, scan, placement)
-    faces = {k: _measure_planes(e, reader.points[1]) for k, e in enumerate(elements) if e.kind != "door"}
+    points = _OwnedPoints(elements, reader.points[1])
+    faces = {k: _measure_planes(e, points.select(k)) for k, e in enumerate(elements) if e.kind in ("wall", "column", "slab")}
     correct = estimate_common_shift([shift for shifts in faces.values() for shift in shifts])
     rows = [
         _judge_door(e, layers, reader) if e.kind == "door" else _judge_element(e, faces[k], layers, correct)
         for k, e in enumerate(elements)
+        if e.kind != "other"
     ]
     deviating = [_build_change(row, layers) for row in rows if row.state in ("elsewhere", "missing") and row.probability >= least]
     unmodelled = [c for c in found.changes if c.kind not in IGNORED]
     return replace(found, changes=(*deviating, *unmodelled), elements=tuple(rows))
+
+
+class _OwnedPoints:
+    """Points of a scan, and on whose faces they lie: what shows another element is no trace of this one.
+
+    Args:
+        elements: of the model.
+        points: (n, 3) m, in the model's frame.
+    """
+
+    def __init__(self, elements: Sequence[ModelElement], points: Array) -> None:
+        low, high = points.min(axis=0) - FARTHEST_SHIFT, points.max(axis=0) + FARTHEST_SHIFT
+        samples, normals, owners = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0, np.int64)]
+        for k, element in enumerate(elements):
+            corners = element.vertices[element.faces]
+            corners = corners[((corners.min(axis=1) <= high) & (corners.max(axis=1) >= low)).all(axis=1)]
+            normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            area = np.linalg.norm(normal, axis=1) / 2
+            count = _count_samples(area)
+            samples.append(_sample_triangles(corners, area))
+            normals.append(np.repeat(normal / np.maximum(2 * area[:, None], 1e-12), count, axis=0))
+            owners.append(np.full(int(count.sum()), k))
+        self.points, at = points, np.concatenate(samples)
+        far, near = cKDTree(at).query(points, NEIGHBOURS, distance_upper_bound=BESIDE) if len(at) else (np.inf, 0)
+        found = np.isfinite(np.broadcast_to(far, (len(points), NEIGHBOURS)))
+        near = np.where(found, np.broadcast_to(near, found.shape), 0)
+        off = np.abs(((points[:, None] - at[near]) * np.concatenate(normals)[near]).sum(axis=2)) if len(at) else far
+        self.owner = np.where(found & (off <= EXPLAINED), np.concatenate(owners)[near], -1) if len(at) else near - 1
+
+    def select(self, element: int) -> Array:
+        """Select the points (n, 3) that are of an element, or of none."""
+        others = (self.owner >= 0) & (self.owner != element)
+        out: Array = self.points[(self.owner == element).any(axis=1) | ~others.any(axis=1)]
+        return out
 
 
 @dataclass(frozen=True, eq=False)

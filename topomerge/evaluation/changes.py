@@ -20,7 +20,7 @@ from topomerge.changes.compare import Change, Changes, align_maps, compare_maps
 from topomerge.changes.model import compare_with_model
 from topomerge.code_digest import compute_code_digest
 from topomerge.datasets.buildings.layouts import BUILDING_KINDS
-from topomerge.datasets.real.ifc import load_model_building
+from topomerge.datasets.real.ifc import find_ground, load_model_building
 from topomerge.datasets.simulation.changed_sessions import ChangedPair, TrueChange, make_changed_pair
 from topomerge.datasets.simulation.scanner import scan_building
 from topomerge.evaluation.documents import write_table
@@ -29,7 +29,7 @@ from topomerge.extraction.extract import extract
 from topomerge.io.ifc import ModelElement, read_elements
 from topomerge.io.points import read_chunks
 from topomerge.statistics import format_interval
-from topomerge.types import Array, LogFn
+from topomerge.types import Array, LogFn, Placement, Sim3
 
 MAKERS = ("topomerge.changes.compare", "topomerge.changes.model", "topomerge.extraction.extract",
           "topomerge.datasets.simulation.changed_sessions")  # fmt: skip
@@ -49,6 +49,7 @@ PLANTED, PLANTED_WALLS = (0.02, 0.05, 0.10), 8  # m; of each model, so many wall
 LONG_WALL = 1.5  # m: shorter walls are not shifted
 MODEL_SPACING = 0.05  # m between points of a scan
 RIGHT = 0.01  # m
+ANCHOR = np.array([[5.0, 5.0, 0.0]])  # m, where poses are compared
 
 
 @dataclass
@@ -163,10 +164,12 @@ def score_model(case: Case) -> Row:
     visited = [i for i, r in enumerate(building.rooms) if r.storey == storey and r.kind != "lift"]
     cloud = scan_building(building, case.sensors[0], visited, rng, MODEL_SPACING)
     scan, model = extract(replace(cloud, labels=None, rooms=())), extract(read_chunks(str(path)), name=path.name)
-    placement, reason, _ = align_maps(model, scan)
-    row: Row = {"what": "model", "aligned": placement is not None}
-    if placement is None:
-        return row | {"reason": reason}
+    placement, reason, _ = align_maps(model, scan, same="building")
+    truth = Sim3(0.0, (0.0, 0.0, find_ground(path, building)))
+    off = np.inf if placement is None else float(np.linalg.norm(placement.pose.apply(ANCHOR) - truth.apply(ANCHOR)))
+    row: Row = {"what": "model", "aligned": placement is not None, "off": round(off, 3) if np.isfinite(off) else None}
+    if placement is None:  # the deviations are measured all the same
+        placement, row["reason"] = Placement(truth), reason
     elements = read_elements(path)
     walls = [k for k, e in enumerate(elements) if e.kind == "wall" and np.ptp(e.vertices[:, :2], axis=0).max() > LONG_WALL]
     asked = compare_with_model(elements, model, scan, placement).elements  # which of them the scan shows, where it shows them
@@ -211,7 +214,7 @@ def _tabulate_groups(rows: Sequence[Row]) -> str:
 def _tabulate_same(rows: Sequence[Row]) -> str:
     used = [r for r in rows if r["aligned"]]
     lines = []
-    for sensors in (*dict.fromkeys(r["sensors"] for r in used), "all"):
+    for sensors in (*dict.fromkeys(r["sensors"] for r in used), "all") if used else ():
         some = [r for r in used if sensors in (r["sensors"], "all")]
         counts = {e: np.array([r["alarms"][e] for r in some]) for e in ("wall", "door", "room", "furniture")}
         total = np.sum(list(counts.values()), axis=0)
@@ -225,10 +228,7 @@ def _tabulate_same(rows: Sequence[Row]) -> str:
 def _tabulate_models(rows: Sequence[Row]) -> str:
     lines = []
     for row in rows:
-        if not row["aligned"]:
-            lines.append([row["building"], row["sensors"], "not aligned", *[""] * 5])
-            continue
-        cells = []
+        cells = ["yes" if row["aligned"] else "no: given"]
         for by in PLANTED:
             own = [(p, s, state) for p, s, state in row["found"] if abs(abs(p) - by) < 1e-6]
             hits = [abs(s - p) for p, s, state in own if state == "elsewhere" and abs(s - p) <= RIGHT]
@@ -238,7 +238,15 @@ def _tabulate_models(rows: Sequence[Row]) -> str:
         cells += [f"{100 * float(np.median(error)):.1f}" if error else "–", f"{false} of {len(row['others'])}"]
         states = [f"{row['states'].count(s)} {s}" for s in dict.fromkeys(row["states"])]
         lines.append([row["building"], row["sensors"], *cells, ", ".join(states)])
-    columns = ("model", "sensor", *(f"{100 * by:.0f} cm found" for by in PLANTED), "median error cm", "false", "elements")
+    columns = (
+        "model",
+        "sensor",
+        "aligned",
+        *(f"{100 * by:.0f} cm found" for by in PLANTED),
+        "median error cm",
+        "false",
+        "elements",
+    )
     return write_table(columns, lines) if lines else "No models."
 
 
@@ -246,4 +254,4 @@ def write_ratio(part: Array, whole: Array, rows: Sequence[Row]) -> str:
     """Write a ratio of sums over rows with its interval over buildings (`statistics.format_interval`)."""
     values = [np.repeat([1.0, 0.0], [int(p), int(w - p)]) for p, w in zip(part, whole, strict=True)]
     places = np.repeat([r["place"] for r in rows], [len(v) for v in values])
-    return format_interval(np.concatenate(values), places)
+    return format_interval(np.concatenate(values), places) if values else "–"
