@@ -32,6 +32,7 @@ RANKS = {
     "landmarks": 5.2,  # testimony beyond walls
     "registration": 5.5,
     "fusion": 6,
+    "changes": 6.5,  # between two maps that lie in one frame
     "viz": 7,
     "studio": 7.5,
     "models": 8,
@@ -46,7 +47,7 @@ RANKS = {
     "cli": 13,
     "__main__": 15,
 }
-HEAVY = ("torch", "torch_geometric", "lightning_fabric", "hydra", "omegaconf", "open3d", "laspy", "pye57", "ifcopenshell")
+HEAVY = ("torch", "torch_geometric", "lightning_fabric", "hydra", "omegaconf", "open3d", "laspy", "pye57", "ifcopenshell", "bcf")
 HEAVY += ("onnxruntime", "onnx")
 HEAVY += ("trimesh", "rosbags", "rapidocr_onnxruntime", "pupil_apriltags", "cv2", "ezdxf", "pypdfium2", "resvg_py")
 

@@ -15,6 +15,9 @@ from typing import TYPE_CHECKING, Any
 from topomerge.writers import WRITERS
 
 if TYPE_CHECKING:
+    from topomerge.changes.compare import Changes as Changes
+    from topomerge.changes.compare import align_maps as align_maps
+    from topomerge.changes.compare import compare_maps as compare_maps
     from topomerge.edits.apply import apply_edits as apply_edits
     from topomerge.edits.apply import load_corrected_map as load_corrected_map
     from topomerge.edits.journal import Edit as Edit
@@ -59,6 +62,9 @@ _HOMES = {
     "build_edit": "topomerge.edits.journal",
     "load_corrected_map": "topomerge.edits.apply",
     "read_journal": "topomerge.edits.journal",
+    "Changes": "topomerge.changes.compare",
+    "align_maps": "topomerge.changes.compare",
+    "compare_maps": "topomerge.changes.compare",
     "find": "topomerge.fusion.atlas.find",
     "InputError": "topomerge.errors",
     "MergeResult": "topomerge.fusion.result",

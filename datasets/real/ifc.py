@@ -76,7 +76,7 @@ def load_model_building(path: Path) -> Building:
     plans = [plan for _, plan in iter_plans(path) if not isinstance(plan, Refusal)]  # a roof has no rooms
     drawn = build_building(remove_dead_flights(plans), name=path.stem, kind="model")
     corners, labels = _load_triangles(path)
-    corners = corners - [0.0, 0.0, _find_ground(path, drawn)]
+    corners = corners - [0.0, 0.0, find_ground(path, drawn)]
     floor = drawn.labels == SURFACES.index("floor")  # some models hold walls and ceilings only; elsewhere it lies on the slab
     corners = np.concatenate([corners, drawn.vertices[drawn.triangles[floor]]])
     labels = np.concatenate([labels, drawn.labels[floor]])
@@ -108,8 +108,8 @@ def _load_triangles(path: Path) -> tuple[Array, Array]:
     return np.concatenate(corners), np.concatenate(labels)
 
 
-def _find_ground(path: Path, building: Building) -> float:
-    """Height of the building's lowest floor in the model, m."""
+def find_ground(path: Path, building: Building) -> float:
+    """Find the height of the building's lowest floor in the model, m."""
     floors = {room.name: room.floor for room in _read_model(path).rooms}
     shifts = [floors[r.name.split()[0]] - r.floor for r in building.rooms if r.name.split()[0] in floors]
     if not shifts or np.ptp(shifts) > 0.3:
@@ -125,7 +125,7 @@ def _read_model(path: Path) -> PointCloud:
 def _sample_model(path: Path, building: Building) -> PointCloud:
     """Points sampled on the model, in the building's frame and with its rooms."""
     cloud = _read_model(path)
-    points = cloud.points.astype(np.float64) + cloud.shift - [0.0, 0.0, _find_ground(path, building)]
+    points = cloud.points.astype(np.float64) + cloud.shift - [0.0, 0.0, find_ground(path, building)]
     labels = np.full(len(points), -1, np.int32)
     bounds = np.append(building.storeys["floor"] - UNDER_CEILING, np.inf)
     for k in range(len(building.storeys)):

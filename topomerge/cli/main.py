@@ -32,6 +32,7 @@ from topomerge.cli.console import (
     write_all,
 )
 from topomerge.cli.dataset import DATASET, FINETUNE
+from topomerge.cli.diff import DIFF
 from topomerge.cli.edit import EDIT
 from topomerge.cli.export import EXPORT
 from topomerge.cli.extract import EMBED, EXPORT_EMBEDDER, EXTRACT, INFO
@@ -111,6 +112,7 @@ COMMANDS = (
     MATCH,
     MERGE,
     MOVE,
+    DIFF,
     SIMULATE,
     COMPLETION,
     ATLAS,
@@ -127,7 +129,7 @@ exit status:
   0    done
   1    bad input or a wrong command line: one line on stderr says which file and why; no output is written
   2    no trustworthy merge: the reason is printed and stands in merge.json; of finetune: it did not help;
-       of find: nothing was found
+       of find: nothing was found; of diff: the maps could not be aligned
   130  interrupted
   141  what read the output went away (`| head`)
   143  terminated

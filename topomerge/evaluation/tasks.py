@@ -49,6 +49,7 @@ MODULES = {
     "radio": "radio",
     "landmarks": "landmarks",
     "edits": "edits",
+    "changes": "changes",
 }
 
 

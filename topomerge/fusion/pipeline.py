@@ -227,7 +227,7 @@ def merge(
     config = MergeConfig(scale, threshold, embedder, rigid, same, force, poses, decided)
     loaded_maps = [load_input(map) for map in maps]
     began = time.perf_counter()
-    placed = (_place_pair if len(loaded_maps) == 2 else _place_set)(loaded_maps, config)
+    placed = (place_pair if len(loaded_maps) == 2 else _place_set)(loaded_maps, config)
     result = replace(_join(replace(placed, decided=decided)), descriptor=get_descriptor_name(embedder))
     return replace(result, seconds=_split_seconds(placed.seconds, time.perf_counter() - began))
 
@@ -241,7 +241,7 @@ class MergeConfig(AtlasSettings):
     decided: Mapping[tuple[int, int], Sim3 | None] = field(default_factory=dict)
 
 
-def _place_pair(maps: Sequence[TopometricMap], config: MergeConfig) -> MergeResult:
+def place_pair(maps: Sequence[TopometricMap], config: MergeConfig) -> MergeResult:
     """Register two maps; where nothing is believed, matched rooms propose poses, too."""
     a, b = maps
     check_pair(a, b, config.scale)

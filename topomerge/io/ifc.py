@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
+import subprocess
+import sys
 from array import array
 from collections.abc import Iterator
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -139,6 +143,70 @@ def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
     lost = len(built) - len(shapes)
     if lost:
         yield Piece(np.empty((0, 3)), warnings=(f"{lost} of {len(built)} elements have no usable shape",), done=1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class ModelElement:
+    """An element of a building model.
+
+    Args:
+        guid: its GlobalId.
+        kind: "wall", "column", "slab", "door" or "other".
+        name: what its author calls it.
+        vertices: (n, 3) float64 m, in the model's frame.
+        faces: (m, 3) int64, rows of vertices.
+    """
+
+    guid: str
+    kind: str
+    name: str
+    vertices: Array
+    faces: Array
+
+
+ELEMENT_KINDS = {"IfcWall": "wall", "IfcColumn": "column", "IfcSlab": "slab", "IfcDoor": "door"}  # all others are "other"
+
+
+def read_elements(path: Path) -> list[ModelElement]:
+    """Read the walls, columns, slabs, doors and all else that is built of a model, in the order of their ids.
+
+    The library is in a process of its own, as in `read`.
+
+    Raises:
+        InputError: no model, a damaged one, or one without walls, columns, slabs and doors.
+    """
+    if find_spec("ifcopenshell") is None:
+        raise InputError(f"{path}: needs the Python package ifcopenshell: pip install 'topomerge[ifc]'")
+    _check_ends(path)
+    check_references(path)
+    words = [sys.executable, "-c", f"from {__name__} import write_elements; write_elements()", str(path)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    child = subprocess.run(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment, check=False)
+    if child.returncode:
+        raise build_damage_error(path, "an IFC model", "the library that reads it broke down")
+    with np.load(io.BytesIO(child.stdout), allow_pickle=False) as data:
+        words, vertices, faces, ends = data["words"], data["vertices"], data["faces"], data["ends"]
+    if not np.isin(words[:, 1], list(ELEMENT_KINDS.values())).any():
+        raise InputError(f"{path}: has no walls, columns, slabs or doors with a shape; export it with its geometry")
+    spans = zip(words.tolist(), ends[:-1].tolist(), ends[1:].tolist(), strict=True)
+    return [ModelElement(*told, vertices[v0:v1], faces[f0:f1]) for told, (v0, f0), (v1, f1) in spans]
+
+
+def write_elements() -> None:
+    """Write the elements of the model that the command line names to stdout, as one NumPy archive, for `read_elements`."""
+    import ifcopenshell
+
+    model = ifcopenshell.open(sys.argv[1])
+    built = [p for p in model.by_type("IfcElement") if p.Representation and _is_built(p, doors=True)]
+    wanted = {p.id(): (p, next((kind for name, kind in ELEMENT_KINDS.items() if p.is_a(name)), "other")) for p in built}
+    shapes = sorted(_iter_shapes(model, [p for p, _ in wanted.values()]), key=lambda shape: shape[0])
+    words = [(str(wanted[k][0].GlobalId), wanted[k][1], str(wanted[k][0].Name or "")) for k, _, _ in shapes]
+    ends = np.cumsum([(0, 0), *((len(v), len(f)) for _, v, f in shapes)], axis=0)
+    vertices = np.concatenate([np.zeros((0, 3)), *(v for _, v, _ in shapes)])
+    faces = np.concatenate([np.zeros((0, 3), np.int64), *(f for _, _, f in shapes)])
+    archive = io.BytesIO()
+    np.savez(archive, words=np.array(words, str).reshape(-1, 3), vertices=vertices, faces=faces, ends=ends)
+    sys.stdout.buffer.write(archive.getvalue())
 
 
 def _check_ends(path: Path) -> None:

@@ -127,7 +127,7 @@ def save_json(map: TopometricMap, path: str | Path) -> None:
         beside.write_text(format_json(convert_map_to_json(map)), encoding="utf-8", errors="replace")
 
 
-def _format_columns(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+def format_columns(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     """Lines of a table: right-aligned, but for the last column."""
     table = [list(header), *map(list, rows)]
     widths = [max(len(row[i]) for row in table) for i in range(len(header))]
@@ -203,10 +203,10 @@ def format_map(map: TopometricMap) -> str:
         (
             f"{source}: {', '.join(counts)}; {_format_count(len(map.grid), 'cell')} of {map.grid.edge:g} m",
             "",
-            *_format_columns(columns, _iter_room_rows(map, names)),
+            *format_columns(columns, _iter_room_rows(map, names)),
             "",
-            *_format_columns(("storey", "floor m", "ceiling m", "area m²", "rooms"), _iter_storey_rows(map)),
+            *format_columns(("storey", "floor m", "ceiling m", "area m²", "rooms"), _iter_storey_rows(map)),
             "",
-            *_format_columns(("seconds", "step"), steps),
+            *format_columns(("seconds", "step"), steps),
         )
     )

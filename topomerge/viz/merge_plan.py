@@ -5,7 +5,7 @@ Both maps side by side with a line from each room to the room that it is in the 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -202,8 +202,17 @@ def lay_out_pair(a: TopometricMap, b: TopometricMap, pose: Sim3 | None) -> tuple
     return first, lay_out(b, "b", None if pose is None else first[0].turn + pose.yaw)
 
 
+Overlay = Callable[[int | None, Sheet], list[Markup]]
+
+
 def render_blend_view(
-    a: TopometricMap, b: TopometricMap, drawn: tuple[Drawn, Drawn], pose: Sim3, bends: Mapping[int, Deformation] | None = None
+    a: TopometricMap,
+    b: TopometricMap,
+    drawn: tuple[Drawn, Drawn],
+    pose: Sim3,
+    bends: Mapping[int, Deformation] | None = None,
+    names: tuple[str, str] = ("a", "b"),
+    overlay: Overlay | None = None,
 ) -> Markup:
     """Both plans in the frame of a, with a slider that shows the one, the other or both; where one is bent, with arrows and a
     slider from rigid to bent.
@@ -212,6 +221,8 @@ def render_blend_view(
         drawn: of `lay_out_pair`.
         pose: T_ab.
         bends: 0 or 1 -> how a or b is bent.
+        names: what the page calls the maps.
+        overlay: what is drawn over a storey of a on the common paper; the view then has a swipe, too.
     """
     (sheet_a, plans_a), (sheet_b, plans_b) = drawn
     bent = {n: bend for n, bend in (bends or {}).items() if len(bend)}
@@ -220,32 +231,43 @@ def render_blend_view(
         _OverlaySide("b", b, sheet_b, plans_b, pose, bent.get(1)),
     ]
     paper = _compute_enclosing_sheet(sheet_a, sheet_b, pose)
-    factor = choose_arrow_factor([PieceShifts.from_deformation(side.bend) for side in sides], paper)
-    figures, names = [], []
+    factor = 0 if overlay else choose_arrow_factor([PieceShifts.from_deformation(side.bend) for side in sides], paper)
+    figures, captions = [], []
     for k, storeys in enumerate(pair_storeys(a, b, pose)):
         layers = [_render_layer(side, s, paper, factor) for side, s in zip(sides, storeys, strict=True) if s is not None]
-        parts = [f"storey {s} of {name}" for name, s in zip("ab", storeys, strict=True) if s is not None]
-        names.append(" on ".join(reversed(parts)).capitalize())
+        layers = [*layers, build_element("g", *overlay(storeys[0], paper), class_="changes")] if overlay else layers
+        parts = [f"storey {s} of {name}" for name, s in zip(names, storeys, strict=True) if s is not None]
+        captions.append(" on ".join(reversed(parts)).capitalize())
         picture = render_drawing(a, replace(paper, key=f"ab{k}-"), 0, layers)
         figures.append(
-            build_element("figure", build_element("figcaption", build_element("b", names[-1])), picture, data_storey=k)
+            build_element("figure", build_element("figcaption", build_element("b", captions[-1])), picture, data_storey=k)
         )
-    choices = [build_element("button", name, type="button", data_storey=k) for k, name in enumerate(names) if len(names) > 1]
-    slider = build_element(
-        "input", type="range", min="0", max="1", step="0.01", value="0.5", data_blend=True, aria_label="From a to b"
-    )
-    bar = build_element("div", _render_source("a", a), slider, _render_source("b", b), class_="blend")
+    choices = [
+        build_element("button", name, type="button", data_storey=k) for k, name in enumerate(captions) if len(captions) > 1
+    ]
+    bar = _render_sliders((a, b), names, overlay is not None)
     groups = [
         bar,
-        *([render_deformation_controls()] if bent else []),
+        *([render_deformation_controls()] if bent and factor else []),
         *([build_element("div", *choices, class_="choices")] if choices else []),
     ]
     controls = build_element("div", *groups, build_element("div", *render_zoom_buttons(), class_="zoom"), class_="controls")
-    hint = build_element("p", "Walls of one map on walls of the other support the merge.", class_="told", aria_live="polite")
-    words = [build_element("p", describe_deformation(len(bent), factor), class_="note")] if bent else []
+    told = "Point at a change." if overlay else "Walls of one map on walls of the other support the merge."
+    hint = build_element("p", told, class_="told", aria_live="polite")
+    words = [build_element("p", describe_deformation(len(bent), factor), class_="note")] if bent and factor else []
     return build_element(
         "div", controls, build_element("div", *figures, class_="sheet", tabindex=0), hint, *words, class_="plan-view"
     )
+
+
+def _render_sliders(maps: Sequence[TopometricMap], names: tuple[str, str], swipes: bool) -> Markup:
+    """The slider that fades from one map to the other, and the one that wipes."""
+    common = {"type": "range", "min": "0", "max": "1", "step": "0.01", "value": "0.5"}
+    words = f"rom {names[0]} to {names[1]}"
+    sliders = [build_element("input", **common, data_blend=True, aria_label=f"F{words}")]
+    sliders += [build_element("input", **common, data_swipe=True, aria_label=f"Swipe f{words}")] if swipes else []
+    first, second = (_render_source(sign, name, m) for sign, name, m in zip("ab", names, maps, strict=True))
+    return build_element("div", first, *sliders, second, class_="blend")
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,11 +329,14 @@ def _render_layer(side: _OverlaySide, storey: int, paper: Sheet, factor: int) ->
     plan, sheet = side.plans[storey], side.sheet
     ground = [_render_outline(d, side, storey, "ground") for d in trace_rooms(plan, sheet).values()]
     signs = (
-        [] if side.bend is None else [render_arrows(side.name, PieceShifts.from_deformation(side.bend), storey, sheet, factor)]
+        []
+        if side.bend is None or not factor
+        else [render_arrows(side.name, PieceShifts.from_deformation(side.bend), storey, sheet, factor)]
     )
     matrix = "matrix(" + " ".join(f"{v:.6g}" for v in compute_sheet_transform(sheet, paper, side.pose).T.ravel()) + ")"
     walls = _render_outline(trace_walls(plan, sheet), side, storey)
-    return build_element("g", *ground, walls, *signs, class_=f"of-{side.name}", transform=matrix)
+    moved = build_element("g", *ground, walls, *signs, class_=f"of-{side.name}", transform=matrix)
+    return build_element("g", moved, class_=f"side-{side.name}")
 
 
 def _render_outline(d: str, side: _OverlaySide, storey: int, name: str | None = None) -> Markup:
@@ -323,8 +348,8 @@ def _render_outline(d: str, side: _OverlaySide, storey: int, name: str | None = 
     return build_element("path", class_=name, d=bent, data_rigid=rigid, fill_rule="evenodd")
 
 
-def _render_source(name: str, map: TopometricMap) -> Markup:
-    sign = build_element("i", class_=f"sign-{name}")
+def _render_source(sign_name: str, name: str, map: TopometricMap) -> Markup:
+    sign = build_element("i", class_=f"sign-{sign_name}")
     return build_element("span", sign, name, class_="legend", title=map.source or None)
 
 

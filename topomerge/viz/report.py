@@ -36,7 +36,7 @@ from topomerge.viz.tables import (
     render_storeys_table,
 )
 
-SCRIPTS = ("plan.js", "tables.js", "camera.js", "cells.js", "scene.js", "merge.js", "places.js", "stamp.js", "page.js")
+SCRIPTS = ("plan.js", "tables.js", "camera.js", "cells.js", "scene.js", "merge.js", "places.js", "diff.js", "stamp.js", "page.js")
 MODULE_WORDS = re.compile(r"^(?:import .*;\n|export )", re.MULTILINE)  # elsewhere they are modules, here one script
 BESIDE = " 'self' file:"  # what a page that looks for a newer one may read: a style sheet that lies beside it, never a script
 

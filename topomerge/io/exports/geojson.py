@@ -75,7 +75,7 @@ def save(map: TopometricMap, path: Path, origin: Origin | None = None, storey: i
         raise InputError(f"--storey {storey}: the map has no such storey ({there})")
     if origin is not None:
         _check_near(map)
-    place = _round_positions if origin is None else _build_geodetic_transform(origin)
+    place = round_positions if origin is None else _build_geodetic_transform(origin)
     features = [*_iter_rooms(map, place, storey), *_iter_doors(map, place, storey), *_iter_windows(map, place, storey)]
     features += [*_iter_walls(map, place, storey), *_iter_openings(map, place, storey), *_iter_landmarks(map, place, storey)]
     listing: dict[str, Any] = {"type": "FeatureCollection"}
@@ -88,14 +88,14 @@ def save(map: TopometricMap, path: Path, origin: Origin | None = None, storey: i
         listing["topomerge"] = _describe_map(map, "WGS84 longitude and latitude in degrees; then metres in the frame of the map")
         listing["topomerge"]["origin"] = vars(origin)
     with replace_on_success(path) as beside:
-        beside.write_text(_format_collection(listing, features), encoding="utf-8", errors="replace")
+        beside.write_text(format_collection(listing, features), encoding="utf-8", errors="replace")
 
 
 def _describe_map(map: TopometricMap, coordinates: str) -> dict[str, Any]:
     return {"coordinates": coordinates, "source": map.source, "voxel_size": float(map.grid.edge)}
 
 
-def _format_collection(listing: dict[str, Any], features: list[dict[str, Any]]) -> str:
+def format_collection(listing: dict[str, Any], features: list[dict[str, Any]]) -> str:
     """A line for each feature, so that files can be compared."""
     head = json.dumps(listing, ensure_ascii=False, allow_nan=False)[:-1]
     lines = ",\n".join(json.dumps(f, ensure_ascii=False, allow_nan=False) for f in features)
@@ -205,7 +205,7 @@ def _build_polygons(floor: shapely.MultiPolygon, z: float, place: Place) -> dict
     return {"type": "Polygon", "coordinates": parts[0]} if len(parts) == 1 else {"type": "MultiPolygon", "coordinates": parts}
 
 
-def _round_positions(points: Array) -> list[list[float]]:
+def round_positions(points: Array) -> list[list[float]]:
     rounded: list[list[float]] = np.round(np.asarray(points, np.float64), DIGITS_M).tolist()
     return rounded
 

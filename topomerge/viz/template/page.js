@@ -22,6 +22,7 @@ document.querySelectorAll("input[data-find]").forEach(startFind);
 document.querySelectorAll(".plan-view").forEach(startPlan);
 document.querySelectorAll("input[data-blend]").forEach(startBlend);
 document.querySelectorAll("input[data-bend]").forEach(startBend);
+document.querySelectorAll(".diff-view").forEach(startDiff);
 startMates(document.getElementById("mates"));
 startPlaces(document.getElementById("places"));
 startStamp(document.getElementById("stamp"));

@@ -200,6 +200,11 @@ function startPlan(view) {
     const storey = element ? figures.findIndex((figure) => figure.contains(element)) : -1;
     const here = (places.get(event.detail.place) || []).some((one) => figures[shown].contains(one));
     if (storey >= 0 && !here) show(storey);
+    if (element && element.matches(".change") && !event.detail.from.closest("svg")) { // a change is shown from near by
+      const { x, y, width, height } = element.getBBox(), wide = Math.max(6 * Math.max(width, height), home[2] / 8);
+      box = [x + width / 2 - wide / 2, y + height / 2 - (wide * home[3]) / home[2] / 2, wide, (wide * home[3]) / home[2]];
+      redraw();
+    }
   });
   new ResizeObserver(redraw).observe(sheet);
   window.addEventListener("beforeprint", () => drawings.forEach((svg) => draw(svg, home, 680, 680 * Math.min(home[3] / home[2], 1.2))));

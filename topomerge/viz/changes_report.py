@@ -1,0 +1,176 @@
+"""The page of what has changed: both plans on each other with a fader and a swipe, the changes, and a list that zooms."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from topomerge.archive import replace_on_success
+from topomerge.changes.compare import Change, Changes
+from topomerge.changes.layers import RelativePlacement
+from topomerge.types import Array
+from topomerge.viz.merge_plan import lay_out_pair, render_blend_view
+from topomerge.viz.report import render_page, render_scroller, render_section
+from topomerge.viz.svg import Sheet
+from topomerge.viz.tables import (
+    Markup,
+    build_element,
+    join,
+    measure,
+    render_cell,
+    render_properties,
+    render_share_bar,
+    render_table,
+)
+
+TONES = {"new": "new", "opened": "new", "grown": "new", "gone": "gone", "missing": "gone", "bricked": "gone", "shut": "gone"}
+ALTERED = "altered"  # moved, elsewhere, split, joined, shrunk
+WORDS = {"new": "new, opened or grown", "gone": "gone, shut, bricked up or missing", ALTERED: "moved, split, joined or elsewhere"}
+ELEMENTS = ("wall", "door", "room", "furniture", "element")
+DOOR_SIGN = 14  # cm, of the ring around a door that changed
+
+
+def save_changes_report(changes: Changes, path: str | Path) -> None:
+    """Write the page. The same changes give the same bytes.
+
+    Raises:
+        InputError: the path can't be written.
+    """
+    text = render_changes_html(changes)
+    with replace_on_success(path) as beside:
+        beside.write_text(text, encoding="utf-8", errors="replace", newline="\n")
+
+
+def render_changes_html(changes: Changes) -> str:
+    """Render the page as HTML: what changed on the plans of both maps, as a list, and of a model its elements."""
+    sections = [_render_summary(changes), render_section("What has changed", _render_view(changes), "changes")]
+    sections.append(render_section("List", render_scroller(_render_list(changes)), "list"))
+    if changes.elements:
+        sections.append(render_section("Elements of the model", render_scroller(_render_elements(changes)), "elements"))
+    facts = {
+        "old": changes.old.source or "–",
+        "new": changes.new.source or "–",
+        "off by less is no change": f"{100 * changes.slack:.0f} cm",
+        "seen by both": ", ".join(f"storey {k}: {v:.0f} m²" for k, v in sorted(changes.compared.items())),
+        "new map turned by": f"{np.degrees(changes.placement.pose.yaw):.2f}°",
+    }
+    sections.append(render_section("How it was made", render_properties(facts, "Comparison"), "made"))
+    names = f"{changes.old.title} → {changes.new.title}"
+    return render_page(names, "What has changed", sections, {})
+
+
+def get_tone(change: Change) -> str:
+    """Get the class of colours of a change: "new", "gone" or "altered"."""
+    return TONES.get(change.kind.split(" ")[1], ALTERED)
+
+
+def _render_summary(changes: Changes) -> Markup:
+    counts = changes.count_kinds()
+    items = [build_element("li", build_element("b", str(count)), build_element("span", kind)) for kind, count in counts.items()]
+    states = [row.state for row in changes.elements]
+    items += [
+        build_element("li", build_element("b", str(states.count(state))), build_element("span", f"elements {state}"))
+        for state in dict.fromkeys(states)
+        if state in ("seen", "unseen")
+    ]
+    nothing = build_element("li", build_element("b", "0"), build_element("span", "changes that both maps could see"))
+    return build_element("ul", *(items or [nothing]), class_="summary")
+
+
+def _render_view(changes: Changes) -> Markup:
+    place = changes.placement
+    bends, pose, to_paper = {}, place.pose, lambda points: points  # drawn as they lie, bent
+    if isinstance(place, RelativePlacement):
+        bends = {k: p.bend for k, p in enumerate((place.old, place.new)) if p.bend is not None}
+        to_paper = place.old.transform_points
+    drawn = lay_out_pair(changes.old, changes.new, pose)
+
+    def overlay(storey: int | None, paper: Sheet) -> list[Markup]:
+        return [
+            _render_mark(k, change, paper, to_paper)
+            for k, change in enumerate(changes.changes)
+            if change.storey == storey or (storey is None and not len(changes.old.storeys))
+        ]
+
+    view = render_blend_view(changes.old, changes.new, drawn, pose, bends, names=("old", "new"), overlay=overlay)
+    boxes = [
+        build_element("label", build_element("input", type="checkbox", checked=True, data_layer=name), f" {name}s")
+        for name in ELEMENTS
+        if any(c.element == name for c in changes.changes)
+    ]
+    signs = [build_element("li", build_element("i", class_=f"sign-{tone}"), words) for tone, words in WORDS.items()]
+    note = (
+        "The first slider fades between the maps; the second one wipes: old to its left, new to its right. Click a row to zoom."
+    )
+    return join(
+        [
+            build_element("div", view, build_element("div", *boxes, class_="layers diff-layers"), class_="diff-view"),
+            build_element("ul", *signs, class_="legend"),
+            build_element("p", note, class_="note"),
+        ]
+    )
+
+
+def _render_mark(k: int, change: Change, paper: Sheet, to_paper: Any) -> Markup:
+    """A change on the paper: an outline, a line, or a ring around a door; furniture that moved has an arrow."""
+    heights = np.full(len(change.shape), change.place[2])
+    places = paper.convert_to_cm(to_paper(np.column_stack([change.shape, heights])))
+    parts: list[Markup] = [build_element("title", _describe(change))]
+    if change.from_place is not None:
+        start, end = (paper.convert_to_cm(to_paper(p[None]))[0].tolist() for p in (change.from_place, change.place))
+        parts.append(build_element("path", d=f"M{start[0]} {start[1]}L{end[0]} {end[1]}", class_="way"))
+        parts.append(build_element("circle", cx=start[0], cy=start[1], r=8, class_="start"))
+    parts.append(build_element("path", d=_format_path(places), class_="shape"))
+    if change.element == "door":
+        x, y = places.mean(axis=0).round().astype(int).tolist()
+        radius = int(50 * change.extent) + DOOR_SIGN
+        parts.append(build_element("circle", cx=x, cy=y, r=radius, class_="shape ring"))
+    kind = f"change {get_tone(change)} of-{change.element}"
+    return build_element("g", *parts, class_=kind, data_edge=f"c{k}", data_sure=f"{change.probability:.3f}")
+
+
+def _describe(change: Change) -> str:
+    return f"{change.kind}{f' {change.name}' if change.name else ''}, probability {change.probability:.2f}"
+
+
+def _format_path(places: Array) -> str:
+    (x, y), rest = places[0].tolist(), places[1:].tolist()
+    return f"M{x} {y}L{' '.join(f'{u} {v}' for u, v in rest)}{'z' if len(places) > 2 else ''}"
+
+
+def _render_list(changes: Changes) -> Markup:
+    columns = [("no.", "number"), ("change", "text"), ("what", "text"), ("storey", "number"), ("size m", "number")]
+    columns += [("shift cm", "number")] if changes.elements else []
+    columns += [("x m", "number"), ("y m", "number"), ("probability", "text")]
+    rows = []
+    for k, change in enumerate(changes.changes):
+        swatch = build_element("span", class_=f"swatch sign-{get_tone(change)}")
+        about = change.name or _name_rooms(change)
+        cells = [render_cell(str(k), k), render_cell(join([swatch, change.kind]), kind="text"), render_cell(about, kind="text")]
+        cells += [render_cell(str(change.storey), change.storey), measure(change.extent, 2)]
+        cells += [measure(100 * change.evidence.get("shift", float("nan")), 1)] if changes.elements else []
+        cells += [measure(v, 2) for v in change.place[:2].tolist()]
+        cells.append(render_cell(render_share_bar(change.probability), change.probability, kind="text"))
+        rows.append(build_element("tr", *cells, data_edge=f"c{k}", tabindex=0))
+    return render_table(columns, rows, "Changes")
+
+
+def _name_rooms(change: Change) -> str:
+    """Which doors or rooms of the maps a change is about."""
+    what = {"door": "door", "room": "room"}.get(change.element, "")
+    sides = [f"{what} {', '.join(map(str, n))} of {when}" for n, when in ((change.old, "old"), (change.new, "new")) if n]
+    return " → ".join(sides) if what else ""
+
+
+def _render_elements(changes: Changes) -> Markup:
+    columns = [("kind", "text"), ("name", "text"), ("GUID", "text"), ("state", "text"), ("shift cm", "number")]
+    columns += [("± cm", "number"), ("seen", "text"), ("probability", "text")]
+    rows = []
+    for row in changes.elements:
+        cells = [render_cell(text, kind="text") for text in (row.element.kind, row.element.name, row.element.guid, row.state)]
+        cells += [measure(100 * row.shift, 1), measure(100 * row.sigma, 1)]
+        cells += [render_cell(render_share_bar(v), v, kind="text") for v in (row.share, row.probability)]
+        rows.append(build_element("tr", *cells))
+    return render_table(columns, rows, "Elements")
