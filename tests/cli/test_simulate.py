@@ -14,6 +14,7 @@ from topomerge.datasets.buildings.layouts import BUILDING_KINDS
 import topomerge
 from topomerge.cli.main import KINDS_OF_BUILDINGS
 from topomerge.cli.main import main as cli
+from topomerge.io.landmarks import read_landmark_file
 
 SMALL_BUILDING = ("--building", "house", "--seed", "3", "--rooms", "4", "--quiet")
 
@@ -108,6 +109,26 @@ def test_hard_negatives_share_nothing(tmp_path: Path, hard: str) -> None:
     facts = truth(tmp_path)
     assert facts["kind"] == hard and facts["shared"] == [] and facts["seen_by_both"] == [] and facts["overlap"] == 0
     assert (facts["T_ab"] is None) == (hard != "other-storey")
+
+
+def test_signs_lie_beside_the_clouds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["simulate", "--building", "office", "--rooms", "5", "--seed", "5", "--overlap", "0.8", "-q"]
+    for folder, signs in (("x", "good"), ("y", "good"), ("z", "poor")):
+        assert cli([*words, "--signs", signs, "-o", str(tmp_path / folder)]) == 0
+    assert (tmp_path / "x/b.landmarks.csv").read_bytes() == (tmp_path / "y/b.landmarks.csv").read_bytes()
+    a, b = (read_landmark_file(tmp_path / f"x/{side}.landmarks.csv") for side in "ab")
+    transform = np.array(json.loads((tmp_path / "x/truth.json").read_text())["T_ab"])
+    both = set(a.get_values().tolist()) & set(b.get_values().tolist())
+    assert len(both) >= 3
+    off = []
+    for value in both:
+        p, q = (of.table["position"][of.get_values() == value][0] for of in (a, b))
+        off.append(np.linalg.norm((transform @ [*q, 1.0])[:3] - p))
+    assert np.median(off) < 1.0
+    assert len(read_landmark_file(tmp_path / "z/a.landmarks.csv")) < len(a)
+    hard = [*words, "--hard", "other-building", "--signs", "good", "-o", str(tmp_path / "w")]
+    assert cli(hard) == 1 and "signs: the doors of the other building are not known" in capsys.readouterr().err
+    assert not (tmp_path / "w").exists()
 
 
 def test_free_scale(tmp_path: Path) -> None:

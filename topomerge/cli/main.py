@@ -56,7 +56,7 @@ def run_simulate(args: argparse.Namespace) -> int:
         from topomerge.datasets.pairs.simulate import prepare_outputs, simulate_maps
 
         building, sessions, frame = simulate_maps(args.building, **choices, scale=args.scale == "free")
-        files = prepare_outputs(building, sessions, frame, folder)
+        files = prepare_outputs(building, sessions, frame, folder, args.signs)
         write_all(files)
     if not args.quiet:
         rooms = f"the building {building.name} has {len(building.rooms)} rooms"
@@ -93,6 +93,12 @@ SIMULATE = Command(
         build_option("--scale", choices=("free", "known"), default="known", help="free: the scale of b is unknown"),
         build_option(
             "--hard", choices=("other-building", "other-storey", "twin-wing"), help="b shows a place that looks like that of a"
+        ),
+        build_option(
+            "--signs",
+            choices=("good", "poor"),
+            default=None,
+            help="signs at doors, too: nearly all, or half of them, misread",
         ),
         build_output_option("DIR", "folder for a.ply, b.ply, truth.json, plan.png"),
         build_quiet_option(),
