@@ -33,6 +33,7 @@ from topomerge.types import Array, PointCloud, Sim3, TopometricMap
 
 OUTLIERS = 20_000  # points scattered about a large cloud
 POINTS_A_FLOOR = 700_000  # of the floors that rooms are counted on: enough for cells of 0.1 m
+EPOCHS = 40  # of a run that is killed
 SEED, SPACING = 41_700, 0.06  # of the training list; m
 TINY = ["data.scans=4", "data.seed=0", "data.folder=", "steps=6", "batch=2", "crop=32", "hold_out=2", "widths=[4,4,4,4,4,4,4,4]"]
 
@@ -174,31 +175,34 @@ def kills(count: int = 8) -> None:
         cache, runs = f"cache={folder}/cache", f"runs={folder}/runs"
         command = [sys.executable, "train.py", "task=plan_segmentation", "patience=0", *TINY, cache, runs]
 
-        def start(name: str, resume: bool, epochs: int = 60) -> subprocess.Popen[bytes]:
+        def start(name: str, resume: bool, epochs: int = EPOCHS) -> subprocess.Popen[bytes]:
             words = [*command, f"name={name}", f"resume={str(resume).lower()}", f"epochs={epochs}"]
             return subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
 
         start("data", False, 1).communicate()  # makes the scans
-        began = time.perf_counter()
         start("whole", False).communicate()
-        seconds, killed, errors = time.perf_counter() - began, 0, []
-        last = Path(folder, "runs", "cut", "last")
-        while True:
-            process = start("cut", last.exists())
-            try:
-                _, error = process.communicate(timeout=float(rng.uniform(0.3, 0.9)) * seconds if killed < count else None)
-            except subprocess.TimeoutExpired:
+        killed, errors = 0, []
+        run = Path(folder, "runs", "cut")
+        for epoch in [*np.sort(rng.integers(1, EPOCHS, count)).tolist(), None]:
+            process = start("cut", (run / "last").exists())
+            while epoch is not None and process.poll() is None and count_lines(run / "metrics.jsonl") < epoch:
+                time.sleep(0.02)
+            if epoch is not None and process.poll() is None:
+                time.sleep(float(rng.uniform(0.0, 0.5)))
                 process.send_signal(signal.SIGKILL)
-                process.communicate()
                 killed += 1
-                continue
-            if process.returncode:
+            _, error = process.communicate()
+            if process.returncode not in (0, -signal.SIGKILL):
                 errors.append(error.decode()[-300:])
-            break
         whole, cut = (tensor_bytes(Path(folder, "runs", name, "last", "network.safetensors")) for name in ("whole", "cut"))
         left = [str(path) for path in Path(folder).rglob(".*") if path.is_file()]
         same = "equal" if whole == cut else "DIFFER"
-        print(f"{killed} kills in runs of {seconds:.0f} s: weights {same}; errors {errors}; left over: {left}")
+        print(f"{killed} kills in a run of {EPOCHS} epochs: weights {same}; errors {errors}; left over: {left}")
+
+
+def count_lines(path: Path) -> int:
+    """Lines of a file; 0 where there is none."""
+    return path.read_bytes().count(b"\n") if path.exists() else 0
 
 
 def tensor_bytes(path: Path) -> bytes:
