@@ -60,11 +60,33 @@ def read_las(path: Path) -> int:
     return found
 
 
+def read_native(path: Path) -> int:
+    """Write a file of another program again, moved, and joined with itself where its format holds several."""
+    from topomerge.io.native import Motion, Source, find_format, save_joined
+    from topomerge.types import Sim3
+
+    form = find_format(path)
+    if form is None:
+        raise InputError(f"{path}: can't be written again")
+    moved = Source(path, Motion(Sim3(0.5, (1.0, 2.0, 3.0)).matrix))
+    with tempfile.TemporaryDirectory() as folder:
+        tally = save_joined(form, [Source(path), moved] if form.joins else [moved], Path(folder) / f"out{path.suffix}")
+    return sum(after for _, after in tally.counts.values())
+
+
 def read_bag(path: Path) -> int:
     """Read points of a bag in this process: one of its own takes seconds."""
     from topomerge.io import bag
 
     bag.read_in_subprocess = lambda _module, _kind, path, options, **_: bag.read_in_process(path, options)
+    return read_cloud(path)
+
+
+def read_usdz(path: Path) -> int:
+    """Read a scene in this process, after the checks that come before."""
+    from topomerge.io import usdz
+
+    usdz.read_in_subprocess = lambda _module, _kind, path, options, *_: usdz.read_in_process(path, options)
     return read_cloud(path)
 
 
@@ -148,8 +170,11 @@ READERS: dict[str, Callable[[Path], int]] = {  # by name or suffix; all others a
     "embedder.card.json": read_embedder,
     "embedder.onnx": read_embedder,
     "pairs.yaml": read_own_pairs,
+    **dict.fromkeys(("native.db", "native.json", "native.e57", "native.ply", "native.pcd", "native.pbstream"), read_native),
+    **dict.fromkeys(("native.g2o", "native.tum", "native.csv"), read_native),
     ".las": read_las,
     ".laz": read_las,
+    ".usdz": read_usdz,
     ".tmap": read_map,
     **dict.fromkeys((".bag", ".db3", ".mcap"), read_bag),
     **dict.fromkeys((".dxf", ".pdf", ".svg"), read_plan),
@@ -196,7 +221,14 @@ def write_corpus(folder: Path) -> dict[str, Path]:
     np.savez(found["plain.npz"], points=samples.box_points(50), poses=np.eye(4)[None], pose_of=np.zeros(50, np.int32))
     found["pairs.yaml"] = folder / "pairs.yaml"
     found["pairs.yaml"].write_text(OWN_PAIRS)
-    return found | write_walks(folder) | write_plans(folder) | write_embedder(folder) | write_atlas(folder)
+    return (
+        found
+        | write_native(folder, found)
+        | write_walks(folder)
+        | write_plans(folder)
+        | write_embedder(folder)
+        | write_atlas(folder)
+    )
 
 
 def write_walks(folder: Path) -> dict[str, Path]:
@@ -228,6 +260,38 @@ def write_walks(folder: Path) -> dict[str, Path]:
     for kind in ("bag", "db3", "mcap") if find_spec("rosbags") else ():
         found[f"walk.{kind}"] = write_bag(folder / kind, kind, walk_messages(room_walk())).rename(folder / f"walk.{kind}")
     return found
+
+
+def write_native(folder: Path, found: dict[str, Path]) -> dict[str, Path]:
+    """Files that are written again, each under a name of its own, and those of the formats that only their readers know."""
+    from tests.io import test_native as native
+    from tests.io.test_native_graphs import flat_graph
+    from tests.io.test_native_rtabmap import write_session
+    from tests.io.test_read_valetudo import rr_file, rr_pixels
+
+    poses = native.random_poses(8)
+    turns = native.quaternions(poses)
+    made = {f"native.{kind}": folder / f"native.{kind}" for kind in ("db", "json", "e57", "ply", "pcd", "g2o", "tum", "csv")}
+    write_session(made["native.db"])
+    made["native.json"].write_text(json.dumps(flat_graph((0, 1))))
+    for kind, source in (("e57", "cloud.e57"), ("ply", "little.ply"), ("pcd", "binary.pcd")):
+        if source in found:
+            shutil.copy(found[source], made[f"native.{kind}"])
+    made["native.g2o"].write_text(native.GRAPH)
+    native.write_lines(made["native.tum"], np.column_stack([np.arange(8.0), poses[:, :3, 3], turns]))
+    rows = np.column_stack([1.4e18 + np.arange(8.0), poses[:, :3, 3], turns[:, [3, 0, 1, 2]], np.zeros((8, 3))])
+    native.write_lines(made["native.csv"], rows, "%.9f", ",", "#timestamp\n")
+    made["home.rr"] = rr_file(folder / "home.rr", rr_pixels(), packed=False)
+    if find_spec("google.protobuf"):
+        from tests.io import cartographer_states as carto
+
+        for name, spatial in (("native.pbstream", False), ("flat.pbstream", False), ("space.pbstream", True)):
+            made[name] = carto.write_messages(folder / name, carto.state(2, spatial=spatial))
+    if find_spec("pxr"):
+        from tests.io.test_usdz import roomplan
+
+        made["room.usdz"] = roomplan(folder / "room.usdz")
+    return {name: path for name, path in made.items() if path.is_file()}
 
 
 def write_plans(folder: Path) -> dict[str, Path]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 import yaml
 from PIL import Image
 
@@ -224,10 +225,8 @@ def test_lanes_of_rmf_are_the_ways_of_nav2(tmp_path):
         normal = (np.cos(edge["direction"]), np.sin(edge["direction"]))
         assert abs((ends[1] - ends[0]) @ normal) < 1e-3
         assert graph["doors"][about["name"][1]]["endpoints"] == ends.tolist()
-    areas = [
-        abs(np.cross(p[:-1], p[1:]).sum() + np.cross(p[-1], p[0])) / 2
-        for p in (np.array([level["vertices"][k][:2] for k in f["vertices"]]) for f in level["floors"])
-    ]
+    outlines = [np.array([level["vertices"][k][:2] for k in floor["vertices"]]) for floor in level["floors"]]
+    areas = [shapely.Polygon(outline).area for outline in outlines]
     assert sum(areas) == pytest.approx(float(map.rooms["area"].sum()), rel=0.15)
 
 

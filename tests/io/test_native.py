@@ -290,7 +290,7 @@ def test_stations_keep_their_points_to_the_bit(tmp_path: Path, scans: int) -> No
     poses = random_poses(scans, seed=scans)
     turns = quaternions(poses)[:, [3, 0, 1, 2]]
     listed = [(rng.uniform(-5, 5, (200 + k, 3)), turns[k], poses[k, :3, 3]) for k in range(scans)]
-    _write_many(tmp_path / "a.e57", listed)
+    write_many_scans(tmp_path / "a.e57", listed)
     kept = (tmp_path / "a.e57").read_bytes()
     tally = move(tmp_path / "a.e57", tmp_path / "out.e57", TILTED)
     assert tally.counts["scans"] == (scans, scans) and (tmp_path / "a.e57").read_bytes() == kept
@@ -309,7 +309,8 @@ def test_stations_keep_their_points_to_the_bit(tmp_path: Path, scans: int) -> No
     np.testing.assert_allclose(after.points, TILTED.move_points(before.points), rtol=0, atol=1e-4)
 
 
-def _write_many(path: Path, scans: list[tuple[Array, Array, Array]]) -> None:
+def write_many_scans(path: Path, scans: list[tuple[Array, Array, Array]]) -> None:
+    """Scans as (points in the scanner's frame, quaternion w x y z, translation), without colours."""
     import pye57
 
     file = pye57.E57(str(path), mode="w")
@@ -320,7 +321,7 @@ def _write_many(path: Path, scans: list[tuple[Array, Array, Array]]) -> None:
 
 def test_damaged_stations(tmp_path: Path) -> None:
     pytest.importorskip("pye57")
-    _write_many(tmp_path / "a.e57", [(box_points(50).astype(float), np.array([1.0, 0, 0, 0]), np.zeros(3))])
+    write_many_scans(tmp_path / "a.e57", [(box_points(50).astype(float), np.array([1.0, 0, 0, 0]), np.zeros(3))])
     data = bytearray((tmp_path / "a.e57").read_bytes())
     data[-200] ^= 1
     (tmp_path / "b.e57").write_bytes(data)
@@ -342,3 +343,24 @@ def test_outputs_have_names_of_their_own(tmp_path: Path) -> None:
         ("scan_moved_2.ply", 1),
     ]
     assert [p.name for p, _, _ in plan_outputs([Source(tmp_path / "one/walk.g2o")], tmp_path)] == ["walk_moved.g2o"]
+
+
+def test_the_table_of_round_trips(tmp_path: Path) -> None:
+    """Nothing is lost, poses are right to a millionth (in floats and in LAS to what these hold), and the page is written."""
+    for name in ("pye57", "laspy", "spark_dsg", "plyfile", "google.protobuf"):
+        pytest.importorskip(name)
+    from tests.io.native_round_trips import TRIPS, main
+
+    page = tmp_path / "native.md"
+    page.write_text("# Native\n<!-- native-round-trips:begin -->\n<!-- native-round-trips:end -->\n")
+    main([str(page)])
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.read_text().splitlines() if line.startswith("|")][
+        2:
+    ]
+    assert [line[0] for line in lines] == list(TRIPS)
+    for name, counts, error, _ in lines:
+        limit = 6e-5 if name in ("LAS", "LAZ") else 5e-6 if "floats" in name else 1e-6
+        assert float(error) <= limit, (name, error)
+        for part in counts.split(", "):
+            before, after = part.rpartition(" → ")[::2]
+            assert before.split()[-1] == after or "Spark-DSG" in name, part

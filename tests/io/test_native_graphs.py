@@ -164,6 +164,8 @@ def test_the_library_opens_it(tmp_path: Path) -> None:
         (lambda g: g["nodes"][0]["attributes"].update(position=[0, 0, float("nan")]), "has no place"),
         (lambda g: g["nodes"].append(7), "damaged"),
         (lambda g: g.update(mesh=5), "mesh is none"),
+        (lambda g: g["nodes"][2]["attributes"].update(bounding_box={"type": "AABB"}), "a.json or .*b.json: damaged"),
+        (lambda g: g["mesh"].update(points=[["x", 0, 0]]), "a.json or .*b.json: damaged"),
         (lambda g: g["SPARK_DSG_header"]["version"].update(major=7), "another version"),
     ],
 )

@@ -77,7 +77,7 @@ def test_two_sessions_become_one(tmp_path: Path, version: str) -> None:
     assert (a.read_bytes(), b.read_bytes()) == kept
     count = len(room_walk().poses)
     assert tally.counts["nodes"] == (2 * count, 2 * count) and tally.counts["features"] == (12, 12)
-    assert all(before == after for before, after in tally.counts.values())
+    assert all(before == after for before, after in tally.counts.values()), tally.counts
     assert ask(out, "PRAGMA integrity_check") == [("ok",)]
     assert ask(out, "SELECT COUNT(*), COUNT(DISTINCT id), MAX(id), COUNT(DISTINCT map_id) FROM Node") == [
         (2 * count, 2 * count, 2 * count, 2)

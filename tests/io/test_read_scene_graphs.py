@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -109,3 +110,45 @@ def test_a_file_that_was_cut(tmp_path: Path) -> None:
     path.write_text(path.read_text()[:-40])
     with pytest.raises(InputError, match="scene.json: damaged"):
         read_points(path)
+
+
+def places_graph() -> dict[str, Any]:
+    """Places of two rooms of 4 by 4 m, 5 m apart, joined by a way through a door; another two rooms 3 m above."""
+    graph = scene_graph()
+    number = 0
+    for z in (0.0, 3.0):
+        names = []
+        for x, clear in ((2.0, 2.0), (4.5, 0.4), (7.0, 2.0)):
+            about = {"position": [x, 2.0, z], "distance": clear}
+            graph["nodes"].append({"id": number, "layer": 3, "partition": 0, "attributes": about})
+            names.append(number)
+            number += 1
+        graph["edges"] += [{"source": a, "target": b} for a, b in pairwise(names)]
+    about = {"position": [2.0, 2.0, 0.5], "name": "chair", "semantic_label": 1}
+    graph["nodes"].append({"id": 99, "layer": 2, "partition": 0, "attributes": about})
+    return graph
+
+
+def test_places_are_used_where_there_is_no_mesh(tmp_path: Path) -> None:
+    cloud = read_points(write_scene_graph(tmp_path / "dsg.json", places_graph()))
+    assert "has no mesh" in cloud.warnings[0] and cloud.landmarks is not None and cloud.landmarks.values == ("chair",)
+    lower = cloud.points[cloud.points[:, 2] < 2.6]
+    wall, floor = lower[lower[:, 2] > 0.01], lower[lower[:, 2] < 0.01]
+    assert cloud.points[:, 2].max() == pytest.approx(5.5)
+    np.testing.assert_allclose(wall[:, :2].min(axis=0), (-0.05, -0.05), atol=0.11)
+    np.testing.assert_allclose(wall[:, :2].max(axis=0), (9.05, 4.05), atol=0.11)
+    off = np.abs(np.linalg.norm(wall[:, :2] - (2, 2), axis=1) - 2)[wall[:, 0] < 3.5]
+    assert off.max() < 0.2, "walls stand as far from a place as it says"
+    door = (np.abs(floor[:, 0] - 4.5) < 0.06) & (np.abs(floor[:, 1] - 2.0) < 0.35)
+    assert door.sum() >= 6 and not ((np.abs(wall[:, 0] - 4.5) < 0.06) & (np.abs(wall[:, 1] - 2.0) < 0.3)).any()
+
+
+def test_places_that_are_none_are_passed_over(tmp_path: Path) -> None:
+    graph = places_graph()
+    graph["nodes"] += [{"layer": 3}, {"id": [1], "layer": 3, "attributes": {"position": [0, 0, 0]}}, 7]
+    graph["nodes"] += [{"id": 50, "layer": 3, "attributes": {"position": [0, 0, float("inf")]}}]
+    graph["edges"] += [{"source": 0, "target": 1234}, {"source": [0], "target": 1}, 5]
+    assert len(read_points(write_scene_graph(tmp_path / "dsg.json", graph))) > 1000
+    graph["nodes"] += [{"id": 51, "layer": 3, "attributes": {"position": [9e5, 9e5, 0], "distance": 1.0}}]
+    with pytest.raises(InputError, match="its places span"):
+        read_points(write_scene_graph(tmp_path / "dsg.json", graph))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gzip
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ import pytest
 import topomerge as tm
 from topomerge.errors import InputError
 from topomerge.io import read_points
-from topomerge.io.valetudo import parse_robot_map
+from topomerge.io.valetudo import parse_roborock_map, parse_robot_map
 
 LEFT, RIGHT = (110, 120), (131, 141)  # columns of two rooms of 1 m in pixels of 10 cm; a wall between, open at rows 103 to 106
 ROWS = (100, 110)
@@ -127,3 +129,90 @@ def test_what_is_no_map_is_refused(tmp_path: Path, about: object, reason: str) -
 def test_its_resolution_is_its_own(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="states its own resolution"):
         read_points(saved(tmp_path, two_rooms()), resolution=0.05)
+
+
+def rr_file(
+    path: Path, pixels: np.ndarray, corner: tuple[int, int] = (500, 480), *, segments: bool = True, packed: bool = True
+) -> Path:
+    """A map as Roborock writes it: where its charger is, a picture whose lowest row is first, a digest."""
+    top_left = struct.pack("<2i", corner[1], corner[0]) + struct.pack("<2i", *pixels.shape)
+    count = struct.pack("<i", 2) if segments else b""
+    blocks = struct.pack("<2HI", 1, 8, 8) + bytes(8)
+    blocks += struct.pack("<2HI", 2, 24 + len(count), pixels.size) + count + top_left + pixels.astype(np.uint8).tobytes()
+    blocks += struct.pack("<2HI", 1024, 8, 20) + bytes(20)
+    data = b"rr" + struct.pack("<HI2H2I", 20, len(blocks), 1, 1, 3, 7) + blocks
+    path.write_bytes(gzip.compress(data) if packed else data)
+    return path
+
+
+def rr_pixels() -> np.ndarray:
+    """Two rooms of 1 m by 1 m side by side, 16 and 17, walls around and between them; the lowest row first."""
+    pixels = np.zeros((26, 47), np.uint8)
+    pixels[2:24, 2:45] = 1
+    pixels[3:23, 3:23] = 16 << 3 | 7
+    pixels[3:23, 24:44] = 17 << 3 | 7
+    pixels[8:12, 23] = 255  # the door between them is floor of no room
+    return pixels
+
+
+@pytest.mark.parametrize("layout", [{}, {"packed": False}, {"segments": False}])
+def test_roborock_s_own_file(tmp_path: Path, layout: dict[str, bool]) -> None:
+    path = rr_file(tmp_path / "home.rr", rr_pixels(), **layout)
+    cloud = read_points(path)
+    tall, floor = cloud.points[cloud.points[:, 2] > 0], cloud.points[cloud.points[:, 2] == 0]
+    low = np.array([(500 + 2) * 0.05, (480 + 2) * 0.05])
+    np.testing.assert_allclose(tall[:, :2].min(axis=0), low + 0.025, atol=1e-4)
+    np.testing.assert_allclose(tall[:, :2].max(axis=0), low + (42.5 * 0.05, 21.5 * 0.05), atol=1e-4)
+    assert len(floor) == 2 * 400 + 4 + (rr_pixels() == 1).sum() and not cloud.warnings  # walls begin on the floor
+    data = path.read_bytes()
+    drawn = parse_roborock_map(path, gzip.decompress(data) if layout.get("packed", True) else data)
+    assert drawn.rooms.max() == 2 and (drawn.rooms == 1).sum() == 400
+
+
+def test_valetudo_re_lies_where_roborock_s_own_file_does(tmp_path: Path) -> None:
+    """Rows are counted from the top of a world of 1024 pixels; pairs, numbers of pixels, and rooms packed above them."""
+    pixels = np.flipud(rr_pixels())
+    height, width = pixels.shape
+    rooms = {number: np.argwhere(pixels == (number << 3 | 7))[:, ::-1] for number in (16, 17)}
+    walls, door = np.argwhere(pixels == 1)[:, ::-1].tolist(), np.argwhere(pixels == 255)[:, ::-1]
+    image = {"position": {"left": 500, "top": 1024 - 480 - height}, "dimensions": {"height": height, "width": width}}
+    by_room = {"floor": door.tolist(), "obstacle_strong": walls, "segments": {str(k): v.tolist() for k, v in rooms.items()}}
+    packed = [(k << 21) | int(x + y * width) for k, v in rooms.items() for x, y in v]
+    flat = {
+        "floor": [int(x + y * width) for x, y in door],
+        "obstacle_weak": [x + y * width for x, y in walls],
+        "segments": packed,
+    }
+    expected = read_points(rr_file(tmp_path / "home.rr", rr_pixels())).points
+    for listed in (by_room, flat):
+        found = read_points(saved(tmp_path, {"image": {**image, "pixels": listed}, "path": {"points": []}, "charger": [1, 2]}))
+        assert {tuple(p) for p in np.round(found.points, 4).tolist()} == {tuple(p) for p in np.round(expected, 4).tolist()}
+
+
+def test_damaged_files_of_roborock(tmp_path: Path) -> None:
+    path = rr_file(tmp_path / "home.rr", rr_pixels(), packed=False)
+    good = path.read_bytes()
+
+    def told(data: bytes) -> str:
+        path.write_bytes(data)
+        with pytest.raises(InputError) as caught:
+            read_points(path)
+        return str(caught.value)
+
+    assert "does not start with rr" in told(b"xx" + good[2:])
+    assert "a block of" in told(good[:200])
+    assert "cut short" in told(gzip.compress(good)[:-9])
+    assert "cut short, or unpacks to more" in told(gzip.compress(bytes(1 << 27)))
+    assert "shows neither floor nor walls" in told(good[:36])
+    assert "shows neither floor nor walls" in told(rr_file(path, np.zeros((5, 5)), packed=False).read_bytes())
+    at = good.index(struct.pack("<2i", 26, 47))
+    assert "a picture of 47 by 27 pixels" in told(good[:at] + struct.pack("<i", 27) + good[at + 4 :])
+    picture = {"position": {"left": 0, "top": 0}, "dimensions": {"height": 3, "width": 3}, "pixels": {"floor": [[5, 1]]}}
+    for change in (
+        {},
+        {"pixels": {"floor": [1.5]}},
+        {"pixels": {"floor": [[1, 2, 3]]}},
+        {"dimensions": {"height": -3, "width": 3}},
+    ):
+        with pytest.raises(InputError, match="damaged"):
+            read_points(saved(tmp_path, {"image": picture | change}))

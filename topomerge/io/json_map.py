@@ -1,17 +1,19 @@
-"""Maps in JSON: of vacuum robots (`valetudo.py`), scene graphs with their mesh. What is in it tells which."""
+"""Maps in JSON: of vacuum robots (`valetudo.py`), scene graphs with their mesh or their places. What is in it tells which."""
 
 from __future__ import annotations
 
 import json
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from topomerge.errors import InputError
-from topomerge.io import valetudo
+from topomerge.io import grid, valetudo
 from topomerge.io.landmarks import parse_landmarks
 from topomerge.io.mesh import sample
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error
@@ -29,17 +31,16 @@ def is_scene_graph(about: object) -> bool:
 
 
 def iter_pieces(path: Path, graph: Mapping[str, Any], options: ReadOptions) -> Iterator[Piece]:
-    """Yield the vertices of the mesh with the graph's objects and names, then points sampled on its faces, in metres.
+    """Yield the vertices of the mesh with the graph's objects and names, then points sampled on its faces, in metres. Without a
+    mesh: the floor that its places have free, and its outline as walls.
 
     Raises:
-        InputError: the graph has no mesh, or a damaged one.
+        InputError: the graph has neither a mesh nor places, or a damaged one.
     """
     mesh = graph.get("mesh")
     if not isinstance(mesh, dict) or not mesh.get("points"):
-        raise InputError(
-            f"{path}: is a scene graph without a mesh, so that nothing tells where its walls are; give dsg_with_mesh.json, which "
-            "Hydra saves beside it"
-        )
+        yield from _iter_place_pieces(path, graph, options)
+        return
     vertices = _parse_table(path, mesh["points"], "points")
     faces = _parse_table(path, mesh.get("faces") or np.zeros((0, 3)), "faces")
     if not (np.abs(faces) < BEYOND_NUMBERS).all() or (faces != np.round(faces)).any():  # so of nan, too
@@ -47,6 +48,74 @@ def iter_pieces(path: Path, graph: Mapping[str, Any], options: ReadOptions) -> I
     colors = _parse_colors(path, mesh, len(vertices))
     yield Piece(vertices, colors, done=0.5, landmarks=find_graph_landmarks(path, graph))
     yield from sample(path, vertices, faces.astype(np.int64), options, colors)
+
+
+PLACE_LAYER, FEWEST_PLACES = 3, 3
+PLACE_CELL, LEAST_CLEAR, WAY = 0.1, 0.2, 0.4  # m: of the plan, around a place at least, and to either side of a way at most
+STOREY_GAP = 1.5  # m between the heights of places, from which on they are of two storeys
+
+
+def _iter_place_pieces(path: Path, graph: Mapping[str, Any], options: ReadOptions) -> Iterator[Piece]:
+    """Walls and floor of each storey by its places, which say how far from them the nearest obstacle is."""
+    places, ways = _parse_places(graph)
+    if len(places) < FEWEST_PLACES or not (places[:, 3] > 0).any():
+        raise InputError(
+            f"{path}: is a scene graph without a mesh, and without places that tell where its walls are; give "
+            "dsg_with_mesh.json, which Hydra saves beside it"
+        )
+    told = "has no mesh: its floor is what its places have free, and its walls are the outline of that"
+    yield Piece(np.empty((0, 3)), warnings=(f"{path}: {told}",), landmarks=find_graph_landmarks(path, graph), done=0.1)
+    order = np.argsort(places[:, 2], kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(places[order, 2]) > STOREY_GAP) + 1):
+        own = ways[np.isin(ways, rows).all(axis=1)]
+        free, low = _draw_places(path, places, rows, own)
+        outline = ndimage.binary_dilation(free, np.ones((3, 3))) & ~free
+        plan = grid.Plan(path, PLACE_CELL, (low[0], low[1], 0.0))
+        for piece in grid.extrude(path, np.flipud(outline), np.flipud(free), plan, options):
+            yield replace(piece, points=piece.points + (0.0, 0.0, places[rows, 2].min()))
+
+
+def _parse_places(graph: Mapping[str, Any]) -> tuple[Array, Array]:
+    """(n, 4) m places x y z and how far the nearest obstacle is; (m, 2) rows of those that a way joins."""
+    rows: dict[Any, list[float]] = {}
+    for node in graph["nodes"]:
+        try:
+            if node["layer"] == PLACE_LAYER and node.get("partition", 0) == 0:
+                about = node["attributes"]
+                values = [*(float(v) for v in about["position"]), float(about.get("distance") or 0.0)]
+                if len(values) == 4 and np.isfinite(values).all() and max(map(abs, values[:3])) < 1e6:
+                    rows[node["id"]] = values
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
+            continue
+    number = {k: n for n, k in enumerate(rows)}
+    ends = [(e.get("source"), e.get("target")) for e in graph["edges"] if isinstance(e, dict)]
+    joined = [
+        (number[a], number[b]) for a, b in ends if isinstance(a, int) and isinstance(b, int) and a in number and b in number
+    ]
+    return np.array(list(rows.values())).reshape(-1, 4), np.array(joined, np.int64).reshape(-1, 2)
+
+
+def _draw_places(path: Path, places: Array, rows: Array, ways: Array) -> tuple[Array, list[float]]:
+    """(h, w) bool of what is free around places and along ways, the lowest row first; and the lower left corner, m."""
+    clear = places[:, 3].clip(LEAST_CLEAR, 10.0)
+    discs = [(places[k, :2], clear[k]) for k in rows.tolist()]
+    for a, b in ways.tolist():
+        start, end = places[a, :2], places[b, :2]
+        wide = min(clear[a], clear[b], WAY)
+        steps = min(int(np.ceil(np.linalg.norm(end - start) / wide)) + 1, 1000)
+        discs += [(start + share * (end - start), wide) for share in np.linspace(0, 1, steps)[1:-1]]
+    centres, radii = np.array([c for c, _ in discs]), np.array([r for _, r in discs])
+    low = np.floor((centres - radii[:, None]).min(axis=0) / PLACE_CELL - 2) * PLACE_CELL
+    width, height = (np.ceil(((centres + radii[:, None]).max(axis=0) - low) / PLACE_CELL) + 3).astype(int).tolist()
+    if width * height > grid.PIXELS:
+        raise InputError(f"{path}: its places span {width:,} by {height:,} cells, more than {grid.PIXELS:,}; it is damaged")
+    free = np.zeros((height, width), bool)
+    for centre, radius in zip(centres, radii, strict=True):
+        first = np.floor((centre - radius - low) / PLACE_CELL).astype(int)
+        last = np.ceil((centre + radius - low) / PLACE_CELL).astype(int) + 1
+        x, y = (low[k] + (np.arange(first[k], last[k]) + 0.5) * PLACE_CELL - centre[k] for k in (0, 1))
+        free[first[1] : last[1], first[0] : last[0]] |= y[:, None] ** 2 + x**2 <= radius**2
+    return free, low.tolist()
 
 
 def find_graph_landmarks(path: Path, graph: Mapping[str, Any]) -> Landmarks:

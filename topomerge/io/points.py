@@ -309,6 +309,7 @@ FORMATS = (
     Format("an IFC model", "ifc", (".ifc",), fixed=True, extra="ifc", takes=("doors",)),
     Format("a ROS bag", "bag", (".bag", ".db3", ".mcap"), extra="ros", takes=("poses", "topic", "extrude", "ceiling")),
     Format("a map in JSON", "json_map", (".json",), fixed=True, takes=DRAWN),
+    Format("a map of a vacuum robot", "valetudo", (".rr", ".rrmap"), fixed=True, takes=("extrude", "ceiling")),
     Format("an RTAB-Map database", "rtabmap", (".db",)),
     Format("a ScanNet recording", "sens", (".sens",)),
     Format("a state of Cartographer", "pbstream", (".pbstream",), fixed=True, takes=("extrude", "ceiling")),

@@ -204,7 +204,7 @@ def _describe_lift(map: TopometricMap, lift: _Lift) -> dict[str, Any]:
                 doors[name] |= {"x": round(x, 3), "y": round(y, 3)}
             level_doors.setdefault(_name_level(storey), []).append(name)
     floors = [_name_level(s) for s in storeys]
-    about = {"x": round(lift.at[0], 4), "y": round(lift.at[1], 4), "yaw": 0.0, "width": round(lift.size[0], 3)}
+    about: dict[str, Any] = {"x": round(lift.at[0], 4), "y": round(lift.at[1], 4), "yaw": 0.0, "width": round(lift.size[0], 3)}
     about |= {"depth": round(lift.size[1], 3), "doors": doors, "level_doors": level_doors, "lowest_floor": floors[0]}
     return about | {
         "highest_floor": floors[-1],

@@ -8,6 +8,7 @@ and no source is ever changed.
 from __future__ import annotations
 
 import itertools
+import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -190,9 +191,16 @@ def save_joined(form: Format, sources: Sequence[Source], target: Path, doubt: Do
     Raises:
         InputError: a source is damaged, or can't be written truly; the line says why.
     """
-    with replace_on_success(target) as beside:
-        module: Any = import_module(f"topomerge.io.native.{form.module}")
-        tally: Tally = module.join(sources, beside, doubt or Doubt())
+    module: Any = import_module(f"topomerge.io.native.{form.module}")
+    try:
+        with replace_on_success(target) as beside:
+            tally: Tally = module.join(sources, beside, doubt or Doubt())
+    except InputError:
+        raise
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, struct.error) as error:
+        named = " or ".join(str(source.path) for source in sources)
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:160]
+        raise InputError(f"{named}: damaged, or not {form.name} ({reason}); export it again") from error
     return tally
 
 

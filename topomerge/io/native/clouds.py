@@ -97,24 +97,29 @@ def _iter_blocks(stream: IO[bytes], row: np.dtype, count: int) -> Iterator[Array
 
 
 def _move_rows(path: Path, rows: Array, motion: Motion) -> Array:
-    """The rows with their places and normals moved."""
-    points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    moved = motion.move_points(points)
-    largest = np.abs(moved[np.isfinite(moved).all(axis=1)]).max(initial=0.0)
-    if rows.dtype["x"].kind != "f" or (rows.dtype["x"].itemsize == 4 and largest > FLOAT32_WITHIN):
-        raise InputError(f"{path}: its coordinates can't hold places {largest:,.0f} m away to a millimetre; save them as double")
-    for names in NORMALS:
-        if set(names) <= set(rows.dtype.names or ()):
-            normals = np.stack([rows[name].astype(np.float64) for name in names], axis=1)
-            ahead = motion.move_points(points + STEP * normals) - moved
-            length = np.linalg.norm(ahead, axis=1, keepdims=True)
-            scale = np.linalg.norm(normals, axis=1, keepdims=True)
-            turned = np.divide(ahead * scale, length, out=np.zeros_like(ahead), where=length > 0)
-            for k, name in enumerate(names):
-                rows[name] = turned[:, k]
-    for k, axis in enumerate("xyz"):
-        rows[axis] = moved[:, k]
+    """The rows with their places and normals moved; what is not finite stays so."""
+    with np.errstate(all="ignore"):
+        points = _stack(rows, ("x", "y", "z"))
+        moved = motion.move_points(points)
+        largest = np.abs(moved[np.isfinite(moved).all(axis=1)]).max(initial=0.0)
+        if rows.dtype["x"].kind != "f" or (rows.dtype["x"].itemsize == 4 and largest > FLOAT32_WITHIN):
+            far = f"can't hold places {largest:,.0f} m away to a millimetre"
+            raise InputError(f"{path}: its coordinates {far}; save them as double")
+        for names in NORMALS:
+            if set(names) <= set(rows.dtype.names or ()):
+                normals = _stack(rows, names)
+                ahead = motion.move_points(points + STEP * normals) - moved
+                length, scale = (np.linalg.norm(v, axis=1, keepdims=True) for v in (ahead, normals))
+                turned = np.divide(ahead * scale, length, out=np.zeros_like(ahead), where=length > 0)
+                for k, name in enumerate(names):
+                    rows[name] = turned[:, k]
+        for k, axis in enumerate("xyz"):
+            rows[axis] = moved[:, k]
     return rows
+
+
+def _stack(rows: Array, names: tuple[str, ...]) -> Array:
+    return np.stack([rows[name].astype(np.float64) for name in names], axis=1)
 
 
 def _format_viewpoint(viewpoint: tuple[float, ...], motion: Motion) -> bytes:

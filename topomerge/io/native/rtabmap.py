@@ -31,6 +31,7 @@ from topomerge.io.rtabmap import (
     RTABMAP_KIND,
     Poses,
     build_read_address,
+    decode_matrix,
     read_poses,
     read_version,
     refuse_open_database,
@@ -108,10 +109,19 @@ def join(sources: Sequence[Source], target: Path, doubt: Doubt) -> Tally:
         between = _link_sessions(base, newest, nodes, joined, doubt)
         _finish(base, newest, joined)
         after = {name: _count(base, "main", table) for name, table in COUNTED.items()}
+        placed = _read_placed(base, newest)
     counts = {name: (before[name] + (between if name == "links" else 0), after[name]) for name in COUNTED}
     counts["links between sessions"] = (between, between)
-    counts["landmarks"] = (len({k for k in joined if k < 0}),) * 2
+    counts["landmarks"] = (sum(k < 0 for k in joined), sum(k < 0 for k in placed))
+    counts["poses"] = (sum(k > 0 for k in joined), sum(k > 0 for k in placed))
     return Tally(counts, tuple(warnings))
+
+
+def _read_placed(base: sqlite3.Connection, newest: _Session) -> list[int]:
+    """Numbers of the nodes and, below 0, tags that have optimised poses in the joined database; older ones hold none."""
+    row = base.execute("SELECT opt_ids FROM Admin").fetchone() if newest.version >= OPTIMISED_SINCE else None
+    ids: list[int] = decode_matrix(row[0], "opt_ids").ravel().tolist() if row is not None and row[0] else []
+    return ids
 
 
 def encode_matrix(values: Array) -> bytes:
