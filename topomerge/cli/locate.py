@@ -1,0 +1,118 @@
+"""Commands `locate`, `serve-locate` and `bridge`: where a scan was taken, asked once, by robots, or all the time."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+
+from topomerge.cli.console import (
+    Command,
+    build_option,
+    check_inputs,
+    find_signal,
+    guard_printing,
+    print_line,
+    print_text,
+    write_out,
+)
+from topomerge.cli.inputs import check_cloud_options, collect_reading_options, is_map
+from topomerge.cli.options import (
+    CLOUD_OPTIONS,
+    build_json_option,
+    build_quiet_option,
+    collect_given,
+    parse_share,
+    parse_whole_number,
+)
+
+PORT = 7654
+
+
+def run_locate(args: argparse.Namespace) -> int:
+    """`topomerge locate`: where in an atlas a scan was taken. Status 2: not here, or it can't be told."""
+    check_inputs([args.input])
+    check_cloud_options([args.input], args)
+    from dataclasses import replace
+
+    from topomerge.fusion.atlas.locate import LOCATE, locate
+
+    answer = locate(args.atlas, _load_scan(args), replace(LOCATE, **collect_given(args, "sure")))
+    if args.json:
+        write_out(json.dumps(answer.serialise(), indent=1, ensure_ascii=False) + "\n")
+    else:
+        print_text(answer.reason)
+        rest = answer.places if answer.status != "located" else answer.places[1:]
+        if rest and not args.quiet:
+            print_text("\n".join(f"  {place.describe()}" for place in rest if place.probability >= 0.005))
+    return 0 if answer.status == "located" else 2
+
+
+def _load_scan(args: argparse.Namespace) -> object:
+    """What `locate` is asked with."""
+    if is_map(args.input):
+        from topomerge.extraction.landmarks import load_map_with_landmarks
+
+        return load_map_with_landmarks(args.input)
+    from topomerge.io.points import read_chunks
+
+    return read_chunks(args.input, **collect_reading_options(args.input, args))
+
+
+def run_serve(args: argparse.Namespace) -> int:
+    """`topomerge serve-locate`: answer until Ctrl-C or a termination."""
+    from topomerge.fusion.atlas.locate_server import LocateServer
+
+    with LocateServer(args.atlas, args.host, args.port) as server:
+        print_line(f"serving {args.atlas} on {server.address[0]}:{server.address[1]} (Ctrl-C ends it)")
+        with guard_printing():
+            sys.stdout.flush()
+        try:
+            server.serve()
+        except (KeyboardInterrupt, SystemExit) as stop:
+            if not isinstance(find_signal(stop), KeyboardInterrupt):
+                raise
+    if not args.quiet:
+        print_line(f"{server.answered} scans answered")
+    return 0
+
+
+def parse_port(text: str) -> int:
+    """Parse a port, 0 for any free one, as the `type` of an argument."""
+    number = parse_whole_number(text)
+    if number > 65535:
+        raise argparse.ArgumentTypeError(f"must be a port from 0 to 65535, not {text}")
+    return number
+
+
+LOCATE = Command(
+    "locate",
+    run_locate,
+    "find where in an atlas a scan was taken",
+    "topomerge locate house/ scan.ply",
+    (
+        build_option("atlas", metavar="ATLAS", help="an atlas (`topomerge atlas add`)"),
+        build_option("input", metavar="SCAN", help="one scan, a slice, a frame with depth, a short walk, or a .tmap"),
+        build_option("--sure", type=parse_share, metavar="P", help="probability from which on a place is told (default 0.7)"),
+        *(option for option in CLOUD_OPTIONS if option[0][0] in ("--up", "--unit", "--one-frame")),
+        build_json_option("print the answer as JSON: places with pose, covariance and probability"),
+        build_quiet_option("print one line only"),
+    ),
+    paths=("input",),
+    description="Find building, storey, room and pose of a scan in an atlas. Status 2: it was not taken there, or several places "
+    "look alike; these are named.",
+)
+SERVE = Command(
+    "serve-locate",
+    run_serve,
+    "answer robots that ask where they are, over a socket",
+    f"topomerge serve-locate house/ --port {PORT}",
+    (
+        build_option("atlas", metavar="ATLAS", help="an atlas"),
+        build_option("--port", type=parse_port, default=PORT, metavar="N", help=f"port (default {PORT}; 0: any free one)"),
+        build_option("--host", default="127.0.0.1", metavar="ADDRESS", help="address (default 127.0.0.1: this machine only)"),
+        build_quiet_option("print nothing at the end"),
+    ),
+    description="Answer line JSON over a socket: each line asks with points or the name of a file in --host's machine, and gets "
+    "one line back.",
+)
