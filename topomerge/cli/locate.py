@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Mapping
+from typing import Any
 
 from topomerge.cli.console import (
     Command,
@@ -20,11 +22,14 @@ from topomerge.cli.inputs import check_cloud_options, collect_reading_options, i
 from topomerge.cli.options import (
     CLOUD_OPTIONS,
     build_json_option,
+    build_output_option,
     build_quiet_option,
     collect_given,
+    parse_positive,
     parse_share,
     parse_whole_number,
 )
+from topomerge.errors import InputError
 
 PORT = 7654
 
@@ -77,6 +82,46 @@ def run_serve(args: argparse.Namespace) -> int:
     return 0
 
 
+def run_bridge(args: argparse.Namespace) -> int:
+    """`topomerge bridge`: robots whose maps are joined while they drive."""
+    from pathlib import Path
+
+    from topomerge.fusion.bridge import Bridge, parse_robot
+    from topomerge.fusion.live import LiveMerger, describe_event
+    from topomerge.io.streams import StreamCounts, read_foxglove, read_mcap, read_rosbridge
+
+    if sum(bool(way) for way in (args.rosbridge, args.foxglove, args.mcap)) != 1:
+        raise InputError("bridge: give one of --rosbridge, --foxglove and --mcap")
+    if not args.robots:
+        raise InputError("bridge: name the robots: --robot NAME=SCANS[,POSES], as --robot a=/a/scan,/a/odom")
+    robots = [parse_robot(text) for text in args.robots]
+    if len({robot.name for robot in robots}) < len(robots):
+        raise InputError("--robot: two have one name; give each its own")
+
+    def tell(event: Mapping[str, Any]) -> None:
+        print_line(json.dumps(event, ensure_ascii=False) if args.json else describe_event(event))
+        with guard_printing():
+            sys.stdout.flush()
+
+    bridge = Bridge(LiveMerger(Path(args.output)), robots, tell, **collect_given(args, "every"))
+    topics, counts = bridge.list_topics(), StreamCounts()
+    for robot in robots:
+        bridge.merger.get_robot(robot.name)
+    try:
+        if args.rosbridge:
+            bridge.run(read_rosbridge(args.rosbridge, topics, counts, bridge.take_outbox))
+        elif args.foxglove:
+            bridge.run(read_foxglove(args.foxglove, topics, counts))
+        else:
+            bridge.run(read_mcap(sys.stdin.buffer, topics, counts))
+    except KeyboardInterrupt:
+        pass
+    if not args.quiet:
+        said = ", ".join(f"{n} {what}" for what, n in sorted(bridge.counts.items())) or "nothing came"
+        print_line(f"{counts.read} messages: {said}; {counts.broken} unreadable -> {args.output}", sys.stderr)
+    return 0 if bridge.merger.links else 2
+
+
 def parse_port(text: str) -> int:
     """Parse a port, 0 for any free one, as the `type` of an argument."""
     number = parse_whole_number(text)
@@ -93,7 +138,7 @@ LOCATE = Command(
     (
         build_option("atlas", metavar="ATLAS", help="an atlas (`topomerge atlas add`)"),
         build_option("input", metavar="SCAN", help="one scan, a slice, a frame with depth, a short walk, or a .tmap"),
-        build_option("--sure", type=parse_share, metavar="P", help="probability from which on a place is told (default 0.7)"),
+        build_option("--sure", type=parse_share, metavar="P", help="probability from which on a place is told (default 0.9)"),
         *(option for option in CLOUD_OPTIONS if option[0][0] in ("--up", "--unit", "--one-frame")),
         build_json_option("print the answer as JSON: places with pose, covariance and probability"),
         build_quiet_option("print one line only"),
@@ -115,4 +160,30 @@ SERVE = Command(
     ),
     description="Answer line JSON over a socket: each line asks with points or the name of a file in --host's machine, and gets "
     "one line back.",
+)
+BRIDGE = Command(
+    "bridge",
+    run_bridge,
+    "join the maps of robots while they drive",
+    "topomerge bridge -o live/ --rosbridge ws://localhost:9090 --robot a=/a/scan,/a/odom --robot b=/b/scan,/b/odom",
+    (
+        build_output_option("DIR", "folder of the state; it is gone on with when it is there"),
+        build_option(
+            "--robot",
+            dest="robots",
+            action="append",
+            default=[],
+            metavar="NAME=SCANS[,POSES]",
+            help="a robot: topic of its scans, clouds or grids, and of its poses (odometry or transforms; /tf always counts)",
+        ),
+        build_option("--rosbridge", default="", metavar="URL", help="rosbridge server, as ws://localhost:9090; answers go back"),
+        build_option("--foxglove", default="", metavar="URL", help="Foxglove websocket server, as ws://localhost:8765"),
+        build_option("--mcap", action="store_true", default=False, help="an MCAP recording on standard input"),
+        build_option("--every", type=parse_positive, metavar="S", help="seconds between two updates, at least (default 5)"),
+        build_json_option("print each event as a line of JSON"),
+        build_quiet_option("print events only"),
+    ),
+    paths=("output",),
+    description="Keep one map a robot, join them when they are believed to show one place, and part them when evidence turns. "
+    "Printed and published: the pose between joined maps, and what a robot should look at next. Status 2: nothing is joined.",
 )

@@ -42,7 +42,7 @@ from topomerge.cli.dataset import DATASET, FINETUNE
 from topomerge.cli.export import EXPORT
 from topomerge.cli.extract import EMBED, EXPORT_EMBEDDER, EXTRACT, INFO
 from topomerge.cli.landmarks import FIND, MARK
-from topomerge.cli.locate import LOCATE, SERVE
+from topomerge.cli.locate import BRIDGE, LOCATE, SERVE
 from topomerge.cli.merge import MATCH, MERGE
 from topomerge.cli.options import build_output_option, build_quiet_option, collect_given, parse_whole_number
 from topomerge.errors import InputError, make_printable
@@ -216,6 +216,7 @@ COMMANDS = (
     WATCH,
     LOCATE,
     SERVE,
+    BRIDGE,
     EXPORT,
     EXPORT_EMBEDDER,
     VIEW,

@@ -48,6 +48,7 @@ FEATURES = (
 )  # fmt: skip
 NEAR, TURNED = 0.8, np.radians(8.0)  # m and rad: poses that are nearer are one
 PLACE_SIGMA, INDEPENDENT = 0.08, 0.1  # m that a wall is off, and share of its columns that count
+MOST_COLUMNS = 400.0  # of walls, of which more tell no more
 LOOSE = 5.0  # m: how far a pose may slide where no wall holds it
 
 
@@ -62,7 +63,7 @@ class LocateSettings:
     alike: places between which it "cannot tell", at most.
     """
 
-    sure: float = 0.7
+    sure: float = 0.9
     coarse: int = 80
     coarse_of_storey: int = 16
     judged: int = 24
@@ -385,7 +386,7 @@ def compute_features(judge: Judge, hypothesis: PoseHypothesis) -> Array:
     features = judge(pose)
     column = judge.b[0].plan.edge ** 2
     total = max(float(seen[10]), column)
-    root = float(np.sqrt(min(total / column, 400.0)))
+    root = float(np.sqrt(min(total / column, MOST_COLUMNS)))
     shares = np.array([seen[1], seen[2], seen[3], seen[0] - seen[1:4].sum(), back[0] - back[1] - back[2]]) / total
     clutter, met = seen[6] + back[6], seen[7] + back[7]
     chance = (seen[9] + back[9]) / max(float(seen[8] + back[8]), 1e-6)
@@ -413,7 +414,7 @@ def decide(index: PlaceIndex, query: Query, judged: Sequence[JudgedPose], settin
             places.append((_build_place(index, pose, query, p), there))
     ranked = sorted((p for p, _ in places), key=lambda p: -p.probability)
     shown = tuple(ranked[: settings.alike + settings.shown])
-    return _word(shown, nowhere, settings)
+    return _word(shown, nowhere, settings, is_telling(query, settings))
 
 
 def compute_probabilities(judged: Sequence[JudgedPose], none: float) -> tuple[Array, float]:
@@ -434,7 +435,15 @@ def _is_same(a: Array, b: Array) -> bool:
     return bool(np.hypot(*(a - b)[:2]) < NEAR and abs(a[2] - b[2]) < 1.5 and abs(wrap_yaw(float(a[3] - b[3]))) < TURNED)
 
 
-def _word(places: tuple[Place, ...], nowhere: float, settings: LocateSettings) -> Location:
+def is_telling(query: Query, settings: LocateSettings = LOCATE) -> bool:
+    """Does a scan show so much that it would be believed, if it fitted perfectly? Else "not here" would be a guess, too."""
+    odds = load_odds()
+    root = float(np.sqrt(min(len(query.fields.walls), MOST_COLUMNS)))
+    best = root * sum(odds["weight"][FEATURES.index(name)] for name in ("sharp", "agree"))
+    return bool(best - odds["nowhere"] >= np.log(settings.sure / (1 - settings.sure)))
+
+
+def _word(places: tuple[Place, ...], nowhere: float, settings: LocateSettings, telling: bool) -> Location:
     best = places[0]
     if best.probability >= settings.sure:
         return Location("located", places[: 1 + settings.shown], 1, nowhere, best.describe())
@@ -446,10 +455,11 @@ def _word(places: tuple[Place, ...], nowhere: float, settings: LocateSettings) -
         else:
             where = f"cannot tell between {told} places that look alike"
         return Location("ambiguous", places, told, nowhere, where)
-    if nowhere >= 0.5:
+    if nowhere >= 0.5 and telling:
         reason = f"not here ({nowhere:.2f}): nothing in the atlas fits well enough"
         return Location("not here", places[: settings.shown], 0, nowhere, reason)
-    return Location("ambiguous", places, 0, nowhere, "cannot tell: too many places fit about as well; show more of the place")
+    reason = "too many places fit about as well" if telling else "the scan shows too little"
+    return Location("ambiguous", places, 0, nowhere, f"cannot tell: {reason}; turn the sensor or walk on, so that it shows more")
 
 
 def _build_place(index: PlaceIndex, judged: JudgedPose, query: Query, probability: float) -> Place:
