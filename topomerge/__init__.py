@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from topomerge.extraction.parameters import PRESETS as PRESETS
     from topomerge.extraction.voxels import voxelise as voxelise
     from topomerge.fusion.atlas.find import find as find
+    from topomerge.fusion.atlas.locate import locate as locate
     from topomerge.fusion.atlas.result import AtlasResult as AtlasResult
     from topomerge.fusion.atlas.solve import build_atlas as build_atlas
     from topomerge.fusion.pipeline import merge as merge
@@ -66,6 +67,7 @@ _HOMES = {
     "align_maps": "topomerge.changes.compare",
     "compare_maps": "topomerge.changes.compare",
     "find": "topomerge.fusion.atlas.find",
+    "locate": "topomerge.fusion.atlas.locate",
     "InputError": "topomerge.errors",
     "MergeResult": "topomerge.fusion.result",
     "PRESETS": "topomerge.extraction.parameters",

@@ -175,6 +175,7 @@ TASKS = Registry(
                 "drawing_segmentation", "door_classification", "wall_segmentation",
                 "passages", "wall_doors", "room_odds", "feature_scale", "match_odds",
                 "place_evidence", "match_belief", "merge_belief", "embedding", "room_matcher", "radio_law",
+                "locate_odds",
             )
         },
     },

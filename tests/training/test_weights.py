@@ -34,6 +34,7 @@ def test_steps_run_in_order_and_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
         "embedding",
         "room_matcher",
         "radio_law",
+        "locate_odds",
     ]
     said = capsys.readouterr().err
     assert "plan_segmentation: is there" in said and set(TASKS) <= set(json.loads((tmp_path / "seconds.json").read_text()))

@@ -37,6 +37,7 @@ from topomerge.cli.edit import EDIT
 from topomerge.cli.export import EXPORT
 from topomerge.cli.extract import EMBED, EXPORT_EMBEDDER, EXTRACT, INFO
 from topomerge.cli.landmarks import FIND, MARK
+from topomerge.cli.locate import BRIDGE, LOCATE, SERVE
 from topomerge.cli.merge import MATCH, MERGE
 from topomerge.cli.move import MOVE
 from topomerge.cli.options import build_output_option, build_quiet_option, collect_given, parse_whole_number
@@ -123,6 +124,9 @@ COMMANDS = (
     COMPLETION,
     ATLAS,
     WATCH,
+    LOCATE,
+    SERVE,
+    BRIDGE,
     EXPORT,
     EXPORT_EMBEDDER,
     VIEW,
@@ -136,6 +140,7 @@ exit status:
   1    bad input or a wrong command line: one line on stderr says which file and why; no output is written
   2    no trustworthy merge: the reason is printed and stands in merge.json; of finetune: it did not help;
        of find: nothing was found; of diff: the maps could not be aligned
+       of find: nothing was found; of locate: not here, or it can't be told
   130  interrupted
   141  what read the output went away (`| head`)
   143  terminated

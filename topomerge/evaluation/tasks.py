@@ -47,6 +47,7 @@ MODULES = {
     "atlases": "atlases",
     "retrieval": "retrieval",
     "radio": "radio",
+    "locate": "locate",
     "landmarks": "landmarks",
     "edits": "edits",
     "changes": "changes",

@@ -215,3 +215,19 @@ class RadioLawFit(TaskSettings):
     task: str = "radio_law"
     name: str = "radio_law"
     watch: str = "log_loss"
+
+
+@dataclass
+class LocateOdds(TaskSettings):
+    """Settings of `locate_odds`.
+
+    Args:
+        split: of the buildings.
+        maps: of the atlas.
+    """
+
+    task: str = "locate_odds"
+    name: str = "locate_odds"
+    watch: str = "log_loss"
+    split: str = "validation"
+    maps: int = 24

@@ -17,6 +17,7 @@ from topomerge.errors import InputError
 from topomerge.fusion.atlas.maps import Maps, Memory
 from topomerge.fusion.atlas.pairs import find_hypotheses
 from topomerge.fusion.inputs import FEW_MAPS
+from topomerge.landmarks.map_search import build_landmark_index
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.registration.judge import Judge
 from topomerge.registration.search import search, search_scaled
@@ -35,6 +36,7 @@ Workers = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, An
 COARSE_PARTNERS = 40  # maps that a map's rooms look most like, on which it is laid coarsely
 MOST_PARTNERS = 5  # of these and of those that name it, the ones on which it lies best
 LIKELY_PARTNERS = 2  # that its rooms look most like, however it lies: drift spoils a coarse pose
+NAMED_PARTNERS = 2  # that its signs, tags and radio speak of, however it lies
 
 
 def compute_vectors(rows: Rows, turns: int = 0) -> Array:
@@ -257,6 +259,7 @@ def find_partners(
     """
     count = len(maps)
     named = _list_similar_maps(maps)
+    testified = _list_named_maps(maps)
     sets = [set(of) for of in named]
     for k, of in enumerate(named):
         for m in of:
@@ -264,7 +267,7 @@ def find_partners(
     if workers is not None and count > 2:
         _score_in_workers(maps, named, scale, workers)
     odds, complete = _score_partners(maps, named, scale, end)
-    chosen = {_order_pair(*pair) for pair in linked}
+    chosen = {_order_pair(*pair) for pair in linked} | {_order_pair(k, m) for k, of in enumerate(testified) for m in of}
     for k in range(count):
         best = sorted(sets[k], key=lambda m, k=k: (-odds.get(_order_pair(k, m), -np.inf), m))  # type: ignore[misc]
         chosen |= {_order_pair(k, m) for m in (best if count <= FEW_MAPS else best[:MOST_PARTNERS] + named[k][:LIKELY_PARTNERS])}
@@ -282,6 +285,17 @@ def _list_similar_maps(maps: Maps) -> list[list[int]]:
     largest = sorted(range(count), key=lambda k: -maps.get_area(k))
     named = iter_most_similar([maps.get_rows(k) for k in range(count)], COARSE_PARTNERS)
     return [list(of) or [m for m in largest if m != k][:COARSE_PARTNERS] for k, of in enumerate(named)]
+
+
+def _list_named_maps(maps: Maps) -> list[list[int]]:
+    """For each map those that its landmarks speak of most; none where all maps are registered with each other anyway."""
+    heard = [k for k in range(len(maps)) if len(maps) > FEW_MAPS and maps.get_prepared(k).has_landmarks]
+    out: list[list[int]] = [[] for _ in range(len(maps))]
+    if len(heard) > 1:
+        index = build_landmark_index(maps[k] for k in heard)
+        for n, k in enumerate(heard):
+            out[k] = [heard[m] for m, _ in index.rank(maps[k], but=n)[:NAMED_PARTNERS]]
+    return out
 
 
 def _score_partners(maps: Maps, named: list[list[int]], scale: str, end: float) -> tuple[dict[tuple[int, int], float], bool]:

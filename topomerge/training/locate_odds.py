@@ -1,0 +1,135 @@
+"""Task `locate_odds`: the odds of a pose of a single scan against other poses and against "nowhere" (`fusion.atlas.locate`).
+
+Single scans of known places, and of buildings without a map, are looked for in an atlas. The weights of what is seen of a pose
+are the most likely ones of a choice among all poses that were judged and "nowhere" (conditional logit, McFadden 1974).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+
+from topomerge.datasets.core.builder import limit_threads
+from topomerge.datasets.pairs.localisation import SCANS, load_located_map, make_located_map, make_located_scan
+from topomerge.errors import InputError
+from topomerge.fusion.atlas.locate import FEATURES, LOCATE, find_places, prepare_query
+from topomerge.fusion.atlas.place_index import PlaceIndex
+from topomerge.io.maps import load_map
+from topomerge.matching.poses import wrap_yaw
+from topomerge.training.closed_form import FitResult, run_fit
+from topomerge.training.task_settings import LocateOdds
+from topomerge.training.tasks import Task
+from topomerge.types import Array, LogFn
+
+RIGHT = (0.5, np.radians(6.0))  # m and rad: a pose that is learned as right
+FOLDS = 6
+SHRINK = 3e-3  # of squared weights of standardised features
+DIGITS = 4
+
+
+class LocateRows(NamedTuple):
+    """A scan: number of its building, (n, 11) features of its poses and (n,) which are right."""
+
+    building: int
+    x: Array
+    y: Array
+
+
+def build_rows(split: str, count: int, folder: Path, log_line: LogFn) -> list[LocateRows]:
+    """Make an atlas of so many maps, and judge poses of scans of each building and of as many without a map."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with limit_threads():
+        made = [load_located_map(make_located_map(split, k, folder)) for k in range(count)]
+        index, rows = PlaceIndex.from_maps({m.path.stem: load_map(m.path) for m in made}), []
+        for k in range(count):
+            for n, kind in enumerate(SCANS):
+                rows += [
+                    build_row(index, made[k], split, k, kind, stranger) for stranger in ([False, True][: 1 + ((k + n) % 3 == 0)])
+                ]
+            log_line(f"{k + 1} of {count} buildings")
+    return [row for row in rows if row is not None]
+
+
+def build_row(index: PlaceIndex, own: Any, split: str, number: int, kind: str, stranger: bool) -> LocateRows | None:
+    """Judge the poses of one scan; None where it shows no walls."""
+    scan = make_located_scan(split, number, kind, stranger)
+    try:
+        query = prepare_query(scan.cloud)
+    except InputError:
+        return None
+    pose, moved = own.place_scan(scan)
+    at = query.place[None]
+    there = (pose.apply(at) + moved)[0, :2]
+    judged = find_places(index, query, LOCATE)
+    right = [
+        not stranger
+        and index.storeys[j.storey].map == number
+        and float(np.hypot(*(j.pose.apply(at)[0, :2] - there))) < RIGHT[0]
+        and abs(wrap_yaw(j.pose.yaw - pose.yaw)) < RIGHT[1]
+        for j in judged
+    ]
+    return LocateRows(number, np.array([j.features for j in judged]), np.array(right)) if judged else None
+
+
+def fit_choice(rows: Sequence[LocateRows]) -> tuple[Array, float]:
+    """Fit (11,) weights of the features and the odds of "nowhere"."""
+    size = np.concatenate([r.x for r in rows]).std(axis=0) + 1e-9
+
+    def loss(w: Array) -> float:
+        total = 0.0
+        for r in rows:
+            z = np.append(r.x / size @ w[:-1], w[-1])
+            chosen = z[:-1][r.y] if r.y.any() else z[-1:]
+            total += float(np.logaddexp.reduce(z) - np.logaddexp.reduce(chosen))
+        return total / len(rows) + SHRINK * float(w[:-1] @ w[:-1])
+
+    fitted: Array = minimize(loss, np.zeros(len(size) + 1), method="L-BFGS-B").x
+    return fitted[:-1] / size, float(fitted[-1])
+
+
+def score_choices(rows: Sequence[LocateRows], weights: Array, nowhere: float) -> dict[str, float]:
+    """Score a fit: mean log loss of the choice; shares of scans that are believed and right, and believed and wrong."""
+    losses, right, wrong = [], 0, 0
+    for r in rows:
+        z = np.append(r.x @ weights, nowhere)
+        p = np.exp(z - np.logaddexp.reduce(z))
+        losses.append(-np.log(max(float(p[:-1][r.y].sum() if r.y.any() else p[-1]), 1e-9)))
+        best = int(p[:-1].argmax())
+        sure = p[best] >= LOCATE.sure
+        right, wrong = right + int(sure and r.y[best]), wrong + int(sure and not r.y[best])
+    return {"log_loss": float(np.mean(losses)), "right": right / len(rows), "wrong": wrong / len(rows)}
+
+
+def fit_locate(settings: LocateOdds, log_line: LogFn) -> FitResult:
+    """Fit on all buildings, and score each by those that were fitted without it."""
+    folder = Path(settings.cache) / "locate" / settings.split
+    rows = build_rows(settings.split, settings.maps, folder, log_line)
+    scores = []
+    for fold in range(FOLDS):
+        own = [r for r in rows if r.building % FOLDS == fold]
+        if own:
+            scores += [(len(own), score_choices(own, *fit_choice([r for r in rows if r.building % FOLDS != fold])))]
+    metrics = {name: sum(n * s[name] for n, s in scores) / len(rows) for name in ("log_loss", "right", "wrong")}
+    weights, nowhere = fit_choice(rows)
+    found = {"names": list(FEATURES), "weight": np.round(weights, DIGITS).tolist(), "nowhere": round(nowhere, DIGITS)}
+    return FitResult(found, metrics, {"split": settings.split, "maps": settings.maps, "scans": len(rows)})
+
+
+def fit(settings: LocateOdds, log_line: LogFn) -> dict[str, float]:
+    """Fit the odds; the scores of buildings that were left out."""
+    return run_fit(settings, fit_locate, log_line)
+
+
+def judge(settings: LocateOdds, file: Path, log_line: LogFn) -> dict[str, Any]:
+    """Score weights on another split."""
+    held = json.loads(file.read_text(encoding="utf-8"))
+    rows = build_rows("test", settings.maps, Path(settings.cache) / "locate" / "test", log_line)
+    return score_choices(rows, np.array(held["weight"]), float(held["nowhere"]))
+
+
+TASK = Task(LocateOdds, fit, ("log_loss",), judge, "topomerge.fusion", "locate_odds.json", hours=0.2, lower=("log_loss",))
