@@ -392,8 +392,8 @@ def part_columns(columns: Array, grid: VoxelGrid, line: Array) -> Array | None:
 def _keep_connected(side: Array, part: Array, one: Array, other: Array) -> Array:
     """The side of each part of a room, -1 unknown, so that each side hangs together.
 
-    A line that is too long cuts off corners. Of the parts on a side the largest stays; others go with the largest of the other side
-    where they meet it across the line.
+    A line that is too long cuts off corners. Of the parts on a side the largest stays; others go with the largest of the other
+    side where they meet it across the line.
 
     Args:
         side: (P,).
