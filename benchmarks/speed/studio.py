@@ -1,7 +1,7 @@
 """The page of `topomerge studio` in a browser: seconds to the first plan, frames a second while one pans, seconds of an edit.
 
 ``python -m benchmarks.speed.studio [rooms ...]``: storeys of a corridor between two rows of rooms, of so many rooms in all. The
-
+browser draws without a graphics card, as on the machines that test.
 """
 
 from __future__ import annotations
