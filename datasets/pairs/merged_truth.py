@@ -12,6 +12,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from topomerge.datasets.pairs.own_pairs import OWN_FOLDER, extract_captures
 from topomerge.datasets.pairs.own_truth import find_overlap
@@ -208,7 +209,8 @@ def find_components(pairs: Sequence[TriedPair]) -> list[tuple[str, ...]]:
 
 
 def write_pairs_file(listing: PairsFile, maps: Mapping[str, TopometricMap], taken: Sequence[TriedPair], file: Path) -> None:
-    """Write the captures that are part of a pair, each of the building that is called like the first capture of it.
+    """Write the captures that are part of a pair, each of the building that is called like the first capture of it. Pairs without
+    a pose show two places.
 
     Raises:
         InputError: it can't be written.
@@ -217,7 +219,10 @@ def write_pairs_file(listing: PairsFile, maps: Mapping[str, TopometricMap], take
 
     above = file.parent.resolve()
     captures = []
-    for group in find_components(taken):
+    groups = find_components([one for one in taken if one.pose is not None])
+    joined = {name for group in groups for name in group}
+    apart = sorted({name for one in taken for name in (one.a, one.b)} - joined)
+    for group in [*groups, *((name,) for name in apart)]:
         for name in group:
             capture = listing.captures[name]
             entry = {"name": name, "file": os.path.relpath(capture.path.resolve(), above), "building": group[0]}
@@ -225,9 +230,11 @@ def write_pairs_file(listing: PairsFile, maps: Mapping[str, TopometricMap], take
             if read.get("poses") and Path(read["poses"]).is_file():
                 read["poses"] = os.path.relpath(Path(read["poses"]).resolve(), above)
             captures.append({**entry, "sensor": capture.sensor, **({"read": read} if read else {})})
-    pairs = []
+    pairs: list[dict[str, Any]] = []
     for one in taken:
-        assert one.pose is not None
+        if one.pose is None:
+            pairs.append({"a": one.a, "b": one.b, "different": True})
+            continue
         matrix = convert_pose_to_files(one.pose, maps[one.b].levelling, maps[one.a].levelling)
         pairs.append({"a": one.a, "b": one.b, "transform": (matrix.round(DECIMALS) + 0.0).tolist()})
     # Captures that nothing connects may be of one building all the same: none are taken for strangers.

@@ -64,6 +64,24 @@ def test_a_line_may_be_short_bent_or_long():
         assert sorted(label_at(map, np.array([(7, 5), (9, 5)], float)).tolist()) == [8, 9]
 
 
+def test_a_line_that_is_too_long_cuts_off_no_corners():
+    """Along the wall of the corridor it crosses the doorways of all rooms on that side."""
+    join = build_edit("join_rooms", at=[[2, 2, 0], [2, 5, 0]])
+    map = edited(join, build_edit("split_room", at=[2, 2, 0], line=[[0.0, 4.05], [16, 4.05]]))
+    assert len(map.rooms) == 9
+    floor = map.navigable.compute_centroids()
+    for x in (6, 10, 14):  # the doorways of the others stay with the corridor
+        doorway = (np.abs(floor[:, 0] - x) < 0.3) & (np.abs(floor[:, 1] - 4.02) < 0.15)
+        assert set(map.navigable_room[doorway].tolist()) == set(corridor_labels(doorway, map))
+
+
+def corridor_labels(places, map):
+    """Labels of places as they were extracted, but for the numbers of the corridor and of the room that was cut off."""
+    base = corridor_map().navigable_room[places]
+    now = {int(old): int(np.bincount(map.navigable_room[corridor_map().navigable_room == old]).argmax()) for old in range(9)}
+    return [now[int(r)] for r in base]
+
+
 def test_a_line_that_does_not_part_the_room_is_told():
     for line in ([[3, 2], [3, 2]], [[30, 4], [30, 6]], [[0.5, 5], [15.5, 5.0]]):
         edit = build_edit("split_room", at=[1, 5, 0], line=line)

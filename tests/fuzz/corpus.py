@@ -9,6 +9,7 @@ import tarfile
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -16,7 +17,9 @@ import numpy as np
 
 from tests import samples
 from tests.scenes_map import building
+from topomerge.edits.journal import Edit
 from topomerge.errors import InputError
+from topomerge.types import TopometricMap
 
 MOST_TAKEN = 5_000_000  # points that are taken of a file; the rest of a large surface is no danger, as it comes in portions
 
@@ -136,7 +139,22 @@ def read_landmarks(path: Path) -> int:
     return len(load_landmark_source(path))
 
 
+def read_edits(path: Path) -> int:
+    """Read a journal of edits, and apply it."""
+    from topomerge.edits.apply import apply_edits
+    from topomerge.edits.journal import read_journal
+
+    done = apply_edits(_building(), read_journal(path).edits)
+    return len(done.map.rooms) + len([str(refused) for refused in done.refused])
+
+
+@cache
+def _building() -> TopometricMap:
+    return building(2, 2)
+
+
 READERS: dict[str, Callable[[Path], int]] = {  # by name or suffix; all others are clouds
+    "a.edits.jsonl": read_edits,
     "a.landmarks.csv": read_landmarks,
     "rooms.geojson": read_landmarks,
     "rooms.gml": read_landmarks,
@@ -167,6 +185,7 @@ def write_corpus(folder: Path) -> dict[str, Path]:
 
     from tests.io.test_landmark_files import some_landmarks
     from tests.types.test_deformation import deformation
+    from topomerge.edits.journal import append_edits
     from topomerge.extraction.landmarks import add_landmarks
     from topomerge.fusion.result import add_bends
     from topomerge.io.exports import save_export
@@ -189,6 +208,8 @@ def write_corpus(folder: Path) -> dict[str, Path]:
     save_map(add_bends(marked, {1: Placement(Sim3(0.3), turn)}, ["a.ply", "b.ply"]), found["map.tmap"])
     found["a.landmarks.csv"] = folder / "a.landmarks.csv"
     found["a.landmarks.csv"].write_text(format_landmark_table(some_landmarks()))
+    found["a.edits.jsonl"] = folder / "a.edits.jsonl"
+    append_edits(found["a.edits.jsonl"], list_edits())
     for name, form in (("rooms.geojson", "geojson"), ("rooms.gml", "indoorgml")):
         found[name] = folder / name
         save_export(marked, form, found[name])
@@ -197,6 +218,38 @@ def write_corpus(folder: Path) -> dict[str, Path]:
     found["pairs.yaml"] = folder / "pairs.yaml"
     found["pairs.yaml"].write_text(OWN_PAIRS)
     return found | write_walks(folder) | write_plans(folder) | write_embedder(folder) | write_atlas(folder)
+
+
+def list_edits() -> list[Edit]:
+    """An edit of each kind, with what may be left out."""
+    from topomerge.edits.draft import find_room_place
+    from topomerge.edits.journal import build_edit
+
+    at = [find_room_place(_building(), r).tolist() for r in range(3)]
+    x, y, _ = at[0]
+    eye = np.eye(4).tolist()
+    edits = [
+        build_edit("split_room", at=at[0], line=[[x - 3, y], [x, y + 0.1], [x + 3, y]]),
+        build_edit("join_rooms", at=at[1:]),
+        build_edit("add_door", at=[x + 2.05, y, at[0][2]], width=0.8, open=None, between=at[:2]),
+        build_edit("move_door", at=_building().edges["centre"][0], to=at[0], between=at[:2]),
+        build_edit("set_door", at=_building().edges["centre"][1], width=1.0, open=False),
+        build_edit("delete_door", at=_building().edges["centre"][2]),
+        build_edit("move_opening", at=at[0], to=at[1]),
+        build_edit("set_opening", at=at[0], width=1.0, sill=0.9, head=2.0),
+        build_edit("delete_opening", at=at[0]),
+        build_edit("rename_room", at=at[0], name="Kitchen"),
+        build_edit("set_room", at=at[1], kind="office", outside=False, looked_into=True),
+        build_edit("assign_area", at=at, area="ward"),
+        build_edit("add_landmark", at=at[0], kind="tag", value="tag36h11:7"),
+        build_edit("delete_landmark", at=at[0], kind="tag", value="tag36h11:7"),
+        build_edit("match_rooms", maps=[0, 1], at=at[:2], sources=["a.tmap", "b.tmap"]),
+        build_edit("accept_merge", maps=[0, 1], matrix=eye),
+        build_edit("reject_merge", maps=[0, 1]),
+        build_edit("place_map", map=1, matrix=eye),
+    ]
+    edits = [replace(edit, id=f"{k:016x}", time="2026-11-27T17:30:25+00:00") for k, edit in enumerate(edits)]
+    return [*edits, Edit("undo", {"edit": edits[1].id}, "u"), Edit("redo", {"edit": edits[1].id}, "r")]
 
 
 def write_walks(folder: Path) -> dict[str, Path]:

@@ -12,8 +12,8 @@ from topomerge.errors import InputError
 
 
 def dataset_command(args: argparse.Namespace) -> int:
-    """`topomerge dataset`: check the pairs of a folder, or find them by merging its captures."""
-    return (_make_pairs if args.verb == "from-merges" else _check_pairs)(args)
+    """`topomerge dataset`: check the pairs of a folder, find them by merging its captures, or take them from corrected maps."""
+    return {"from-merges": _make_pairs, "from-edits": _collect_edits, "check": _check_pairs}[args.verb](args)
 
 
 def _tell(args: argparse.Namespace, text: str) -> None:
@@ -52,6 +52,21 @@ def _make_pairs(args: argparse.Namespace) -> int:
     return 0
 
 
+def _collect_edits(args: argparse.Namespace) -> int:
+    from topomerge.datasets.pairs.edited_truth import build_edited_truth
+
+    if args.output is None:
+        raise InputError("-o: dataset from-edits needs a folder to write what is true into")
+    if collect_given(args, "scale"):
+        raise InputError("--scale: is for dataset from-merges; leave it out")
+    made = build_edited_truth(args.folder, args.output)
+    print_text("\n".join(made.lines))
+    if not args.quiet:
+        maps = f"{made.maps} corrected map{'s' * (made.maps != 1)}, {made.pairs} pair{'s' * (made.pairs != 1)}"
+        print_line(f"{maps}, {made.edits / max(made.rooms, 1):.2f} edits a room -> {args.output}")
+    return 0
+
+
 CACHE = build_option("--cache", default="cache", metavar="DIR", help="of the maps; that of train.py (default cache)")
 JOBS = build_option("--jobs", type=parse_count, default=1, metavar="N", help="processes that extract (default 1)")
 DATASET = Command(
@@ -62,11 +77,16 @@ DATASET = Command(
     (
         build_option(
             "verb",
-            choices=("check", "from-merges"),
-            help="check: print what the pairs have in common; from-merges: find the pairs of captures without truth",
+            choices=("check", "from-merges", "from-edits"),
+            help="check: print what the pairs have in common; from-merges: find the pairs of captures without truth; from-edits: "
+            "take what is true from corrected maps",
         ),
-        build_option("folder", metavar="DIR", help="a folder with a pairs.yaml, or such a file; from-merges: or with captures"),
-        build_option("-o", "--output", metavar="OUT", default=None, help="from-merges: folder for the pairs.yaml"),
+        build_option(
+            "folder",
+            metavar="DIR",
+            help="a folder with a pairs.yaml, or such a file; from-merges: or with captures; from-edits: with maps",
+        ),
+        build_option("-o", "--output", metavar="OUT", default=None, help="from-merges, from-edits: folder for the pairs.yaml"),
         build_option("--scale", choices=("fixed", "free"), help="from-merges, free: the captures may differ in scale"),
         CACHE,
         JOBS,
@@ -75,7 +95,8 @@ DATASET = Command(
     paths=("folder", "output"),
     description="check: for each pair of the pairs.yaml of a folder (docs: Training, Your own pairs) the rooms of both maps, "
     "those that match, and the area in common; and what is wrong. Status 1: something is. from-merges: register each two "
-    "captures, and write as a pairs.yaml what is believed from a probability of .99 on, closed in cycles.",
+    "captures, and write as a pairs.yaml what is believed from a probability of .99 on, closed in cycles. from-edits: write the "
+    "rooms, doors and matches of maps that somebody corrected, and print how many edits a room it took.",
 )
 
 

@@ -173,10 +173,7 @@ def _mark_room(draft: Draft, room: int, at: Array, kind: str, value: str) -> Non
 def _add_door(
     draft: Draft, at: Array, width: float | None = None, open: bool | None = None, between: Array | None = None
 ) -> None:
-    rooms = None if between is None else draft.find_rooms(between)
-    if rooms is not None and len(rooms) < 2:
-        raise EditError(f"both places lie in room {rooms[0]}: a door leads from one room into another")
-    pair, direction, floor = _find_sides(draft, at, rooms)
+    pair, direction, floor = _find_sides(draft, at, between)
     there = [
         k
         for k in np.flatnonzero((np.sort(draft.edges["rooms"], axis=1) == pair).all(axis=1)).tolist()
@@ -193,8 +190,15 @@ def _add_door(
     _change_door(draft, row, width, open)
 
 
-def _find_sides(draft: Draft, at: Array, rooms: list[int] | None = None) -> tuple[tuple[int, int], float, float]:
-    """The two rooms of a door, the smaller number first, the direction between them, rad, and the height of its floor."""
+def _find_sides(draft: Draft, at: Array, between: Array | None = None) -> tuple[tuple[int, int], float, float]:
+    """The two rooms of a door, the smaller number first, the direction between them, rad, and the height of its floor.
+
+    Args:
+        between: (2, 3) m, places in these rooms where they are told.
+    """
+    rooms = None if between is None else draft.find_rooms(between)
+    if rooms is not None and len(rooms) < 2:
+        raise EditError(f"both places lie in room {rooms[0]}: a door leads from one room into another")
     steps = np.arange(SIDE_STEP, SIDE_REACH + SIDE_STEP / 2, SIDE_STEP)
     rows = draft.find_floor(at, SIDE_REACH)
     if not len(rows):
@@ -259,9 +263,9 @@ def _delete_door(draft: Draft, at: Array) -> None:
     draft.edges = np.delete(draft.edges, draft.find_edge(at))
 
 
-def _move_door(draft: Draft, at: Array, to: Array) -> None:
+def _move_door(draft: Draft, at: Array, to: Array, between: Array | None = None) -> None:
     row = draft.find_edge(at)
-    pair, direction, floor = _find_sides(draft, to)
+    pair, direction, floor = _find_sides(draft, to, between)
     draft.edges["rooms"][row], draft.edges["direction"][row] = pair, direction
     _place_door(draft, row, np.array([*to[:2], floor]))
 

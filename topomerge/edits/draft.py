@@ -379,7 +379,7 @@ def part_columns(columns: Array, grid: VoxelGrid, line: Array) -> Array | None:
         left = np.bincount(part[np.where(is_right, other, one)[crossed]], minlength=count)
         if (np.minimum(right, left) > MIXED_SHARE * np.maximum(right, left)).any():
             continue
-        side = np.where(right > left, 1, np.where(left > right, 0, -1))[part]
+        side = _keep_connected(np.where(right > left, 1, np.where(left > right, 0, -1)), part, one[crossed], other[crossed])[part]
         if (side < 0).any():
             side = side[_find_nearest(columns - low, side >= 0, number.shape, number)]
         least = LEAST_PART / grid.edge**2
@@ -387,6 +387,27 @@ def part_columns(columns: Array, grid: VoxelGrid, line: Array) -> Array | None:
             out: Array = side == 1
             return out
     return None
+
+
+def _keep_connected(side: Array, part: Array, one: Array, other: Array) -> Array:
+    """The side of each part of a room, -1 unknown, so that each side hangs together.
+
+    A line that is too long cuts off corners. Of the parts on a side the largest stays; others go with the largest of the other
+    side where they meet it across the line.
+
+    Args:
+        side: (P,).
+        part: (n,) of each column.
+        one, other: columns that meet across the line.
+    """
+    size = np.bincount(part, minlength=len(side))
+    largest = [int(np.where(side == s, size, -1).argmax()) for s in (0, 1)]
+    out = side.copy()
+    for a, b in {*zip(part[one].tolist(), part[other].tolist(), strict=True)}:
+        for small, main in ((a, b), (b, a)):
+            if main in largest and small not in largest and side[small] >= 0:
+                out[small] = side[main]
+    return out
 
 
 def _find_nearest(columns: Array, known: Array, shape: tuple[int, ...], number: Array) -> Array:

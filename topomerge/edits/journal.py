@@ -97,7 +97,7 @@ MAP_OPS: dict[str, dict[str, tuple[Check, str]]] = {
     "join_rooms": {"at": PLACES},
     "add_door": {"at": PLACE, "width?": WIDTH, "open?": STATE, "between?": TWO_PLACES},
     "delete_door": {"at": PLACE},
-    "move_door": {"at": PLACE, "to": PLACE},
+    "move_door": {"at": PLACE, "to": PLACE, "between?": TWO_PLACES},
     "set_door": {"at": PLACE, "width?": WIDTH, "open?": STATE},
     "move_opening": {"at": PLACE, "to": PLACE},
     "set_opening": {"at": PLACE, "width?": WIDTH, "sill?": HEIGHT, "head?": HEIGHT},

@@ -7,6 +7,7 @@ the scan, the preset or the code has changed. The measures are in `topomerge/met
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -19,12 +20,13 @@ import numpy as np
 
 from topomerge.code_digest import compute_code_digest
 from topomerge.datasets.core.builder import limit_threads
+from topomerge.datasets.pairs.edited_truth import TRUTH_SUFFIX
 from topomerge.datasets.simulation.floor_truth import evaluate_map, predict_columns
 from topomerge.errors import InputError
 from topomerge.evaluation.cases import GROUPS, SELECTIONS, select_cases
 from topomerge.evaluation.documents import compute_mean, write_mean, write_table
-from topomerge.evaluation.scans import Case, Scan, load_scan
-from topomerge.evaluation.tasks import Row, TaskSettings, find_optional_data, measure_missing
+from topomerge.evaluation.scans import EDITED_SOURCE, Case, Scan, load_scan
+from topomerge.evaluation.tasks import Row, TaskSettings, find_optional_data, limit_cases, measure_missing
 from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS
 from topomerge.types import LogFn
@@ -59,11 +61,13 @@ class Settings(TaskSettings):
         presets: of the extraction.
         pictures: draw each case into ``<folder>/pictures``.
         fresh: make the scans again: the simulator has changed.
+        path: a folder of `topomerge dataset from-edits`, whose maps are measured in place of a set.
     """
 
     presets: str = "default"
     pictures: bool = False
     fresh: bool = False
+    path: str = ""
 
 
 def list_cases(settings: Settings) -> list[Case]:
@@ -72,11 +76,23 @@ def list_cases(settings: Settings) -> list[Case]:
     Raises:
         InputError: there is no such set.
     """
+    if settings.path:
+        return _list_edited_cases(settings)
     names = (settings.data.set or "dev").split(",")
     known = [*GROUPS, *SELECTIONS, "all"]
     if unknown := set(names) - set(known):
         raise InputError(f"data.set={','.join(sorted(unknown))}: {', '.join(known)} are possible")
     return [case for case in select_cases(names, settings.data.limit or None) if settings.data.only in case.name]
+
+
+def _list_edited_cases(settings: Settings) -> list[Case]:
+    """The corrected maps of a folder."""
+    files = sorted(Path(settings.path).glob(f"*{TRUTH_SUFFIX}"))
+    if settings.data.set or not files:
+        reason = "is for corrected maps; leave data out" if settings.data.set else f"holds no *{TRUTH_SUFFIX}"
+        raise InputError(f"path={settings.path}: {reason} (topomerge dataset from-edits makes such a folder)")
+    cases = [Case("corrected maps", EDITED_SOURCE, str(file), seed=zlib.crc32(file.read_bytes())) for file in files]
+    return limit_cases(cases, settings)
 
 
 def list_inputs(settings: Settings) -> list[str]:

@@ -35,6 +35,7 @@ from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.types import Array, PointCloud, TopometricMap, TrueRoom, VoxelGrid
 
 SCAN_FORMAT = 3  # raise it when the same case gives other bytes
+EDITED_SOURCE = "edited"
 COMMON = 0.6  # share of the rooms that the two sessions of a pair have in common
 ADRIFT = 1.5  # degrees about every 15 m: three times a hand-held camera's
 IPA, IPA_CELL = "grids_ipa_room_segmentation", 0.05
@@ -49,7 +50,8 @@ class Case:
 
     Args:
         set: the row of the tables that it belongs to.
-        source: procedural; r2v, campus, mall, rmf, ipa-plan (plans that are erected and scanned); ifc (models, scanned); ipa, gdc
+        source: edited (a file of `datasets.pairs.edited_truth`; its digest is the seed);
+            procedural; r2v, campus, mall, rmf, ipa-plan (plans that are erected and scanned); ifc (models, scanned); ipa, gdc
             (grids, raised); home (vacuum robots' maps); file (anything that can be read; nothing is true about it).
         building: kind of procedural building, or name of the plan, model, grid or file.
         seed: of the building and of the walk.
@@ -106,7 +108,7 @@ class Scan:
 
 def load_scan(case: Case, folder: Path, data: Path | None) -> Scan:
     """Load the scan of a case, from the cache where it has it."""
-    path = folder / f"{case.key}.npz"
+    path = folder / f"{case.key}.npz" if case.source != EDITED_SOURCE else Path(case.building)
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
         made = make_scan(case, data)
