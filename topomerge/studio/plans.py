@@ -49,7 +49,7 @@ class DrawnPlan:
         sheet: the paper.
         cells: of each storey.
         walked: (m,) int32 storey of each navigable cell: while these stay, so do `cells`.
-        walls: outlines of the walls of each storey.
+        walls: outlines of the walls of each storey; None of those that were not traced.
         rooms: (nx, ny) int32 room of each pixel, -1 none, of each storey.
         colours: (R,) int64 numbers in `PALETTE`.
         outlines: of its rooms.
@@ -58,18 +58,21 @@ class DrawnPlan:
     sheet: Sheet
     cells: list[StoreyCells]
     walked: Array
-    walls: tuple[str, ...]
+    walls: tuple[str | None, ...]
     rooms: tuple[Array, ...]
     colours: Array
     outlines: Outlines
 
 
-def build_plan_data(map: TopometricMap, before: DrawnPlan | None = None) -> tuple[dict[str, Any], DrawnPlan]:
+def build_plan_data(
+    map: TopometricMap, before: DrawnPlan | None = None, most: int | None = None
+) -> tuple[dict[str, Any], DrawnPlan]:
     """Build the plans of all storeys, as plain values.
 
     Args:
         map: any map.
         before: how it was drawn before it was corrected; None: on new paper.
+        most: storeys from the lowest on that are traced; of the others there are no outlines. None: all.
 
     Returns:
         `back` (a, b, c, d, e, f: paper to m, as `Sheet.back`), `size` (cm), `turn` (rad), `low` and `high` (m), `rooms` (their
@@ -82,18 +85,21 @@ def build_plan_data(map: TopometricMap, before: DrawnPlan | None = None) -> tupl
     cells = before.cells if before is not None and stays else locate_storey_cells(map, frame)
     plans = [paint_rooms(map, one) for one in cells]
     sheet = build_sheet(plans, frame) if before is None else before.sheet
-    walls = before.walls if before is not None and stays else tuple(trace_walls(plan, sheet) for plan in plans)
     rasters = tuple(plan.room for plan in plans)
     colours = assign_colours(len(map.rooms), _find_neighbours(map, rasters, sheet.frame.size), _find_old_colours(rasters, before))
     about, known = _describe_rooms(map, PALETTE[colours].reshape(-1, 3)), before.outlines if before is not None else {}
     kept: Outlines = {}
-    storeys = []
+    storeys, walls = [], []
     for s, plan in enumerate(plans):
-        outlines = _trace_storey(plan, sheet, known, kept)
-        rooms = [{**about[i], "d": o.d, "x": o.x, "y": o.y, "clear": o.clear} for i, o in outlines.items()]
-        storeys.append(
-            {"rooms": rooms, "walls": walls[s], "seen": trace_observed_floor(plan, sheet), **_list_parts(map, sheet, s)}
-        )
+        wall = before.walls[s] if before is not None and stays else None
+        rooms: list[dict[str, Any]] = []
+        if most is None or s < most:
+            wall = trace_walls(plan, sheet) if wall is None else wall
+            outlines = _trace_storey(plan, sheet, known, kept)
+            rooms = [{**about[i], "d": o.d, "x": o.x, "y": o.y, "clear": o.clear} for i, o in outlines.items()]
+        walls.append(wall)
+        outside = {"walls": wall or "", "seen": trace_observed_floor(plan, sheet) if rooms else ""}
+        storeys.append({"rooms": rooms, **outside, **_list_parts(map, sheet, s)})
     low, high = map.grid.bounds if len(map.grid) else (np.zeros(3), np.zeros(3))
     listing = {
         "back": [round(v, 9) for v in sheet.back],
@@ -104,7 +110,7 @@ def build_plan_data(map: TopometricMap, before: DrawnPlan | None = None) -> tupl
         "rooms": len(map.rooms),
         "storeys": storeys,
     }
-    return listing, DrawnPlan(sheet, cells, walked, walls, rasters, colours, kept)
+    return listing, DrawnPlan(sheet, cells, walked, tuple(walls), rasters, colours, kept)
 
 
 def _trace_storey(

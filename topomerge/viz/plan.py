@@ -53,10 +53,9 @@ class StoreyPlan:
 
 def compute_frame(map: TopometricMap) -> Frame:
     """Compute pixels over all cells of the map, as many cells each as it takes to stay below `MAX_PIXELS`."""
-    cells = np.concatenate([map.grid.cells, map.navigable.cells])[:, :2]
-    if not len(cells):
-        cells = np.zeros((1, 2), np.int32)
-    first, last = cells.min(axis=0), cells.max(axis=0)
+    grids = [grid.cells for grid in (map.grid, map.navigable) if len(grid)] or [np.zeros((1, 3), np.int32)]
+    first = np.array([min(int(cells[:, k].min()) for cells in grids) for k in (0, 1)])
+    last = np.array([max(int(cells[:, k].max()) for cells in grids) for k in (0, 1)])
     step = int(np.ceil((last - first + 1).max() / MAX_PIXELS))
     nx, ny = ((last - first) // step + 1).tolist()
     return Frame(map.grid.origin[:2] + first * map.grid.edge, step * map.grid.edge, (nx, ny), first, step)
