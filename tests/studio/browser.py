@@ -14,7 +14,12 @@ import pytest
 
 from tests.viz.chromium import browser
 
-FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+FLAGS = (
+    "--no-sandbox",
+    "--disable-gpu",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+)  # as on machines without a card
 WAIT = 60_000  # ms, for a machine that does much else
 STOREY = """() => {
   const { rooms, doors, windows, landmarks } = studio.canvas.data;

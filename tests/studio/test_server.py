@@ -342,3 +342,12 @@ def test_only_what_lies_in_the_folder_can_be_worked_on(client: TestClient) -> No
         for kind in ("extract", "merge", "compare", "explode"):
             assert client.post("/api/jobs", json={"kind": kind, "paths": paths}, headers=ORIGIN).status_code == 400
     assert client.get("/api/folder").json()["jobs"] == []
+
+
+def test_the_lowest_storey_of_a_map_is_drawn_first(client: TestClient) -> None:
+    quick = client.get("/api/plan/house.tmap?quick").json()
+    whole = client.get("/api/plan/house.tmap").json()
+    assert not quick["whole"] and whole["whole"] and quick["storeys"][0] == whole["storeys"][0]
+    assert quick["storeys"][1]["rooms"] == [] and len(whole["storeys"][1]["rooms"]) == 5
+    assert quick["storeys"][1]["doors"] == whole["storeys"][1]["doors"]
+    assert client.get("/api/plan/house.tmap?quick").json() == whole, "what is open is whole"

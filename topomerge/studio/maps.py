@@ -50,6 +50,7 @@ class OpenMap:
         refused: edits that do not fit the map, each with the reason.
         drawn: how it is drawn.
         plan: what the page draws, as JSON.
+        whole: are all storeys in the plan, or only the lowest one?
     """
 
     path: Path
@@ -60,6 +61,7 @@ class OpenMap:
     refused: tuple[RefusedEdit, ...] = ()
     drawn: DrawnPlan | None = None
     plan: bytes = b""
+    whole: bool = True
 
     @property
     def version(self) -> int:
@@ -79,8 +81,12 @@ class OpenMaps:
         self._locks: dict[Path, threading.Lock] = {}
         self._lock = threading.Lock()
 
-    def load(self, path: Path) -> OpenMap:
+    def load(self, path: Path, quick: bool = False) -> OpenMap:
         """Load a map as it is now, with the journal as it is now.
+
+        Args:
+            path: of the map.
+            quick: draw the lowest storey only, if the map was not open before: of a large map it is seen soon.
 
         Raises:
             InputError: the map or its journal can't be read.
@@ -93,8 +99,9 @@ class OpenMaps:
             held = self._open.get(path)
             if held is None or held.stamp != stamp:
                 base = load_map_with_landmarks(path)
-                held = _apply(OpenMap(path, stamp, base, base, replace(journal, edits=())), journal)
-            elif held.journal.edits != journal.edits:
+                held = _apply(OpenMap(path, stamp, base, base, replace(journal, edits=()), whole=not quick), journal)
+            elif held.journal.edits != journal.edits or not (held.whole or quick):
+                held.whole = True
                 held = _apply(held, journal)
             with self._lock:
                 self._open[path] = held
@@ -176,7 +183,9 @@ def _apply(held: OpenMap, journal: Journal, after: EditedMap | None = None) -> O
     elif after is None:
         after = apply_edits(held.map, added)
     corrected = replace(held, map=after.map, journal=journal, refused=(*before, *after.refused))
-    listing, corrected.drawn = build_plan_data(corrected.map, held.drawn)
+    listing, corrected.drawn = build_plan_data(corrected.map, held.drawn, None if held.whole else 1)
+    corrected.whole = held.whole or len(listing["storeys"]) == 1
+    listing["whole"] = corrected.whole
     refused = [{"id": one.edit.id, "op": one.edit.op, "reason": one.reason} for one in corrected.refused]
     listing |= {"version": journal.version, "unapplied": refused, "journal": _list_journal(journal)}
     listing |= {"title": corrected.map.title, "warnings": [*corrected.map.warnings, *journal.warnings]}

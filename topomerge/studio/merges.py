@@ -58,8 +58,19 @@ def describe_merge(folder: StudioFolder, maps: OpenMaps, path: Path) -> dict[str
         folder: of the studio.
         maps: that are open.
         path: the folder of the merge.
+
+    Raises:
+        InputError: its merge.json is damaged, or a map can't be read.
     """
-    listing = read_listing(path / "merge.json")
+    try:
+        return _describe(folder, maps, path, read_listing(path / "merge.json"))
+    except InputError:
+        raise
+    except (KeyError, TypeError, AttributeError, ValueError) as error:  # whatever stands in a stranger's file
+        raise InputError(f"{path.name}/merge.json: damaged ({' '.join(str(error).split())[:80]}); merge again") from error
+
+
+def _describe(folder: StudioFolder, maps: OpenMaps, path: Path, listing: Mapping[str, Any]) -> dict[str, Any]:
     sources = find_sources(folder, path, listing)
     opened = [None if source is None else maps.load(source) for source in sources]
     transforms = listing.get("transforms") or {}
@@ -76,12 +87,8 @@ def describe_merge(folder: StudioFolder, maps: OpenMaps, path: Path) -> dict[str
         ("Probability", format_probability(float(probability)) if isinstance(probability, int | float) else "–"),
         ("Matched rooms", str(len(listing.get("matches") or []))),
         ("Maps in it", f"{len(transforms) + 1 if transforms else 0} of {len(described)}"),
-        *[(f"Turned by, {described[int(k)]['name']}", f"{t['yaw_deg']:.1f}°") for k, t in sorted(transforms.items())],
-        *[
-            (f"Residual, {described[int(k)]['name']}", f"{100 * t['rmse_m']:.1f} cm")
-            for k, t in transforms.items()
-            if t["rmse_m"]
-        ],
+        *[(f"Turn of {described[int(k)]['name']}", f"{t['yaw_deg']:.1f}°") for k, t in sorted(transforms.items())],
+        *[(f"Residual of {described[int(k)]['name']}", _format_residual(t["rmse_m"])) for k, t in sorted(transforms.items())],
     ]
     landmarks = (listing.get("evidence") or {}).get("landmarks") or {}
     return {

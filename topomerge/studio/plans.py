@@ -2,57 +2,104 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
 from topomerge.io.rooms_ply import PALETTE, WALL_BETWEEN, assign_colour_numbers
 from topomerge.structure.floors import compute_jambs
 from topomerge.types import LANDMARK_KINDS, Array, TopometricMap, classify_door_state, find_room_names
-from topomerge.viz.plan import StoreyPlan, find_label_places, format_hex_colour, rasterize_storeys
-from topomerge.viz.svg import Sheet, lay_out, trace_observed_floor, trace_rooms, trace_walls
+from topomerge.viz.plan import (
+    StoreyCells,
+    StoreyPlan,
+    compute_frame,
+    find_label_place,
+    format_hex_colour,
+    locate_storey_cells,
+    paint_rooms,
+)
+from topomerge.viz.svg import Sheet, build_sheet, fill_rooms, trace_observed_floor, trace_room, trace_walls
 
 DRAWN_KINDS = ("text", "tag", "object", "name")  # of landmarks: radio and the like are many, use and area belong to rooms
 MOST_LANDMARKS = 2000  # of a storey, the surest
 PASSED = ("door", "opening")  # kinds of edges that stand in walls
 
 
+class Outline(NamedTuple):
+    """A room on paper, cm: the `d` of its path, where its name stands, and how much space is about it."""
+
+    d: str
+    x: int
+    y: int
+    clear: int
+
+
+Outlines = dict[bytes, Outline]  # digest of the pixels of a room -> its outline
+
+
 @dataclass(frozen=True, eq=False)
 class DrawnPlan:
-    """How a map was drawn, so that what it becomes is drawn in the same place and in the same colours.
+    """How a map was drawn, so that what it becomes is drawn in the same place, in the same colours and in less time.
 
     Args:
         sheet: the paper.
+        cells: of each storey.
+        walked: (m,) int32 storey of each navigable cell: while these stay, so do `cells`.
+        walls: outlines of the walls of each storey; None of those that were not traced.
         rooms: (nx, ny) int32 room of each pixel, -1 none, of each storey.
         colours: (R,) int64 numbers in `PALETTE`.
+        outlines: of its rooms.
     """
 
     sheet: Sheet
+    cells: list[StoreyCells]
+    walked: Array
+    walls: tuple[str | None, ...]
     rooms: tuple[Array, ...]
     colours: Array
+    outlines: Outlines
 
 
-def build_plan_data(map: TopometricMap, before: DrawnPlan | None = None) -> tuple[dict[str, Any], DrawnPlan]:
+def build_plan_data(
+    map: TopometricMap, before: DrawnPlan | None = None, most: int | None = None
+) -> tuple[dict[str, Any], DrawnPlan]:
     """Build the plans of all storeys, as plain values.
 
     Args:
         map: any map.
         before: how it was drawn before it was corrected; None: on new paper.
+        most: storeys from the lowest on that are traced; of the others there are no outlines. None: all.
 
     Returns:
         `back` (a, b, c, d, e, f: paper to m, as `Sheet.back`), `size` (cm), `turn` (rad), `low` and `high` (m), `rooms` (their
         number), `storeys`, lowest first, each with `floor` (m), `rooms`, `walls`, `seen`, `doors`, `stairs`, `windows`,
         `narrows`, `landmarks`; and how it is drawn.
     """
-    if before is None:
-        sheet, plans = lay_out(map)
-    else:
-        sheet, plans = before.sheet, rasterize_storeys(map, before.sheet.frame)
+    walked = np.append(map.rooms["storey"], -1)[map.navigable_room].astype(np.int32)
+    frame = compute_frame(map) if before is None else before.sheet.frame
+    stays = before is not None and np.array_equal(walked, before.walked)
+    cells = before.cells if before is not None and stays else locate_storey_cells(map, frame)
+    plans = [paint_rooms(map, one) for one in cells]
+    sheet = build_sheet(plans, frame) if before is None else before.sheet
     rasters = tuple(plan.room for plan in plans)
     colours = assign_colours(len(map.rooms), _find_neighbours(map, rasters, sheet.frame.size), _find_old_colours(rasters, before))
-    rooms = _describe_rooms(map, PALETTE[colours].reshape(-1, 3))
+    about, known = _describe_rooms(map, PALETTE[colours].reshape(-1, 3)), before.outlines if before is not None else {}
+    kept: Outlines = {}
+    storeys, walls = [], []
+    for s, plan in enumerate(plans):
+        wall = before.walls[s] if before is not None and stays else None
+        rooms: list[dict[str, Any]] = []
+        if most is None or s < most:
+            wall = trace_walls(plan, sheet) if wall is None else wall
+            outlines = _trace_storey(plan, sheet, known, kept)
+            rooms = [{**about[i], "d": o.d, "x": o.x, "y": o.y, "clear": o.clear} for i, o in outlines.items()]
+        walls.append(wall)
+        outside = {"walls": wall or "", "seen": trace_observed_floor(plan, sheet) if rooms else ""}
+        storeys.append({"rooms": rooms, **outside, **_list_parts(map, sheet, s)})
     low, high = map.grid.bounds if len(map.grid) else (np.zeros(3), np.zeros(3))
     listing = {
         "back": [round(v, 9) for v in sheet.back],
@@ -61,33 +108,62 @@ def build_plan_data(map: TopometricMap, before: DrawnPlan | None = None) -> tupl
         "low": _round_place(low),
         "high": _round_place(high),
         "rooms": len(map.rooms),
-        "storeys": [_build_storey(map, sheet, plan, s, rooms) for s, plan in enumerate(plans)],
+        "storeys": storeys,
     }
-    return listing, DrawnPlan(sheet, rasters, colours)
+    return listing, DrawnPlan(sheet, cells, walked, tuple(walls), rasters, colours, kept)
+
+
+def _trace_storey(
+    plan: StoreyPlan, sheet: Sheet, known: Mapping[bytes, Outline], kept: dict[bytes, Outline]
+) -> dict[int, Outline]:
+    """Room -> its outline; one whose pixels are known is not traced again. All go to `kept`."""
+    room = fill_rooms(plan, sheet.frame)
+    outlines = {}
+    for i, box in enumerate(ndimage.find_objects(room + 1)):
+        if box is None:
+            continue
+        filled, own = room[box] == i, plan.room[box] == i
+        place = np.array([[side.start, side.stop] for side in box])
+        key = hashlib.blake2b(
+            place.tobytes() + np.packbits(filled).tobytes() + np.packbits(own).tobytes(), digest_size=16
+        ).digest()
+        if (outline := known.get(key)) is None:
+            name = find_label_place(own, plan.wall[box], box, sheet.frame)
+            x, y = sheet.locate((name.x, name.y))
+            outline = Outline(trace_room(filled, sheet, box), x, y, round(100 * name.clear))
+        outlines[i] = kept[key] = outline
+    return outlines
 
 
 def _find_neighbours(map: TopometricMap, rasters: Sequence[Array], size: float) -> Array:
     """(k, 2) int64 pairs of rooms, ascending, that a door or a wall's thickness parts; told by the plans, in a tenth of the time
     that all cells of the floors would take."""
-    pairs = [map.edges["rooms"].astype(np.int64)]
+    count = max(len(map.rooms), 1)
+    codes = [map.edges["rooms"].astype(np.int64) @ (count, 1)]
     for room in rasters:
         for step in range(1, round(WALL_BETWEEN / size) + 2):
             for one, other in ((room[:-step], room[step:]), (room[:, :-step], room[:, step:])):
                 met = (one != other) & (one >= 0) & (other >= 0)
-                pairs.append(np.unique(np.stack([one[met], other[met]], axis=1), axis=0))
-    unique: Array = np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0)
-    return unique
+                codes.append(one[met].astype(np.int64) * count + other[met])
+    unique = np.unique(np.concatenate(codes))
+    out: Array = np.unique(np.sort(np.stack([unique // count, unique % count], axis=1), axis=1), axis=0)
+    return out
 
 
 def _find_old_colours(rasters: Sequence[Array], before: DrawnPlan | None) -> dict[int, int]:
     """Room -> the colour that most of its floor had, those with the most floor first."""
-    if before is None:
+    if before is None or not len(before.colours):
         return {}
-    met = [np.stack([new, old])[:, (new >= 0) & (old >= 0)] for new, old in zip(rasters, before.rooms, strict=True)]
-    both, count = np.unique(np.concatenate(met, axis=1), axis=1, return_counts=True)
+    count = len(before.colours)
+    codes = []
+    for new, old in zip(rasters, before.rooms, strict=True):
+        both = (new >= 0) & (old >= 0)
+        codes.append(new[both].astype(np.int64) * count + old[both])
+    met = np.bincount(np.concatenate(codes)) if codes else np.zeros(0, np.int64)
+    ranked = np.flatnonzero(met)
     found: dict[int, int] = {}
-    for k in np.argsort(-count, kind="stable").tolist():
-        found.setdefault(int(both[0, k]), int(before.colours[both[1, k]]))
+    for code in ranked[np.argsort(-met[ranked], kind="stable")].tolist():
+        found.setdefault(code // count, int(before.colours[code % count]))
     return found
 
 
@@ -132,22 +208,14 @@ def _find_room_words(map: TopometricMap, kind: str) -> dict[int, str]:
     return {int(row["room"]): map.landmarks.values[row["value"]] for row in table if row["room"] >= 0}
 
 
-def _build_storey(map: TopometricMap, sheet: Sheet, plan: StoreyPlan, storey: int, about: list[dict[str, Any]]) -> dict[str, Any]:
-    outlines, places = trace_rooms(plan, sheet), find_label_places(plan, sheet.frame)
-    rooms = []
-    for i, d in outlines.items():
-        if i in places:
-            x, y = sheet.locate((places[i].x, places[i].y))
-            rooms.append({**about[i], "d": d, "x": x, "y": y, "clear": round(100 * places[i].clear)})
+def _list_parts(map: TopometricMap, sheet: Sheet, storey: int) -> dict[str, Any]:
+    """What a storey has beside its rooms."""
     of_storey = map.rooms["storey"] == storey if len(map.rooms) else np.zeros(0, bool)
-    edges = [k for k in range(len(map.edges)) if of_storey[map.edges["rooms"][k]].any()]
+    edges = np.flatnonzero(of_storey[map.edges["rooms"]].any(axis=1)).tolist() if len(map.edges) else []
     windows = map.windows[of_storey[map.windows["rooms"][:, 0]]] if len(map.windows) else map.windows
     narrows = [n for n in map.narrows if of_storey[map.areas["room"][n["rooms"][0]]]]
     return {
         "floor": round(float(map.storeys["floor"][storey]), 3) if len(map.storeys) else 0.0,
-        "rooms": rooms,
-        "walls": trace_walls(plan, sheet),
-        "seen": trace_observed_floor(plan, sheet),
         "doors": [_describe_door(map, sheet, k) for k in edges if map.edges["kind"][k] in PASSED],
         "stairs": [_describe_stairs(map, sheet, k, storey) for k in edges if map.edges["kind"][k] not in PASSED],
         "windows": [_describe_window(sheet, window) for window in windows],

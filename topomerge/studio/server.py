@@ -243,8 +243,8 @@ class Studio:
         return path
 
     async def send_plan(self, request: Request) -> Response:
-        """The plans of a map, corrected."""
-        held = await run_in_threadpool(self.maps.load, self._resolve_map(request))
+        """The plans of a map, corrected; with `?quick` perhaps only that of the lowest storey."""
+        held = await run_in_threadpool(self.maps.load, self._resolve_map(request), "quick" in request.query_params)
         return Response(held.plan, media_type="application/json")
 
     async def send_scene(self, request: Request) -> Response:

@@ -266,9 +266,10 @@ class TopometricMap:
         not above it."""
         if not len(self.storeys):
             return np.full(len(self.grid), -1, np.int32)
-        z = self.grid.origin[2] + (self.grid.cells[:, 2] + 0.5) * self.grid.edge
+        level = self.grid.cells[:, 2]
+        z = self.grid.origin[2] + (np.arange(int(level.max(initial=0)) + 1) + 0.5) * self.grid.edge
         by_height = np.searchsorted(self.storeys["floor"] - 2 * self.grid.edge, z) - 1
-        storey = np.clip(by_height, 0, None).astype(np.int32)
+        storey = np.clip(by_height, 0, None).astype(np.int32)[level]
         with_room = self.room >= 0
         storey[with_room] = self.rooms["storey"][self.room[with_room]]
         return storey

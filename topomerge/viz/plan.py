@@ -53,50 +53,87 @@ class StoreyPlan:
 
 def compute_frame(map: TopometricMap) -> Frame:
     """Compute pixels over all cells of the map, as many cells each as it takes to stay below `MAX_PIXELS`."""
-    cells = np.concatenate([map.grid.cells, map.navigable.cells])[:, :2]
-    if not len(cells):
-        cells = np.zeros((1, 2), np.int32)
-    first, last = cells.min(axis=0), cells.max(axis=0)
+    grids = [grid.cells for grid in (map.grid, map.navigable) if len(grid)] or [np.zeros((1, 3), np.int32)]
+    first = np.array([min(int(cells[:, k].min()) for cells in grids) for k in (0, 1)])
+    last = np.array([max(int(cells[:, k].max()) for cells in grids) for k in (0, 1)])
     step = int(np.ceil((last - first + 1).max() / MAX_PIXELS))
     nx, ny = ((last - first) // step + 1).tolist()
     return Frame(map.grid.origin[:2] + first * map.grid.edge, step * map.grid.edge, (nx, ny), first, step)
 
 
+@dataclass(frozen=True, eq=False)
+class StoreyCells:
+    """The cells that the plan of a storey shows, and where. They stay when the map is cut into rooms in another way.
+
+    Args:
+        occupied: rows of occupied cells, ascending.
+        occupied_at: their pixels, x * ny + y.
+        walked: rows of navigable cells, ascending.
+        walked_at: their pixels.
+        floor: (nx, ny) bool: something is there.
+        wall: (nx, ny) bool.
+    """
+
+    occupied: Array
+    occupied_at: Array
+    walked: Array
+    walked_at: Array
+    floor: Array
+    wall: Array
+
+
 def rasterize_storeys(map: TopometricMap, frame: Frame) -> list[StoreyPlan]:
     """Return a plan of each storey, lowest first; one plan of everything where the map has no storeys."""
+    return [paint_rooms(map, cells) for cells in locate_storey_cells(map, frame)]
+
+
+def locate_storey_cells(map: TopometricMap, frame: Frame) -> list[StoreyCells]:
+    """Find the cells of each storey, lowest first, and their pixels."""
     count = max(len(map.storeys), 1)
-    occupied = np.maximum(map.find_cell_storeys(), 0)
-    walked = np.where(map.navigable_room >= 0, map.rooms["storey"][map.navigable_room], -1) if len(map.rooms) else None
-    return [_rasterize_storey(map, frame, s, occupied == s, None if walked is None else walked == s) for s in range(count)]
+    occupied = _group_cells(map.grid.cells, np.maximum(map.find_cell_storeys(), 0), frame, count)
+    walked = [(np.zeros(0, np.int64), np.zeros(0, np.int64))] * count
+    if len(map.rooms):
+        storey = np.where(map.navigable_room >= 0, map.rooms["storey"][map.navigable_room], count)
+        walked = _group_cells(map.navigable.cells, storey, frame, count)
+    found = []
+    for s, ((rows, at), (floor_rows, floor_at)) in enumerate(zip(occupied, walked, strict=True)):
+        floor = np.zeros(frame.shape[0] * frame.shape[1], bool)
+        floor[at] = floor[floor_at] = True
+        wall = _rasterize_walls(map, frame, s, map.grid.cells[rows, 2], at)
+        found.append(StoreyCells(rows, at, floor_rows, floor_at, floor.reshape(frame.shape), wall))
+    return found
 
 
-def _rasterize_storey(map: TopometricMap, frame: Frame, storey: int, of_storey: Array, walked: Array | None) -> StoreyPlan:
-    cells, labels = map.grid.cells[of_storey], map.room[of_storey]
-    at = frame.compute_pixels(cells)
-    floor = np.zeros(frame.shape, bool)
-    floor[at[:, 0], at[:, 1]] = True
-    room = np.full(frame.shape, -1, np.int32)
+def _group_cells(cells: Array, storey: Array, frame: Frame, count: int) -> list[tuple[Array, Array]]:
+    """Rows of the cells of each storey below `count`, and their pixels."""
+    order = np.argsort(storey.astype(np.uint8 if count < 256 else np.int32), kind="stable")
+    ends = np.cumsum(np.bincount(storey, minlength=count))[:count].tolist()
+    x, y = ((cells[order, k] - frame.first[k]) // frame.step for k in (0, 1))
+    at = x.astype(np.int64) * frame.shape[1] + y
+    return [(order[a:b], at[a:b]) for a, b in zip([0, *ends], ends, strict=False)]
+
+
+def paint_rooms(map: TopometricMap, cells: StoreyCells) -> StoreyPlan:
+    """Paint the rooms of a storey."""
+    room = np.full(cells.floor.size, -1, np.int32)
+    labels = map.room[cells.occupied]
     inside = labels >= 0
-    room[at[inside, 0], at[inside, 1]] = labels[inside]
-    if walked is not None:  # where one walks is surer than what hangs over it
-        x, y = frame.compute_pixels(map.navigable.cells[walked]).T
-        room[x, y] = map.navigable_room[walked]
-        floor[x, y] = True
-    return StoreyPlan(room, floor, _rasterize_walls(map, frame, storey, cells, at))
+    room[cells.occupied_at[inside]] = labels[inside]
+    room[cells.walked_at] = map.navigable_room[cells.walked]  # where one walks is surer than what hangs over it
+    return StoreyPlan(room.reshape(cells.floor.shape), cells.floor, cells.wall)
 
 
-def _rasterize_walls(map: TopometricMap, frame: Frame, storey: int, cells: Array, at: Array) -> Array:
+def _rasterize_walls(map: TopometricMap, frame: Frame, storey: int, level: Array, at: Array) -> Array:
     """(nx, ny) bool: the cut of the storey, at heights above its floor."""
-    if not len(cells):
+    if not len(level):
         return np.zeros(frame.shape, bool)
-    lowest = map.grid.origin[2] + cells[:, 2].min() * map.grid.edge
+    lowest = map.grid.origin[2] + level.min() * map.grid.edge
     floor = float(map.storeys["floor"][storey]) if storey < len(map.storeys) else lowest
-    height = map.grid.origin[2] + (cells[:, 2] + 0.5) * map.grid.edge - floor
-    cut = at[(height >= CUT[0]) & (height < CUT[1])]
-    filled = np.zeros(frame.shape, np.int64)
-    np.add.at(filled, (cut[:, 0], cut[:, 1]), 1)
+    height = map.grid.origin[2] + (np.arange(int(level.max()) + 1) + 0.5) * map.grid.edge - floor
+    cut = at[((height >= CUT[0]) & (height < CUT[1]))[level]]
+    filled = np.bincount(cut, minlength=frame.shape[0] * frame.shape[1]).reshape(frame.shape)
     # A pixel of step x step cells shows a wall that is one cell wide.
-    return filled >= max(WALL_SHARE * (CUT[1] - CUT[0]) / map.grid.edge * frame.step, 1)
+    return np.asarray(filled >= max(WALL_SHARE * (CUT[1] - CUT[0]) / map.grid.edge * frame.step, 1))
 
 
 @dataclass(frozen=True)
@@ -110,20 +147,28 @@ class Place:
 
 def find_label_places(plan: StoreyPlan, frame: Frame) -> dict[int, Place]:
     """Room -> the point of its area with most space around it; of nearly equal ones the nearest to the middle."""
-    of_rooms = {}
-    for i, box in enumerate(ndimage.find_objects(plan.room + 1)):
-        if box is None:
-            continue
-        mask = np.pad((plan.room[box] == i) & ~plan.wall[box], 1)
-        if not mask.any():
-            mask = np.pad(plan.room[box] == i, 1)
-        space = ndimage.distance_transform_edt(mask)
-        options = np.argwhere(space >= 0.85 * space.max())
-        middle = np.argwhere(mask).mean(axis=0)
-        best = options[np.argmin(((options - middle) ** 2).sum(axis=1))]
-        x, y = frame.compute_centre(best - 1 + np.array([box[0].start, box[1].start])).tolist()
-        of_rooms[i] = Place(x, y, float(space[tuple(best)]) * frame.size)
-    return of_rooms
+    boxes = enumerate(ndimage.find_objects(plan.room + 1))
+    return {i: find_label_place(plan.room[box] == i, plan.wall[box], box, frame) for i, box in boxes if box is not None}
+
+
+def find_label_place(room: Array, wall: Array, box: tuple[slice, slice], frame: Frame) -> Place:
+    """Find the place of the name of one room.
+
+    Args:
+        room: (nx, ny) bool, its pixels in a box around it.
+        wall: (nx, ny) bool, the walls there.
+        box: where the box is.
+        frame: the pixels of the plan.
+    """
+    mask = np.pad(room & ~wall, 1)
+    if not mask.any():
+        mask = np.pad(room, 1)
+    space = ndimage.distance_transform_edt(mask)
+    options = np.argwhere(space >= 0.85 * space.max())
+    middle = np.argwhere(mask).mean(axis=0)
+    best = options[np.argmin(((options - middle) ** 2).sum(axis=1))]
+    x, y = frame.compute_centre(best - 1 + np.array([box[0].start, box[1].start])).tolist()
+    return Place(x, y, float(space[tuple(best)]) * frame.size)
 
 
 MOST_DRAWN = 2_500_000  # cells that are drawn once the view rests; of a map with more, neighbours are merged

@@ -168,13 +168,13 @@ def _fill_small_holes(mask: Array, most: float) -> Array:
 def trace_rooms(plan: StoreyPlan, sheet: Sheet) -> dict[int, str]:
     """Trace each room: room -> its outline as the `d` of an SVG path."""
     room = fill_rooms(plan, sheet.frame)
-    outlines = {}
-    for i, box in enumerate(ndimage.find_objects(room + 1)):
-        if box is not None:
-            start = np.array([s.start for s in box])
-            share = (room[box] == i).astype(np.float32)
-            outlines[i] = trace(share, sheet, start) or trace(share, sheet, start, blur=0.0)
-    return outlines
+    return {i: trace_room(room[box] == i, sheet, box) for i, box in enumerate(ndimage.find_objects(room + 1)) if box is not None}
+
+
+def trace_room(mask: Array, sheet: Sheet, box: tuple[slice, slice]) -> str:
+    """Trace one room as the `d` of an SVG path, of its pixels (nx, ny) bool in a box."""
+    share, start = mask.astype(np.float32), np.array([s.start for s in box])
+    return trace(share, sheet, start) or trace(share, sheet, start, blur=0.0)
 
 
 @lru_cache(maxsize=DRAWN_AGAIN)

@@ -68,7 +68,8 @@ export class Editor {
 
   async open() {
     try {
-      this.take(await get(`/api/plan/${encodePath(this.path)}`));
+      this.take(await get(`/api/plan/${encodePath(this.path)}?quick`));
+      if (!this.plan.whole) this.queue = get(`/api/plan/${encodePath(this.path)}`).then((plan) => this.closed || this.take(plan)); // edits wait for it
     } catch (error) {
       this.place.replaceChildren(el("p", { class: "bad note-box" }, error.message));
       return;
