@@ -143,7 +143,7 @@ def _is_in_wall(door: Array, wall: WallChange) -> bool:
     along = (ends[1] - ends[0]) / max(wall.length, 1e-9)
     apart = door["centre"][:2] - ends[0]
     place, off = float(apart @ along), abs(float(apart[0] * along[1] - apart[1] * along[0]))
-    return off < SAME_DOOR / 2 and -door["width"] < place < wall.length + door["width"]
+    return off < SAME_DOOR / 2 and -float(door["width"]) < place < wall.length + float(door["width"])
 
 
 def _decide(old: dict[str, float], new: dict[str, float], walled: float) -> tuple[str, float]:
@@ -185,9 +185,9 @@ def read_state(layers: StoreyLayers, map: MapLayer, door: Array, own: Array | No
     at = (door["centre"][:2] + u[:, None, None] * along + v[None, :, None] * normal).reshape(-1, 2)
     standing = layers.sample(map.filled, at).astype(bool).reshape(len(u), len(v))
     open_ground = layers.sample(map.free | (map.standing & ~map.filled), at).astype(bool).reshape(len(u), len(v))
-    blocked = standing.any(axis=1)
-    passed = ~blocked & (open_ground.mean(axis=1) > 0.6)
-    inner, jambs = np.abs(u) < width / 2 - 0.12, np.abs(u) > width / 2 + 0.05
+    blocked = np.asarray(standing.any(axis=1))
+    passed = np.asarray(~blocked & (open_ground.mean(axis=1) > 0.6))
+    inner, jambs = np.asarray(np.abs(u) < width / 2 - 0.12), np.asarray(np.abs(u) > width / 2 + 0.05)
     way, shut = float(passed[inner].mean()), float(blocked[inner].mean())
     told = 0.0 if own is None else (OWN_OPEN if own["open"] else -OWN_SHUT) * float(own["confidence"])
     share = way / max(way + shut, 1e-6)

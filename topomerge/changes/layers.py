@@ -146,7 +146,7 @@ class StoreyLayers:
     def sample(self, raster: Array, points: Array, outside: float = 0) -> Array:
         """Sample a raster at points (n, 2+) m in the old map's frame."""
         at = self.compute_pixels(points)
-        inside = ((at >= 0) & (at < raster.shape)).all(axis=1)
+        inside = np.asarray(((at >= 0) & (at < raster.shape)).all(axis=1))
         i, j = np.where(inside[:, None], at, 0).T
         out: Array = np.where(inside, raster[i, j], outside)
         return out
@@ -214,14 +214,14 @@ def _draw_map(
 ) -> MapLayer:
     """Look a map's plan up at places (n, 2) m in its frame; only heights that both maps looked at count."""
     cells = np.floor((places - plan.origin) / plan.edge).astype(np.int64)
-    inside = ((cells >= 0) & (cells < plan.wall.shape)).all(axis=1)
+    inside = np.asarray(((cells >= 0) & (cells < plan.wall.shape)).all(axis=1))
     i, j = np.where(inside[:, None], cells, 0).T
     mask = plan.profile.dtype.type(observed)
     bodies = max((observed & plan.bands.build_mask(*BODY_HEIGHTS)).bit_count(), 1)
     body = plan.profile & mask & plan.profile.dtype.type(plan.bands.build_mask(*BODY_HEIGHTS))
     standing = (body != 0) | plan.wall
     floor = plan.is_occupied(*FLOOR_BAND)
-    high = plan.is_occupied(*HIGH_BAND) | (plan.ceiling < HIGH_BAND[1])
+    high = plan.is_occupied(*HIGH_BAND) | (plan.ceiling < HIGH_BAND[1]) | plan.sliced  # a slice does not tell
     free = plan.inside & ~standing
     top = np.where(body != 0, (np.floor(np.log2(np.maximum(body, 1))) + 1 - plan.bands.below) * plan.bands.step, 0.0)
 
@@ -232,12 +232,12 @@ def _draw_map(
     many = np.bitwise_count(body)
     low = plan.profile & mask & plan.profile.dtype.type(plan.bands.build_mask(*LOW_BAND))
     thing, filled = standing & ((low != 0) | (many >= MANY_BANDS)), plan.wall | (many >= bodies / 2)
-    rasters = [plan.wall, standing, plan.wall & high, thing, filled, free, free & floor, _draw_rooms(map, plan)]
-    bits = [lookup(r) for r in rasters[:-1]]
-    room = lookup(rasters[-1], -1)
-    room = room.astype(np.int32)
+    named = {"wall": plan.wall, "standing": standing, "tall": plan.wall & high, "thing": thing, "filled": filled}
+    named |= {"free": free, "clear": free & floor}
+    bits = {name: lookup(raster).astype(bool) for name, raster in named.items()}
+    room = lookup(_draw_rooms(map, plan), -1).astype(np.int32)
     entered = np.append(map.rooms["entered"], 0.0)[room]
-    return MapLayer(*(b.astype(bool) for b in bits), room, entered, lookup(top), furnished, float(map.grid.edge))
+    return MapLayer(**bits, room=room, entered=entered, top=lookup(top), furnished=furnished, edge=float(map.grid.edge))
 
 
 def _draw_rooms(map: TopometricMap, plan: StoreyPlan) -> Array:
