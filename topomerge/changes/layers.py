@@ -25,6 +25,7 @@ LOW_BAND, MANY_BANDS = (0.25, 1.0), 4  # m above the floor, where furniture stan
 HIGH_BAND = (2.25, 2.5)  # m above the floor: walls reach up to there, cupboards do not
 MISFIT_REACH = 0.4  # m: walls that are farther apart are not one wall that is a little off
 MISFIT_WINDOW = 2.0  # m, standard deviation of the window over which misfit is averaged
+WALL_RUN = 0.75  # m of wall that tell which way it runs
 MISFIT_PRIOR = (0.03, 40.0)  # m, and of how many columns' weight: the misfit where few walls tell it
 MISFITS = 2.0  # times the misfit, and cells, are no change
 LEAST_SLACK, MOST_SLACK = 0.12, 0.6  # m
@@ -259,17 +260,26 @@ def estimate_slack(old: MapLayer, new: MapLayer, scale: float = 1.0) -> Array:
     """Estimate (nx, ny) m by which things may be off that have not moved: half a cell of either map, and `MISFITS` times the
     misfit of the walls around, which registration and drift have left."""
     prior, weight = MISFIT_PRIOR
-    total = np.full(old.wall.shape, weight * prior)
-    count = np.full(old.wall.shape, weight)
     window = MISFIT_WINDOW / CHANGE_CELL
     cells = 2 * np.pi * window**2  # the sum of a Gaussian window is its mean times so many pixels
-    for one, other in ((old, new), (new, old)):
-        near = one.wall & (other.to_wall < MISFIT_REACH)
-        off = np.where(near, np.maximum(other.to_wall - CHANGE_CELL, 0.0), 0.0)
-        total += cells * ndimage.gaussian_filter(off.astype(np.float64), window, truncate=2.0)
-        count += cells * ndimage.gaussian_filter(near.astype(np.float64), window, truncate=2.0)
+    misfits = []
+    for axis in (0, 1):  # walls tell how far off they are across, and nothing along
+        total, count = (np.full(old.wall.shape, v) for v in (weight * prior, weight))
+        for one, other in ((old, new), (new, old)):
+            near = one.wall & (other.to_wall < MISFIT_REACH) & _runs_along(one.wall, axis)
+            off = np.where(near, np.maximum(other.to_wall - CHANGE_CELL, 0.0), 0.0)
+            total += cells * ndimage.gaussian_filter(off.astype(np.float64), window, truncate=2.0)
+            count += cells * ndimage.gaussian_filter(near.astype(np.float64), window, truncate=2.0)
+        misfits.append(total / count)
     noise = (old.edge + scale * new.edge) / 2
-    return np.clip(noise + MISFITS * total / count, LEAST_SLACK, MOST_SLACK)
+    return np.clip(noise + MISFITS * np.maximum(*misfits), LEAST_SLACK, MOST_SLACK)
+
+
+def _runs_along(wall: Array, axis: int) -> Array:
+    """(nx, ny) bool: does the wall of a pixel run along an axis rather than across it?"""
+    long = round(WALL_RUN / CHANGE_CELL)
+    along, across = (ndimage.uniform_filter1d(wall.astype(np.float32), long, axis=k) for k in (axis, 1 - axis))
+    return np.asarray(along > across)
 
 
 def list_runs(seen: Sequence[bool] | Array) -> list[tuple[int, int]]:
