@@ -22,6 +22,7 @@ FACE_SPAN, FACE_BIN, FACE_REACH = 0.4, 0.01, 0.03  # m across a wall, in which i
 LEAST_THICK, MOST_THICK, SECOND_FACE = 0.07, 0.35, 0.25  # m between them; share of the points of the stronger one
 FLUSH = 0.15, 0.03  # share of what blocks a door that lies in the weaker face, from which on it is a wall; its softness
 LEAST_POINTS = 12  # to measure that
+MISREAD = 0.04  # share of the doors whose state a map takes for another one, however sure it is
 BLIND_LEAF = 0.85  # of what blocks a door and was seen from one side: it is a leaf
 OWN_OPEN, OWN_SHUT = 6.0, 3.0  # log odds by which a map's own door speaks for how it says that the door stands
 OWN_LEAF = 4.0  # odds of a leaf against a wall, where the map has a door that it calls shut
@@ -152,8 +153,12 @@ def _decide(old: dict[str, float], new: dict[str, float], walled: float) -> tupl
     Args:
         walled: probability that the wall of the door is new or gone: its doors are, too, then.
     """
+    before, after = (
+        {**s, **{name: (1 - MISREAD) * s[name] + MISREAD * sum(s[n] for n in STATES) / len(STATES) for name in STATES}}
+        for s in (old, new)
+    )
     prior = {pair: max(p, walled) if "none" in pair else p for pair, p in PRIOR.items()}
-    joint = {(s, t): old[s] * new[t] * (1.0 if s == t else prior[s, t]) for s in STATES for t in STATES}
+    joint = {(s, t): before[s] * after[t] * (1.0 if s == t else prior[s, t]) for s in STATES for t in STATES}
     total = sum(joint.values())
     kinds: dict[str, float] = {}
     for pair, share in joint.items():
