@@ -96,7 +96,7 @@ def _render_view(changes: Changes) -> Markup:
 
     view = render_blend_view(changes.old, changes.new, drawn, pose, bends, names=("old", "new"), overlay=overlay)
     boxes = [
-        build_element("label", build_element("input", type="checkbox", checked=True, data_layer=name), f" {name}s")
+        build_element("label", build_element("input", type="checkbox", checked=True, data_layer=name), f" {name if name == 'furniture' else name + 's'}")
         for name in ELEMENTS
         if any(c.element == name for c in changes.changes)
     ]
