@@ -22,6 +22,7 @@ FACE_SPAN, FACE_BIN, FACE_REACH = 0.4, 0.01, 0.03  # m across a wall, in which i
 LEAST_THICK, MOST_THICK, SECOND_FACE = 0.07, 0.35, 0.25  # m between them; share of the points of the stronger one
 FLUSH = 0.15, 0.03  # share of what blocks a door that lies in the weaker face, from which on it is a wall; its softness
 LEAST_POINTS = 12  # to measure that
+MISREAD = 0.04  # share of the doors whose state a map takes for another one, however sure it is
 BLIND_LEAF = 0.85  # of what blocks a door and was seen from one side: it is a leaf
 OWN_OPEN, OWN_SHUT = 6.0, 3.0  # log odds by which a map's own door speaks for how it says that the door stands
 OWN_LEAF = 4.0  # odds of a leaf against a wall, where the map has a door that it calls shut
@@ -143,7 +144,7 @@ def _is_in_wall(door: Array, wall: WallChange) -> bool:
     along = (ends[1] - ends[0]) / max(wall.length, 1e-9)
     apart = door["centre"][:2] - ends[0]
     place, off = float(apart @ along), abs(float(apart[0] * along[1] - apart[1] * along[0]))
-    return off < SAME_DOOR / 2 and -door["width"] < place < wall.length + door["width"]
+    return off < SAME_DOOR / 2 and -float(door["width"]) < place < wall.length + float(door["width"])
 
 
 def _decide(old: dict[str, float], new: dict[str, float], walled: float) -> tuple[str, float]:
@@ -152,8 +153,12 @@ def _decide(old: dict[str, float], new: dict[str, float], walled: float) -> tupl
     Args:
         walled: probability that the wall of the door is new or gone: its doors are, too, then.
     """
+    before, after = (
+        {**s, **{name: (1 - MISREAD) * s[name] + MISREAD * sum(s[n] for n in STATES) / len(STATES) for name in STATES}}
+        for s in (old, new)
+    )
     prior = {pair: max(p, walled) if "none" in pair else p for pair, p in PRIOR.items()}
-    joint = {(s, t): old[s] * new[t] * (1.0 if s == t else prior[s, t]) for s in STATES for t in STATES}
+    joint = {(s, t): before[s] * after[t] * (1.0 if s == t else prior[s, t]) for s in STATES for t in STATES}
     total = sum(joint.values())
     kinds: dict[str, float] = {}
     for pair, share in joint.items():
@@ -185,9 +190,9 @@ def read_state(layers: StoreyLayers, map: MapLayer, door: Array, own: Array | No
     at = (door["centre"][:2] + u[:, None, None] * along + v[None, :, None] * normal).reshape(-1, 2)
     standing = layers.sample(map.filled, at).astype(bool).reshape(len(u), len(v))
     open_ground = layers.sample(map.free | (map.standing & ~map.filled), at).astype(bool).reshape(len(u), len(v))
-    blocked = standing.any(axis=1)
-    passed = ~blocked & (open_ground.mean(axis=1) > 0.6)
-    inner, jambs = np.abs(u) < width / 2 - 0.12, np.abs(u) > width / 2 + 0.05
+    blocked = np.asarray(standing.any(axis=1))
+    passed = np.asarray(~blocked & (open_ground.mean(axis=1) > 0.6))
+    inner, jambs = np.asarray(np.abs(u) < width / 2 - 0.12), np.asarray(np.abs(u) > width / 2 + 0.05)
     way, shut = float(passed[inner].mean()), float(blocked[inner].mean())
     told = 0.0 if own is None else (OWN_OPEN if own["open"] else -OWN_SHUT) * float(own["confidence"])
     share = way / max(way + shut, 1e-6)

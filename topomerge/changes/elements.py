@@ -35,6 +35,7 @@ THING_ODDS = {
 }
 BESIDE_WALL = 0.12  # m beside a wall, whose noise is no furniture
 LEAF_THICKNESS = 0.3  # m: what stands thinner than that beside a door may be its leaf
+WHOLE = 0.75  # share of a wall that was seen to stand, where no door is in it
 LEAF_REACH = 0.35  # m beyond the width of its door
 NUDGED, SAME_SIZE, CARRIED = 0.6, 0.55, 8.0  # m, ratio of areas, m: furniture that was moved a little, or across its room
 
@@ -108,7 +109,8 @@ def _fills_door(wall: WallChange, centre: Array, width: float) -> bool:
     along = (wall.ends[1] - wall.ends[0]) / max(wall.length, 1e-9)
     apart = wall.ends.mean(axis=0) - centre
     off, shift = abs(float(apart[0] * along[1] - apart[1] * along[0])), abs(float(apart @ along))
-    return off < LEAF_THICKNESS and shift + wall.length / 2 < width / 2 + 2 * LEAF_REACH
+    inside = off < LEAF_THICKNESS and shift + wall.length / 2 < width / 2 + 2 * LEAF_REACH
+    return inside and wall.evidence["support"] > WHOLE  # a short wall with a door in it has a gap there
 
 
 def _widen(mask: Array, metres: float) -> Array:

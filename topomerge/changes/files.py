@@ -5,7 +5,7 @@ from __future__ import annotations
 import uuid
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -147,6 +147,7 @@ def save_bcf(changes: Changes, path: str | Path) -> None:
     )
     names = replace_forbidden(f"{changes.old.title} to {changes.new.title}")
     file = BcfXml.create_new(names, extensions)
+    assert file.project is not None
     file.project.project_id = _make_guid("project", names)
     for k, change in enumerate(changes.changes):
         words = replace_forbidden(describe_change(change))
@@ -156,7 +157,7 @@ def save_bcf(changes: Changes, path: str | Path) -> None:
             title=words, description=replace_forbidden(f"Probability {change.probability:.2f}. {told}"), creation_author=AUTHOR,
             creation_date=XmlDateTime.from_string(STAMP), guid=guid, topic_type=change.kind, topic_status=STATUS, index=k,
         )  # fmt: skip
-        handler = TopicHandler(topic_dir=Path(guid))
+        handler = TopicHandler(topic_dir=cast(Any, Path(guid)))  # of which only the name is used
         handler.markup = model.Markup(topic=topic)
         view = VisualizationInfoHandler.create_from_point_and_guids(change.place, *([change.guid] if change.guid else []))
         view.visualization_info.guid = _make_guid("view", guid)

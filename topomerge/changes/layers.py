@@ -25,6 +25,7 @@ LOW_BAND, MANY_BANDS = (0.25, 1.0), 4  # m above the floor, where furniture stan
 HIGH_BAND = (2.25, 2.5)  # m above the floor: walls reach up to there, cupboards do not
 MISFIT_REACH = 0.4  # m: walls that are farther apart are not one wall that is a little off
 MISFIT_WINDOW = 2.0  # m, standard deviation of the window over which misfit is averaged
+WALL_RUN = 0.75  # m of wall that tell which way it runs
 MISFIT_PRIOR = (0.03, 40.0)  # m, and of how many columns' weight: the misfit where few walls tell it
 MISFITS = 2.0  # times the misfit, and cells, are no change
 LEAST_SLACK, MOST_SLACK = 0.12, 0.6  # m
@@ -146,7 +147,7 @@ class StoreyLayers:
     def sample(self, raster: Array, points: Array, outside: float = 0) -> Array:
         """Sample a raster at points (n, 2+) m in the old map's frame."""
         at = self.compute_pixels(points)
-        inside = ((at >= 0) & (at < raster.shape)).all(axis=1)
+        inside = np.asarray(((at >= 0) & (at < raster.shape)).all(axis=1))
         i, j = np.where(inside[:, None], at, 0).T
         out: Array = np.where(inside, raster[i, j], outside)
         return out
@@ -214,14 +215,14 @@ def _draw_map(
 ) -> MapLayer:
     """Look a map's plan up at places (n, 2) m in its frame; only heights that both maps looked at count."""
     cells = np.floor((places - plan.origin) / plan.edge).astype(np.int64)
-    inside = ((cells >= 0) & (cells < plan.wall.shape)).all(axis=1)
+    inside = np.asarray(((cells >= 0) & (cells < plan.wall.shape)).all(axis=1))
     i, j = np.where(inside[:, None], cells, 0).T
     mask = plan.profile.dtype.type(observed)
     bodies = max((observed & plan.bands.build_mask(*BODY_HEIGHTS)).bit_count(), 1)
     body = plan.profile & mask & plan.profile.dtype.type(plan.bands.build_mask(*BODY_HEIGHTS))
     standing = (body != 0) | plan.wall
     floor = plan.is_occupied(*FLOOR_BAND)
-    high = plan.is_occupied(*HIGH_BAND) | (plan.ceiling < HIGH_BAND[1])
+    high = plan.is_occupied(*HIGH_BAND) | (plan.ceiling < HIGH_BAND[1]) | plan.sliced  # a slice does not tell
     free = plan.inside & ~standing
     top = np.where(body != 0, (np.floor(np.log2(np.maximum(body, 1))) + 1 - plan.bands.below) * plan.bands.step, 0.0)
 
@@ -232,12 +233,12 @@ def _draw_map(
     many = np.bitwise_count(body)
     low = plan.profile & mask & plan.profile.dtype.type(plan.bands.build_mask(*LOW_BAND))
     thing, filled = standing & ((low != 0) | (many >= MANY_BANDS)), plan.wall | (many >= bodies / 2)
-    rasters = [plan.wall, standing, plan.wall & high, thing, filled, free, free & floor, _draw_rooms(map, plan)]
-    bits = [lookup(r) for r in rasters[:-1]]
-    room = lookup(rasters[-1], -1)
-    room = room.astype(np.int32)
+    named = {"wall": plan.wall, "standing": standing, "tall": plan.wall & high, "thing": thing, "filled": filled}
+    named |= {"free": free, "clear": free & floor}
+    bits = {name: lookup(raster).astype(bool) for name, raster in named.items()}
+    room = lookup(_draw_rooms(map, plan), -1).astype(np.int32)
     entered = np.append(map.rooms["entered"], 0.0)[room]
-    return MapLayer(*(b.astype(bool) for b in bits), room, entered, lookup(top), furnished, float(map.grid.edge))
+    return MapLayer(**bits, room=room, entered=entered, top=lookup(top), furnished=furnished, edge=float(map.grid.edge))
 
 
 def _draw_rooms(map: TopometricMap, plan: StoreyPlan) -> Array:
@@ -259,17 +260,26 @@ def estimate_slack(old: MapLayer, new: MapLayer, scale: float = 1.0) -> Array:
     """Estimate (nx, ny) m by which things may be off that have not moved: half a cell of either map, and `MISFITS` times the
     misfit of the walls around, which registration and drift have left."""
     prior, weight = MISFIT_PRIOR
-    total = np.full(old.wall.shape, weight * prior)
-    count = np.full(old.wall.shape, weight)
     window = MISFIT_WINDOW / CHANGE_CELL
     cells = 2 * np.pi * window**2  # the sum of a Gaussian window is its mean times so many pixels
-    for one, other in ((old, new), (new, old)):
-        near = one.wall & (other.to_wall < MISFIT_REACH)
-        off = np.where(near, np.maximum(other.to_wall - CHANGE_CELL, 0.0), 0.0)
-        total += cells * ndimage.gaussian_filter(off.astype(np.float64), window, truncate=2.0)
-        count += cells * ndimage.gaussian_filter(near.astype(np.float64), window, truncate=2.0)
+    misfits = []
+    for axis in (0, 1):  # walls tell how far off they are across, and nothing along
+        total, count = (np.full(old.wall.shape, v) for v in (weight * prior, weight))
+        for one, other in ((old, new), (new, old)):
+            near = one.wall & (other.to_wall < MISFIT_REACH) & _runs_along(one.wall, axis)
+            off = np.where(near, np.maximum(other.to_wall - CHANGE_CELL, 0.0), 0.0)
+            total += cells * ndimage.gaussian_filter(off.astype(np.float64), window, truncate=2.0)
+            count += cells * ndimage.gaussian_filter(near.astype(np.float64), window, truncate=2.0)
+        misfits.append(total / count)
     noise = (old.edge + scale * new.edge) / 2
-    return np.clip(noise + MISFITS * total / count, LEAST_SLACK, MOST_SLACK)
+    return np.clip(noise + MISFITS * np.maximum(*misfits), LEAST_SLACK, MOST_SLACK)
+
+
+def _runs_along(wall: Array, axis: int) -> Array:
+    """(nx, ny) bool: does the wall of a pixel run along an axis rather than across it?"""
+    long = round(WALL_RUN / CHANGE_CELL)
+    along, across = (ndimage.uniform_filter1d(wall.astype(np.float32), long, axis=k) for k in (axis, 1 - axis))
+    return np.asarray(along > across)
 
 
 def list_runs(seen: Sequence[bool] | Array) -> list[tuple[int, int]]:

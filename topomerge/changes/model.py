@@ -379,5 +379,6 @@ def _build_change(row: ElementRow, layers: Sequence[StoreyLayers]) -> Change:
     rounded = {name: round(float(value), 4) for name, value in evidence.items()}
     extent = float(np.linalg.norm(np.diff(shape, axis=0), axis=1).max())
     kind = f"element {row.state}"
-    about = {"guid": row.element.guid, "name": f"{row.element.kind} {row.element.name}".strip()}
-    return Change(kind, storey.storeys[0], place, shape, round(extent, 3), round(row.probability, 4), rounded, **about)
+    name = f"{row.element.kind} {row.element.name}".strip()
+    change = Change(kind, storey.storeys[0], place, shape, round(extent, 3), round(row.probability, 4), rounded)
+    return replace(change, guid=row.element.guid, name=name)

@@ -139,8 +139,8 @@ exit status:
   0    done
   1    bad input or a wrong command line: one line on stderr says which file and why; no output is written
   2    no trustworthy merge: the reason is printed and stands in merge.json; of finetune: it did not help;
-       of find: nothing was found; of diff: the maps could not be aligned
-       of find: nothing was found; of locate: not here, or it can't be told
+       of find: nothing was found; of diff: the maps could not be aligned;
+       of locate: not here, or it can't be told
   130  interrupted
   141  what read the output went away (`| head`)
   143  terminated

@@ -189,7 +189,7 @@ def read_elements(path: Path) -> list[ModelElement]:
     if not np.isin(words[:, 1], list(ELEMENT_KINDS.values())).any():
         raise InputError(f"{path}: has no walls, columns, slabs or doors with a shape; export it with its geometry")
     spans = zip(words.tolist(), ends[:-1].tolist(), ends[1:].tolist(), strict=True)
-    return [ModelElement(*told, vertices[v0:v1], faces[f0:f1]) for told, (v0, f0), (v1, f1) in spans]
+    return [ModelElement(guid, kind, name, vertices[v0:v1], faces[f0:f1]) for (guid, kind, name), (v0, f0), (v1, f1) in spans]
 
 
 def write_elements() -> None:

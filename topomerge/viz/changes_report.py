@@ -29,6 +29,7 @@ TONES = {"new": "new", "opened": "new", "grown": "new", "gone": "gone", "missing
 ALTERED = "altered"  # moved, elsewhere, split, joined, shrunk
 WORDS = {"new": "new, opened or grown", "gone": "gone, shut, bricked up or missing", ALTERED: "moved, split, joined or elsewhere"}
 ELEMENTS = ("wall", "door", "room", "furniture", "element")
+PLURALS = {"furniture": "furniture"}
 DOOR_SIGN = 14  # cm, of the ring around a door that changed
 
 
@@ -96,7 +97,9 @@ def _render_view(changes: Changes) -> Markup:
 
     view = render_blend_view(changes.old, changes.new, drawn, pose, bends, names=("old", "new"), overlay=overlay)
     boxes = [
-        build_element("label", build_element("input", type="checkbox", checked=True, data_layer=name), f" {name}s")
+        build_element(
+            "label", build_element("input", type="checkbox", checked=True, data_layer=name), f" {PLURALS.get(name, f'{name}s')}"
+        )
         for name in ELEMENTS
         if any(c.element == name for c in changes.changes)
     ]

@@ -201,7 +201,7 @@ function startPlan(view) {
     const here = (places.get(event.detail.place) || []).some((one) => figures[shown].contains(one));
     if (storey >= 0 && !here) show(storey);
     if (element && element.matches(".change") && !event.detail.from.closest("svg")) { // a change is shown from near by
-      const { x, y, width, height } = element.getBBox(), wide = Math.max(6 * Math.max(width, height), home[2] / 8);
+      const { x, y, width, height } = element.getBBox(), wide = Math.min(Math.max(3 * Math.max(width, height), home[2] / 8), 0.6 * home[2]);
       box = [x + width / 2 - wide / 2, y + height / 2 - (wide * home[3]) / home[2] / 2, wide, (wide * home[3]) / home[2]];
       redraw();
     }
