@@ -20,13 +20,14 @@ def is_progress_asked() -> bool:
 
 def build_progress_teller(task: str) -> Callable[[float, str], None]:
     """Build what tells the share of a task that is done, and what is being done."""
-    last = [0.0, ""]
+    last: tuple[float, str] = (0.0, "")
 
     def tell(share: float, text: str = "") -> None:
+        nonlocal last
         now = time.monotonic()
-        if share < 1 and text == last[1] and now - float(last[0]) < EVERY:
+        if share < 1 and text == last[1] and now - last[0] < EVERY:
             return
-        last[:] = now, text
+        last = now, text
         listed = {"task": task, "share": round(min(max(float(share), 0.0), 1.0), 4), "text": text}
         sys.stderr.write(f"{PROGRESS_MARK}{json.dumps(listed)}\n")
         sys.stderr.flush()

@@ -118,6 +118,8 @@ def test_commands_read_the_corrected_map(edit: Run) -> None:
         assert run("embed", "a.tmap", "-o", "a.npy", "--descriptor", "engineered", *extra)[1].startswith(f"{count} rooms")
         run("view", "a.tmap", "-o", "a.html", "--no-open", *extra)
         assert f"{count} rooms" in Path("a.html").read_text(encoding="utf-8")
+    edit("--rename-room", "0", "Kitchen")
+    assert "Kitchen" in run("find", "--name", "kitchen", "a.tmap")[1]
     assert "numbers the rooms of a.tmap anew" in run("mark", "a.tmap", "--room", "1", "--text", "x")[2]
 
 

@@ -13,6 +13,7 @@ from topomerge.cli.console import (
     check_outputs,
     open_output_folder,
     print_line,
+    warn,
     write_all,
 )
 from topomerge.cli.inputs import load_stored_map
@@ -30,6 +31,7 @@ def run_export(args: argparse.Namespace) -> int:
     source = _find_map_file(args.input)
     path, folder = _choose_output_path(args, names, source)
     topomap = load_stored_map(source, args)
+    warn(topomap.warnings)
     topomap = filter_confident(topomap, getattr(args, "min_confidence", 0.0))
     with open_output_folder(path.parent):
         files = [file for name in names for file in prepare_outputs(topomap, name, path, folder, **options)]

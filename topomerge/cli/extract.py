@@ -159,6 +159,7 @@ def run_info(args: argparse.Namespace) -> int:
     from topomerge.io.listing import convert_map_to_json, format_json, format_map
 
     topomap = load_stored_map(args.input, args)
+    warn(topomap.warnings)
     if args.json:
         write_out(format_json(convert_map_to_json(topomap)))
     else:

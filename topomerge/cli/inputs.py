@@ -74,16 +74,20 @@ def is_map(path: str) -> bool:
 
 
 def load_stored_map(path: str | Path, args: argparse.Namespace) -> TopometricMap:
-    """Load a `.tmap` with its corrections, unless `NO_EDITS` was given, and print its warnings.
+    """Load a `.tmap` with its corrections, unless `NO_EDITS` was given.
 
     Raises:
         InputError: it can't be read.
     """
-    from topomerge.edits.apply import load_corrected_map
+    from topomerge.edits.journal import find_journal, read_journal
+    from topomerge.io.maps import load_map
 
-    topomap = load_corrected_map(path, getattr(args, "edits", None))
-    warn(topomap.warnings)
-    return topomap
+    topomap = load_map(path)
+    if getattr(args, "edits", None) == 0 or not find_journal(path).exists():
+        return topomap
+    from topomerge.edits.apply import correct_map  # here: what is not corrected needs nothing of the extraction
+
+    return correct_map(topomap, read_journal(find_journal(path)))
 
 
 def load_input_map(path: str, args: argparse.Namespace) -> TopometricMap:

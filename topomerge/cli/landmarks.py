@@ -182,10 +182,12 @@ def list_map_files(path: Path) -> list[Path]:
 
 
 def _iter_found(path: Path, given: dict[str, list[str]]) -> Iterator[dict[str, Any]]:
+    from topomerge.edits.apply import load_corrected_map
+    from topomerge.edits.journal import find_journal
     from topomerge.io.landmarks import serialise_landmarks
     from topomerge.io.maps import load_landmarks
 
-    landmarks, _ = load_landmarks(path)
+    landmarks = load_corrected_map(path).landmarks if find_journal(path).exists() else load_landmarks(path)[0]
     for kind, patterns in given.items():
         for entry in serialise_landmarks(landmarks.select(match_values(landmarks, FOUND_BY[kind], patterns))):
             yield {"map": str(path), **entry}

@@ -103,9 +103,12 @@ def require_compact_rooms(navigable: VoxelGrid, room: Array, rooms: int) -> None
     """
     inside = (room >= 0) & (room < rooms)
     low, high = np.full((rooms, 2), np.iinfo(np.int64).max), np.full((rooms, 2), -1)
-    columns = navigable.cells[inside, :2].astype(np.int64)
-    np.minimum.at(low, room[inside], columns)
-    np.maximum.at(high, room[inside], columns)
+    order = np.argsort(room[inside].astype(np.uint16), kind="stable")  # below ROOM_LIMIT
+    of, columns = room[inside][order], navigable.cells[inside, :2][order].astype(np.int64)
+    starts = np.flatnonzero(np.diff(of, prepend=-1))
+    if len(starts):
+        low[of[starts]] = np.minimum.reduceat(columns, starts, axis=0)
+        high[of[starts]] = np.maximum.reduceat(columns, starts, axis=0)
     sizes = np.where(high[:, 0] >= 0, np.prod(np.where(high >= 0, high - low + 1, 0), axis=1, dtype=np.float64), 0.0)
     if sizes.max(initial=0) > ROOM_COLUMNS or sizes.sum() > TOTAL_COLUMNS:
         raise ValueError(f"has rooms that span {sizes.sum():.2g} columns of cells, the largest {sizes.max():.2g}")

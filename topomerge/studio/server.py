@@ -220,14 +220,14 @@ class Studio:
         title = " + ".join(path.name for path in paths)
         if kind == "extract" and len(paths) == 1:
             output = self.folder.find_map_path(paths[0])
-            words = ("extract", names[0], "-o", self.folder.format_word(output))
-            return self.jobs.add(kind, title, words, self.folder.name(output))
+            extracting = ("extract", names[0], "-o", self.folder.format_word(output))
+            return self.jobs.add(kind, title, extracting, self.folder.name(output))
         if kind == "merge" and len(paths) > 1:
             return self.jobs.add(kind, title, ("merge", *names, "-o", self.folder.format_word(place)), place.name, (0, 2))
         if kind == "compare" and len(paths) == 2:
             output = self.folder.find_free(f"{paths[0].stem[:50]} to {paths[1].stem[:50]}")
-            words = ("diff", *names, "-o", self.folder.format_word(output))
-            return self.jobs.add(kind, title, words, f"{output.name}/{DIFF_PAGE}")
+            comparing = ("diff", *names, "-o", self.folder.format_word(output))
+            return self.jobs.add(kind, title, comparing, f"{output.name}/{DIFF_PAGE}")
         raise InputError(f"{kind[:40]}: of {len(paths)} files can't be done; choose others")
 
     async def cancel_job(self, request: Request) -> Response:
