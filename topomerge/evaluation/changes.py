@@ -46,7 +46,8 @@ GROUPS = {
 }  # fmt: skip
 MODELS = {"dev": (), "": ("duplex", "Office_A_20110811")}
 MODEL_SENSORS = ("tls", "lidar")
-PLANTED, PLANTED_WALLS = (0.02, 0.05, 0.10), 8  # m; of each model, so many walls of each
+PLANTED, PLANTED_WALLS = (0.02, 0.05, 0.10), 8  # m; of each model, so many walls of each at most, and
+PLANTED_SHARE = 0.4  # of those that the scan shows: what most walls share is how the scan lies, and no deviation
 LONG_WALL = 1.5  # m: shorter walls are not shifted
 MODEL_SPACING = 0.05  # m between points of a scan
 RIGHT = 0.01  # m
@@ -177,7 +178,8 @@ def score_model(case: Case) -> Row:
     asked = {r.element.guid: r for r in compare_with_model(elements, model, scan, placement).elements}
     walls = [k for k, e in enumerate(elements) if e.kind == "wall" and np.ptp(e.vertices[:, :2], axis=0).max() > LONG_WALL]
     shown = [k for k in walls if asked[elements[k].guid].state in ("seen", "elsewhere")]
-    drawn = rng.permutation(shown)[: PLANTED_WALLS * len(PLANTED)].tolist()
+    most = min(PLANTED_WALLS * len(PLANTED), max(round(PLANTED_SHARE * len(shown)), 1))
+    drawn = rng.permutation(shown)[:most].tolist()
     planted = {k: (PLANTED[n % len(PLANTED)] * float(rng.choice([-1, 1]))) for n, k in enumerate(drawn)}
     moved = [shift_element(e, asked[e.guid].normal * planted[k]) if k in planted else e for k, e in enumerate(elements)]
     began = process_time()
