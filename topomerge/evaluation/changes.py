@@ -46,7 +46,8 @@ GROUPS = {
 }  # fmt: skip
 MODELS = {"dev": (), "": ("duplex", "Office_A_20110811")}
 MODEL_SENSORS = ("tls", "lidar")
-PLANTED, PLANTED_WALLS = (0.02, 0.05, 0.10), 8  # m; of each model, so many walls of each
+PLANTED, PLANTED_WALLS = (0.02, 0.05, 0.10), 8  # m; of each model, so many walls of each at most, and
+PLANTED_SHARE = 0.4  # of those that the scan shows: what most walls share is how the scan lies, and no deviation
 LONG_WALL = 1.5  # m: shorter walls are not shifted
 MODEL_SPACING = 0.05  # m between points of a scan
 RIGHT = 0.01  # m
@@ -116,14 +117,14 @@ def score_pair(case: Case) -> Row:
         return row
     changes = compare_maps(maps[0], maps[1], placement)
     row |= {"align_s": aligned - began, "compare_s": process_time() - aligned, "m2": sum(changes.compared.values())}
-    told = [*iterate_told(changes, pair)]
+    told = list_told(changes, pair)
     row["groups"] = {name: score_kinds(told, pair.changes, kinds) for name, kinds in GROUPS.items()}
     elements = [c.element for c in changes.changes]
     row["alarms"] = {e: elements.count(e) for e in ("wall", "door", "room", "furniture")}
     return row
 
 
-def iterate_told(changes: Changes, pair: ChangedPair) -> list[tuple[str, Array]]:
+def list_told(changes: Changes, pair: ChangedPair) -> list[tuple[str, Array]]:
     """List kind and place (2,) m, in the building's coordinates, of what is said to have changed; what moved is gone and new."""
     back = pair.frames[0].inverse()
 
@@ -174,18 +175,20 @@ def score_model(case: Case) -> Row:
     if placement is None:  # the deviations are measured all the same
         placement, row["reason"] = Placement(truth), reason
     elements = read_elements(path)
+    asked = {r.element.guid: r for r in compare_with_model(elements, model, scan, placement).elements}
     walls = [k for k, e in enumerate(elements) if e.kind == "wall" and np.ptp(e.vertices[:, :2], axis=0).max() > LONG_WALL]
-    asked = compare_with_model(elements, model, scan, placement).elements  # which of them the scan shows, where it shows them
-    shown = [k for k in walls if asked[k].state in ("seen", "elsewhere")]
-    drawn = rng.permutation(shown)[: PLANTED_WALLS * len(PLANTED)].tolist()
+    shown = [k for k in walls if asked[elements[k].guid].state in ("seen", "elsewhere")]
+    most = min(PLANTED_WALLS * len(PLANTED), max(round(PLANTED_SHARE * len(shown)), 1))
+    drawn = rng.permutation(shown)[:most].tolist()
     planted = {k: (PLANTED[n % len(PLANTED)] * float(rng.choice([-1, 1]))) for n, k in enumerate(drawn)}
-    moved = [shift_element(e, asked[k].normal * planted[k]) if k in planted else e for k, e in enumerate(elements)]
+    moved = [shift_element(e, asked[e.guid].normal * planted[k]) if k in planted else e for k, e in enumerate(elements)]
     began = process_time()
-    rows = compare_with_model(moved, model, scan, placement).elements
-    found = [(by, -rows[k].shift, rows[k].state) for k, by in planted.items()]  # the wall is shifted, so the scan is behind it
-    others = [rows[k].state for k in shown if k not in planted]
+    rows = {r.element.guid: r for r in compare_with_model(moved, model, scan, placement).elements}
+    told = [(by, rows[elements[k].guid]) for k, by in planted.items()]
+    found = [(by, -r.shift, r.state) for by, r in told]  # it is the model's wall that is shifted: the scan's is behind it
+    others = [rows[elements[k].guid].state for k in shown if k not in planted]
     row |= {"compare_s": process_time() - began, "found": found, "others": others}
-    return row | {"states": [r.state for r in asked], "sigma": float(np.nanmedian([r.sigma for r in rows]))}
+    return row | {"states": [r.state for r in asked.values()], "sigma": float(np.nanmedian([r.sigma for r in rows.values()]))}
 
 
 def shift_element(element: ModelElement, by: Array) -> ModelElement:
