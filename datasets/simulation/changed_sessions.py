@@ -93,7 +93,8 @@ def make_changed_pair(
     rng = np.random.default_rng([seed, BUILDING_KINDS.index(kind), 53])
     base = make_base_building(kind, seed, rng)
     visited = [i for i, r in enumerate(base.rooms) if r.kind != "lift"][:rooms]
-    days, done = (base, base), []
+    days = base, base
+    done: list[KnownChange] = []
     if changed:
         base, other, done = _alter(base, visited, rng)
         later = simulate_session(other, Difficulty(moved=0.12, gone=0.1, doors_moved=0.3, people=0.1), rng)
