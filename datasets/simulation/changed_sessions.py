@@ -94,7 +94,7 @@ def make_changed_pair(
     base = make_base_building(kind, seed, rng)
     visited = [i for i, r in enumerate(base.rooms) if r.kind != "lift"][:rooms]
     days = base, base
-    done: list[KnownChange] = []
+    done: list[TrueChange] = []
     if changed:
         base, other, done = _alter(base, visited, rng)
         later = simulate_session(other, Difficulty(moved=0.12, gone=0.1, doors_moved=0.3, people=0.1), rng)

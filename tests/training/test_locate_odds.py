@@ -1,0 +1,48 @@
+"""The odds of where a scan was taken: a choice that features decide is learned, and "nowhere" where none fits."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from topomerge.archive import find_weights_file
+from topomerge.fusion.atlas.locate import FEATURES, JudgedPose, compute_probabilities, load_odds
+from topomerge.training.locate_odds import LocateRows, fit_choice, score_choices
+from topomerge.types import Sim3
+
+
+def draw_rows(count: int, seed: int) -> list[LocateRows]:
+    """Scans of which the right pose has a high first feature; every third one has no right pose."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for k in range(count):
+        x = rng.normal(size=(8, len(FEATURES)))
+        y = np.zeros(8, bool)
+        if k % 3:
+            y[k % 8] = True
+            x[y, 0] += 8.0
+        rows.append(LocateRows(k, x, y))
+    return rows
+
+
+def test_a_choice_is_learned_and_holds_on_other_scans() -> None:
+    weights, nowhere = fit_choice(draw_rows(90, 0))
+    assert weights[0] > 1.0 and np.abs(weights[1:]).max() < 0.3 * weights[0] and nowhere > 0
+    scores = score_choices(draw_rows(60, 1), weights, nowhere)
+    assert scores["log_loss"] < 0.5 and scores["right"] > 0.4 and scores["wrong"] <= 0.05
+
+
+def test_the_weights_that_ship_are_of_these_features() -> None:
+    held = load_odds()
+    assert held["names"] == list(FEATURES) and len(held["weight"]) == len(FEATURES) and held["nowhere"] > 0
+    assert json.loads(find_weights_file("topomerge.fusion", "locate_odds.json").read_text()) == held
+    weight = dict(zip(held["names"], held["weight"], strict=True))
+    assert weight["sharp"] > 0 and weight["agree"] > 0 and weight["conflict"] < 0 and weight["off"] < 0
+
+
+def test_probabilities_of_poses_and_of_nowhere_sum_to_one() -> None:
+    poses = [JudgedPose(0, Sim3(), np.zeros(len(FEATURES)), odds) for odds in (12.0, 12.0, -900.0)]
+    chances, nowhere = compute_probabilities(poses, 10.0)
+    assert chances.sum() + nowhere == pytest.approx(1.0) and chances[0] == chances[1] > nowhere > chances[2] == 0.0
