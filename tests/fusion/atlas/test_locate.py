@@ -115,6 +115,8 @@ def test_a_sign_tells_twins_apart() -> None:
     scan = replace(scan_part(), landmarks=build_landmarks("text", ["2.113"], "hand", at[None]))
     answer = locate(twins, scan)
     assert answer.status == "located" and answer.places[0].map == "two"
+    two = next(m for m in twins.maps if m.name == "two")
+    assert any(two.rooms) and answer.places[0].room_name == two.rooms[answer.places[0].room]
 
 
 def test_landmarks_name_the_maps_that_hold_the_same_rare_strings() -> None:

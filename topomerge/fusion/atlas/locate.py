@@ -473,7 +473,8 @@ def _build_place(index: PlaceIndex, judged: JudgedPose, query: Query, probabilit
     covariance = measure_covariance(query, judged.pose)
     x, y, z = at.round(3).tolist()
     rounded = tuple(tuple(float(f"{v:.3g}") for v in row) for row in covariance.tolist())
-    return Place(own.name, own.building, storey.number, room, judged.pose, (x, y, z), rounded, probability)
+    name = own.rooms[room] if 0 <= room < len(own.rooms) else ""
+    return Place(own.name, own.building, storey.number, room, judged.pose, (x, y, z), rounded, probability, name)
 
 
 def measure_covariance(query: Query, pose: Sim3) -> Array:

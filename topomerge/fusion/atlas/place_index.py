@@ -27,7 +27,7 @@ from topomerge.io.maps import load_landmarks, load_map
 from topomerge.landmarks.map_search import LandmarkIndex, build_landmark_index
 from topomerge.matching.poses import PlanFields
 from topomerge.registration.storeys import build_plans
-from topomerge.types import Array, Sim3, TopometricMap
+from topomerge.types import Array, Sim3, TopometricMap, find_room_names
 
 INDEX_FOLDER, INDEX_VERSION, KIND = "locate", 1, "file of an index of places"
 ADVICE = "delete the folder `locate` of the atlas, it is made again"
@@ -79,12 +79,14 @@ class IndexedMap:
         building: number of the component of the atlas in which it lies.
         pose: of the map in the frame of that.
         load: gives the map.
+        rooms: names of its rooms by its landmarks; none where it has no landmarks.
     """
 
     name: str
     building: int
     pose: Sim3
     load: Callable[[], TopometricMap]
+    rooms: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +100,7 @@ class PlaceIndex:
     @classmethod
     def from_maps(cls, maps: Mapping[str, TopometricMap]) -> PlaceIndex:
         """Build an index of maps in memory; each is a building of its own."""
-        listed = [IndexedMap(name, k, Sim3(), partial(_get, map)) for k, (name, map) in enumerate(maps.items())]
+        listed = [IndexedMap(name, k, Sim3(), partial(_get, map), name_rooms(map)) for k, (name, map) in enumerate(maps.items())]
         memory = _Plans()
         storeys = [s for k, map in enumerate(maps.values()) for s in _parse_storeys(k, build_arrays(map), memory, None)]
         return cls(tuple(listed), tuple(storeys), build_landmark_index(list(maps.values())))
@@ -133,12 +135,18 @@ def open_index(folder: str | Path) -> PlaceIndex:
     for k, entry in enumerate(stored.entries):
         source, path = stored.folder / entry.file, stored.folder / INDEX_FOLDER / f"{entry.key}.npz"
         building, pose = poses.get(entry.name, (-1 - k, Sim3()))
-        maps.append(IndexedMap(entry.name, building, pose, partial(load_map, source)))
+        witness = load_map(source) if len(load_landmarks(source)[0]) else None
+        maps.append(IndexedMap(entry.name, building, pose, partial(load_map, source), name_rooms(witness)))
         arrays = None if path.exists() else _write_arrays(load_map(source), path)
         storeys += _parse_storeys(k, arrays, memory, path)
-        witnesses.append(load_map(source) if len(load_landmarks(source)[0]) else None)
+        witnesses.append(witness)
     _remove_stale({e.key for e in stored.entries}, stored.folder / INDEX_FOLDER)
     return PlaceIndex(tuple(maps), tuple(storeys), build_landmark_index(witnesses))
+
+
+def name_rooms(map: TopometricMap | None) -> tuple[str, ...]:
+    """Name the rooms of a map by its landmarks: "" where none does."""
+    return () if map is None or not len(map.landmarks) else tuple(find_room_names(map.landmarks, len(map.rooms)))
 
 
 def _get(map: TopometricMap) -> TopometricMap:
