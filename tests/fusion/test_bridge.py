@@ -67,6 +67,7 @@ def read_subscriptions(link: Any, count: int) -> list[dict[str, Any]]:
     return [json.loads(link.recv(timeout=20)) for _ in range(count)]
 
 
+@pytest.mark.longer
 def test_two_robots_are_joined_over_rosbridge_and_hear_of_it(tmp_path: Path) -> None:
     heard: list[dict[str, Any]] = []
 
@@ -121,6 +122,7 @@ def test_a_start_after_a_stop_goes_on(tmp_path: Path) -> None:
     assert set(again.merger.take_changed()) == {"a", "b"}
 
 
+@pytest.mark.longer
 def test_a_join_is_taken_back_when_evidence_turns(tmp_path: Path) -> None:
     merger = LiveMerger(tmp_path)
     for name, k in PARTS.items():

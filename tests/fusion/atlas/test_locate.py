@@ -19,6 +19,7 @@ from topomerge import archive
 from topomerge.cli.main import main as cli
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
+from topomerge.extraction.landmarks import add_landmarks
 from topomerge.fusion.atlas.folder import Entry, StoredAtlas, read_atlas
 from topomerge.fusion.atlas.locate import LOCATE, Location, Query, find_places, locate, prepare_query
 from topomerge.fusion.atlas.place_index import INDEX_FOLDER, PlaceIndex, open_index
@@ -108,7 +109,7 @@ def test_a_map_is_found_as_its_scan_is() -> None:
 
 def test_a_sign_tells_twins_apart() -> None:
     def with_sign(map: TopometricMap, text: str, at: Array) -> TopometricMap:
-        return replace(map, landmarks=build_landmarks("text", [text], "hand", at[None]))
+        return add_landmarks(map, build_landmarks("text", [text], "hand", at[None]))
 
     at = np.array([0.1, 2.0, 1.5])
     twins = PlaceIndex.from_maps({"one": with_sign(whole(), "4.711", at), "two": with_sign(whole(), "2.113", at)})
