@@ -193,6 +193,7 @@ def test_json_has_the_schema(merged, refused):
         "transforms",
         "bend",
         "matches",
+        "decided",
         "seconds",
         "points",
         "alternatives",

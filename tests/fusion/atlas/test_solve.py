@@ -11,10 +11,10 @@ import topomerge as tm
 from tests.fusion.atlas.atlas_scenes import FRAMES, NAMES, REGISTRATIONS, office_map, stranger, truth
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.maps import LOADED_AT_ONCE, Maps, hash_map
-from topomerge.fusion.atlas.partners import COARSE_PARTNERS, compute_coarse_log_odds, find_partners
+from topomerge.fusion.atlas.partners import COARSE_PARTNERS, _list_named_maps, compute_coarse_log_odds, find_partners
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.matching.poses import PoseHypothesis, pose_difference
-from topomerge.types import Sim3, TopometricMap
+from topomerge.types import Sim3, TopometricMap, build_landmarks
 
 SHIFTED = Sim3(0.0, (4.5, 0.0, 0.0))  # by a room
 
@@ -168,6 +168,9 @@ class Looks:
     def get_area(self, k: int) -> float:
         return 100.0 + 1e-6 * k
 
+    def has_landmarks(self, k: int) -> bool:
+        return False
+
     def coarse_log_odds(self, i: int, j: int, scale: str) -> float:
         """Of maps that are 40 apart in their numbers 3; of others the less, the farther they are apart."""
         assert scale == "fixed" and (i, j) not in self.laid and i < j
@@ -200,6 +203,18 @@ def test_all_of_few_maps_are_partners(looks: Looks):
     assert complete and all(few[k] == sorted((m for m in range(11) if m != k), key=lambda m: abs(m - k)) for k in range(11))
     alone, (first, second) = find_partners(Looks(looks.all[:1])), find_partners(Looks(looks.all[:2]))[0]
     assert alone == ([[]], True) and (first, second) == ([1], [0])
+
+
+def test_maps_with_the_same_rare_sign_are_partners_however_they_lie(looks: Looks, monkeypatch: pytest.MonkeyPatch) -> None:
+    signs = {7: "2.113", 23: "2.113", 30: "4.711"}
+    place = office_map(0)
+    maps = {k: replace(place, landmarks=build_landmarks("text", [v], "hand", np.zeros((1, 3)))) for k, v in signs.items()}
+    monkeypatch.setattr(Looks, "has_landmarks", lambda self, k: k in signs)
+    monkeypatch.setattr(Looks, "__getitem__", lambda self, k: maps[k], raising=False)
+    named = _list_named_maps(looks)
+    assert named[7] == [23] and named[23] == [7] and not any(named[k] for k in range(len(looks)) if k not in (7, 23))
+    partners, _ = find_partners(looks)
+    assert 23 in partners[7] or 7 in partners[23]
 
 
 def test_without_time_the_maps_that_look_alike_are_partners(looks: Looks):

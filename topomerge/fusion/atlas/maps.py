@@ -216,6 +216,10 @@ class Maps:
         """Is a storey a slice, which has no planes?"""
         return self.answer(("sliced",), (k,), lambda: any(v.plan.sliced for v in self.get_prepared(k).storeys))
 
+    def has_landmarks(self, k: int) -> bool:
+        """Does it hold landmarks that testify?"""
+        return self.answer(("landmarks",), (k,), lambda: self.get_prepared(k).has_landmarks)
+
     def get_rows(self, k: int) -> Rows:
         """Return descriptors of the rooms."""
         return self.memory.answer(("rows", self.embedder, self.keys[k]), lambda: embed_rooms(self._describe, self[k]))

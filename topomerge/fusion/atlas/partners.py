@@ -289,7 +289,7 @@ def _list_similar_maps(maps: Maps) -> list[list[int]]:
 
 def _list_named_maps(maps: Maps) -> list[list[int]]:
     """For each map those that its landmarks speak of most; none where all maps are registered with each other anyway."""
-    heard = [k for k in range(len(maps)) if len(maps) > FEW_MAPS and maps.get_prepared(k).has_landmarks]
+    heard = [k for k in range(len(maps)) if len(maps) > FEW_MAPS and maps.has_landmarks(k)]
     out: list[list[int]] = [[] for _ in range(len(maps))]
     if len(heard) > 1:
         index = build_landmark_index(maps[k] for k in heard)

@@ -4,7 +4,7 @@ function startDiff(view) {
   const slider = view.querySelector("input[data-swipe]"), far = 1e7;
   const drawings = [...view.querySelectorAll("svg.plan")];
   const make = (name, parent, attributes) => {
-    const element = document.createElementNS("http://www.w3.org/2000/svg", name);
+    const element = document.createElementNS(parent.namespaceURI, name);
     for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
     return parent.appendChild(element);
   };
