@@ -126,6 +126,7 @@ def run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300, check=False, env=environment)
 
 
+@pytest.mark.longer
 def test_encoder_loss_optimizer_and_schedule_train_export_load_and_merge(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(EMBEDDER)
     (tmp_path / "configs" / "loss").mkdir(parents=True)
@@ -152,6 +153,7 @@ def test_encoder_loss_optimizer_and_schedule_train_export_load_and_merge(tmp_pat
     assert (tmp_path / "swept" / "sweep" / "table.md").read_text().count("| transformer ") == 2
 
 
+@pytest.mark.longer
 def test_a_task_of_somebody_else_trains_and_is_judged(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(TASK)
     (tmp_path / "configs" / "task").mkdir(parents=True)
@@ -170,6 +172,7 @@ def test_a_task_of_somebody_else_trains_and_is_judged(tmp_path: Path) -> None:
     assert judged.returncode == 0 and f"| error | {best:.3f} |" in judged.stdout, judged.stderr
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize(
     ("text", "words", "said"),
     [
