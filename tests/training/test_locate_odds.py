@@ -37,7 +37,7 @@ def test_a_choice_is_learned_and_holds_on_other_scans() -> None:
 def test_the_weights_that_ship_are_of_these_features() -> None:
     held = load_odds()
     assert held["names"] == list(FEATURES) and len(held["weight"]) == len(FEATURES) and held["nowhere"] > 0
-    assert json.loads(find_weights_file("topomerge.fusion", "locate_odds.json").read_text()) == held
+    assert json.loads(find_weights_file("topomerge.fusion.atlas", "locate_odds.json").read_text()) == held
     weight = dict(zip(held["names"], held["weight"], strict=True))
     assert weight["sharp"] > 0 and weight["agree"] > 0 and weight["conflict"] < 0 and weight["off"] < 0
 

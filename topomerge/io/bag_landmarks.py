@@ -105,9 +105,9 @@ class CloudSample:
 
     def _add(self, scan: PosedScan) -> None:
         points = np.asarray(scan.points, np.float64)
-        points = points[np.isfinite(points).all(axis=1) & (np.abs(points).max(axis=1, initial=0) < 1e6)]
+        points = _drop_wild(points)
         if scan.pose is not None and not scan.registered:
-            points = points @ scan.pose[:3, :3].T + scan.pose[:3, 3]
+            points = _drop_wild(points @ scan.pose[:3, :3].T + scan.pose[:3, 3])  # a damaged pose is wild, too
         self._parts.append(_thin(points))
         self._held += len(self._parts[-1])
         if len(self._parts) > 200:
@@ -118,6 +118,10 @@ class CloudSample:
         """Return (n, 3) m."""
         self._parts = [_thin(np.concatenate(self._parts))] if self._parts else [np.zeros((0, 3))]
         return self._parts[0]
+
+
+def _drop_wild(points: Array) -> Array:
+    return points[np.isfinite(points).all(axis=1) & (np.abs(points).max(axis=1, initial=0) < 1e6)]
 
 
 def _thin(points: Array) -> Array:

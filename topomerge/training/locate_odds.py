@@ -132,4 +132,4 @@ def judge(settings: LocateOdds, file: Path, log_line: LogFn) -> dict[str, Any]:
     return score_choices(rows, np.array(held["weight"]), float(held["nowhere"]))
 
 
-TASK = Task(LocateOdds, fit, ("log_loss",), judge, "topomerge.fusion", "locate_odds.json", hours=0.2, lower=("log_loss",))
+TASK = Task(LocateOdds, fit, ("log_loss",), judge, "topomerge.fusion.atlas", "locate_odds.json", hours=0.2, lower=("log_loss",))

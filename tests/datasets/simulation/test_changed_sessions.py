@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import shapely
 from topomerge.datasets.core.building import SURFACES
-from topomerge.datasets.simulation.changed_sessions import ChangedPair, make_changed_pair
+from topomerge.datasets.simulation.changed_sessions import SEEN_POINTS, ChangedPair, make_changed_pair
 
 pytestmark = pytest.mark.longer
 
@@ -25,8 +25,8 @@ def test_each_change_is_in_the_clouds(pair: ChangedPair) -> None:
         if change.seen and change.kind in ("wall new", "wall gone", "furniture new", "furniture gone"):
             points = flat[1 if change.kind.endswith("new") else 0]
             height = points[:, 2] - floor
-            inside = shapely.contains_xy(change.outline.buffer(0.1), points[:, 0], points[:, 1])
-            assert int((inside & (height > 0.25) & (height < 2.0)).sum()) >= 20
+            inside = shapely.contains_xy(change.outline.buffer(0.125), points[:, 0], points[:, 1])
+            assert int((inside & (height > 0.25) & (height < 2.0)).sum()) >= SEEN_POINTS
 
 
 def test_nothing_changes_where_nothing_shall() -> None:

@@ -375,7 +375,7 @@ def _judge(judge: Judge, storey: int, hypothesis: PoseHypothesis, scorer: Landma
 
 def load_odds() -> dict[str, Any]:
     """Load the weights of `FEATURES` and the odds of "nowhere" (`train.py task=locate_odds`)."""
-    return read_weights_json("topomerge.fusion", "locate_odds.json")
+    return read_weights_json("topomerge.fusion.atlas", "locate_odds.json")
 
 
 def compute_features(judge: Judge, hypothesis: PoseHypothesis) -> Array:
