@@ -44,23 +44,17 @@ FEET = re.compile(SIDE_IN_FEET + r"\s*[x×X*]\s*" + SIDE_IN_FEET)
 NUMBERED = re.compile(r"[A-Za-z]{0,3}[-. ]?\d{1,3}(?:[.\-]\d{1,4}){0,2}[a-z]?(?<=..)")
 NAME_SIGMA = 1.0  # m, of where a name stands in its room
 STATED_SCALE = re.compile(r"(?<![\d:.,])1\s?:\s?([1-9]\d{1,3})(?![\d:.,])")
-SURELY_READ, BESIDE_TEXT, INK = 0.5, 0.15, 48  # confidence of a text, share of its height around it, levels of 255 off the paper
 WORD = re.compile(r"[^\W\d_]{2,}")
 
 
 @dataclass(frozen=True)
 class PictureText:
-    """A text on a picture: its middle (column, row) and its height, px, and how surely it was read.
-
-    Args:
-        box: left, top, right and bottom of what was read, px; None: not known.
-    """
+    """A text on a picture: its middle (column, row) and its height, px, and how surely it was read."""
 
     text: str
     place: tuple[float, float]
     height: float
     confidence: float
-    box: tuple[float, float, float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,7 +326,6 @@ def trace_drawing(
         texts = read_texts(picture) if text is not False else ()
     stated = None if page is None else find_stated_scale(texts or ())
     known = resolution if resolution is not None or stated is None or page is None else page * stated
-    picture = erase_texts(picture, texts or ())
     drawing = parse_drawing(picture, known)
     if not drawing.free.any():
         raise InputError(f"{path}: no walls around a room were found in it; if it is a robot's grid, give --no-drawing")
@@ -396,29 +389,5 @@ def read_texts(picture: Array) -> tuple[PictureText, ...] | None:
     for corners, text, confidence in reader(resize_picture(picture, finer)):
         middle = corners.mean(axis=0) / finer
         height = float(np.hypot(*(corners[3] - corners[0]))) / finer
-        (left, top), (right, bottom) = (corners.min(axis=0) / finer).tolist(), (corners.max(axis=0) / finer).tolist()
-        box = left, top, right, bottom
-        out.append(PictureText(clean_text(text), (float(middle[0]), float(middle[1])), height, confidence, box))
+        out.append(PictureText(clean_text(text), (float(middle[0]), float(middle[1])), height, confidence))
     return tuple(out)
-
-
-def erase_texts(picture: Array, texts: Sequence[PictureText]) -> Array:
-    """Return a picture (h, w, 3) uint8 without the letters of texts that were read: large ones look like walls.
-
-    Within the box of a text, what differs from the paper and does not reach beyond the box becomes paper. Walls stay.
-    """
-    out = picture.copy()
-    for text in texts:
-        if text.box is None or text.confidence < SURELY_READ:
-            continue
-        reach = max(BESIDE_TEXT * text.height, 1.0)
-        left, top, right, bottom = text.box
-        rows = slice(max(int(top - reach), 0), int(bottom + reach) + 1)
-        columns = slice(max(int(left - reach), 0), int(right + reach) + 1)
-        part = out[rows, columns]
-        paper = np.median(part.reshape(-1, 3), axis=0)
-        label, count = ndimage.label(np.abs(part - paper).max(axis=2) > INK, np.ones((3, 3)))
-        beyond = np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]])
-        letter = np.isin(label, np.setdiff1d(np.arange(1, count + 1), beyond))
-        part[letter] = paper
-    return out
