@@ -220,6 +220,27 @@ def test_two_pages_at_one_map_lose_no_change(context: Any, folder: Path) -> None
         assert (page.room(0)["name"], page.room(1)["name"]) == ("again", "from the other")
 
 
+LATE = """() => {
+  const real = window.fetch;
+  window.fetch = async (...words) => {
+    const answer = await real(...words);
+    if (String(words[0]).includes("/api/plan/")) await new Promise((done) => setTimeout(done, 600));
+    return answer;
+  };
+}"""
+
+
+def test_a_late_answer_does_not_bring_back_what_was_before(context: Any, folder: Path) -> None:
+    """The plan that was asked for before an edit comes after that edit's own answer."""
+    one = MapPage(context, context.address, "house.tmap")
+    room = one.room(0)
+    wish = {"op": "rename_room", "at": [room["x"], room["y"]], "name": "Lab"}
+    one.page.evaluate(LATE)
+    one.page.evaluate("async (wish) => { const asked = studio.reload(); await studio.edit(wish); await asked; }", wish)
+    one.wait_version(1)
+    assert one.room(0)["name"] == "Lab" and len(lines(folder)) == 1
+
+
 def test_files_are_dropped_extracted_and_opened(context: Any, folder: Path, tmp_path: Path) -> None:
     from tests.samples import box_points, write_ply
 

@@ -103,7 +103,11 @@ export class Editor {
     if (this.reloading || this.closed) return;
     this.reloading = true;
     try {
-      const plan = await get(`/api/plan/${encodePath(this.path)}`);
+      let plan, shown;
+      do { // an edit of one's own that was answered meanwhile is newer than this answer
+        shown = this.plan;
+        plan = await get(`/api/plan/${encodePath(this.path)}`);
+      } while (!this.closed && this.plan !== shown);
       if (!this.closed && plan.version !== this.plan?.version) {
         this.take(plan);
         if (words) toast(words);
