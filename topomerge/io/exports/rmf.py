@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 
 from topomerge.archive import replace_on_success
-from topomerge.errors import InputError
-from topomerge.io.exports.ros import Route, plan_storey_route, rasterize_occupancy
+from topomerge.io.exports.ros import Route, count_storeys, plan_storey_route, rasterize_occupancy
 from topomerge.structure.floors import build_floor_polygons
 from topomerge.types import Array, TopometricMap, find_room_names
 
@@ -62,11 +61,7 @@ def prepare_files(map: TopometricMap, folder: Path, stem: str, storey: int | Non
     Raises:
         InputError: there is no such storey, or none at all.
     """
-    count = len(map.storeys)
-    if storey is not None and not 0 <= storey < count:
-        raise InputError(f"--storey {storey}: the map has no such storey (it has {count})")
-    if not count:
-        raise InputError("the map has no storeys, so that there are no lanes; extract it from a denser cloud")
+    count = count_storeys(map, storey, "there are no lanes")
     names = find_room_names(map.landmarks, len(map.rooms))
     lifts = find_lifts(map, names)
     levels, first = [], 0

@@ -369,6 +369,24 @@ LIKELY_OUTSIDE = 0.5  # probability from which a room is kept out of
 FREE_PIXEL, OCCUPIED_PIXEL, UNKNOWN_PIXEL = 254, 0, 205
 
 
+def count_storeys(map: TopometricMap, storey: int | None, lacking: str) -> int:
+    """Count the storeys of a map.
+
+    Args:
+        storey: that is wanted; None: all.
+        lacking: what a map without storeys does not give, in words.
+
+    Raises:
+        InputError: there is no such storey, or none at all.
+    """
+    count = len(map.storeys)
+    if storey is not None and not 0 <= storey < count:
+        raise InputError(f"--storey {storey}: the map has no such storey (it has {count})")
+    if not count:
+        raise InputError(f"the map has no storeys, so that {lacking}; extract it from a denser cloud")
+    return count
+
+
 def prepare_files(map: TopometricMap, folder: Path, stem: str, storey: int | None = None) -> list[tuple[Path, partial[None]]]:
     """Prepare the files of the folder: of each storey its grid, and `storey_0_keepout.pgm` and `.yaml` where floor is
     probably outside, and `storey_0_route.geojson` where there are routes.
@@ -379,11 +397,7 @@ def prepare_files(map: TopometricMap, folder: Path, stem: str, storey: int | Non
     Raises:
         InputError: there is no such storey, or none at all.
     """
-    count = len(map.storeys)
-    if storey is not None and not 0 <= storey < count:
-        raise InputError(f"--storey {storey}: the map has no such storey (it has {count})")
-    if not count:
-        raise InputError("the map has no storeys, so that there is nothing to draw for a robot; extract it from a denser cloud")
+    count = count_storeys(map, storey, "there is nothing to draw for a robot")
     outputs: list[tuple[Path, partial[None]]] = []
     first = 0
     for s in range(count):
