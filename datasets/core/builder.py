@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn, Protocol, TypeVar
 
 import numpy as np
 
@@ -23,6 +23,8 @@ from topomerge.archive import convert_to_plain, replace_on_success
 from topomerge.code_digest import compute_code_digest
 from topomerge.errors import InputError
 from topomerge.types import Array, LogFn
+
+ItemType = TypeVar("ItemType")
 
 PATIENCE = 20.0  # s to wait for the scheduler of a cluster
 OLD = 3600.0  # s; half-written files of a build that was killed are deleted when they are older
@@ -76,6 +78,19 @@ def check_sharing(sharing: BuildSettings) -> None:
         raise InputError(f"jobs must be 1 or more, not {sharing.jobs}")
     if len(sharing.part) != 2 or not 1 <= sharing.part[0] <= sharing.part[1]:
         raise InputError(f"part must be [k, n] with 1 <= k <= n, not {sharing.part}")
+
+
+def select_items(items: Sequence[ItemType], limit: int) -> list[ItemType]:
+    """Select so many of the items of a set, 0: all, at random and in their order; a larger selection holds a smaller one.
+
+    Raises:
+        InputError: a negative limit.
+    """
+    if limit < 0:
+        raise InputError(f"data.limit must be 0 or more, not {limit}")
+    if not limit or limit >= len(items):
+        return list(items)
+    return [items[k] for k in sorted(np.random.default_rng(0).permutation(len(items))[:limit].tolist())]
 
 
 def build_set(

@@ -97,7 +97,9 @@ def build_drawings(
             given = [list(select_plans(one.item, plans)) for one in (item, *before)]
             for side in "ab":
                 tasks += [(DrawingItem(item, before, side, own), given, str(folder)) for own in (True, False)]
-    report = build_set(folder.parent / f"{recipe.name}_drawings.jsonl", tasks, make_drawing, sharing, log_line, unit="drawings")
+    report = build_set(
+        folder.parent / f"{recipe.manifest}_drawings.jsonl", tasks, make_drawing, sharing, log_line, unit="drawings"
+    )
     return [path for item, _, _ in tasks if (path := folder / f"{item.name}.npz").exists()], report
 
 

@@ -14,7 +14,15 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from topomerge.datasets.core.builder import BuildReport, BuildRow, BuildSettings, build_set, check_sharing, make_item
+from topomerge.datasets.core.builder import (
+    BuildReport,
+    BuildRow,
+    BuildSettings,
+    build_set,
+    check_sharing,
+    make_item,
+    select_items,
+)
 from topomerge.datasets.pairs.evaluation_pair import convert_to_sim3
 from topomerge.datasets.pairs.example import _make_first_pair
 from topomerge.datasets.pairs.items import Item, Library, Recipe, check, draw_items, load_library, select_plans
@@ -63,6 +71,7 @@ class GridRecipe:
         sensors: weight of each; empty: `WEIGHTS`.
         drawings: of the first so many pairs of each set, drawings of what they show, and of what they do not (`grid_drawings`).
         strangers: pairs of maps of two pairs.
+        limit: only so many of all pairs (`core.builder.select_items`); 0: all.
     """
 
     name: str = "grids"
@@ -73,6 +82,12 @@ class GridRecipe:
     sensors: dict[str, float] = field(default_factory=dict)
     drawings: list[int] = field(default_factory=lambda: [92, 42, 66])
     strangers: int = 0
+    limit: int = 0
+
+    @property
+    def manifest(self) -> str:
+        """Name of the manifest; one of a part of the set has its own."""
+        return f"{self.name}-{self.limit}" if self.limit else self.name
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +165,7 @@ def draw_grid_items(recipe: GridRecipe) -> tuple[list[GridItem], Library]:
             if number == SLICED_SET:
                 harder = replace(harder, sensors=(harder.sensors[0], "laser2d"))
             items.append(GridItem(harder, number, k))
-    return items, plans
+    return select_items(items, recipe.limit), plans
 
 
 def _increase_difficulty(k: int, item: Item) -> Item:
@@ -171,7 +186,7 @@ def build_grids(
     folder = Path(sharing.cache).resolve() / "grids"
     begin, step = sharing.part
     tasks = [(item, list(select_plans(item.item, plans)), str(folder)) for item in items[begin - 1 :: step]]
-    report = build_set(folder.parent / f"{recipe.name}.jsonl", tasks, make_grids, sharing, log_line)
+    report = build_set(folder.parent / f"{recipe.manifest}.jsonl", tasks, make_grids, sharing, log_line)
     return [path for item in items if (path := folder / f"{item.name}.npz").exists()], report
 
 

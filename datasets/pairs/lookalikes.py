@@ -12,7 +12,15 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 from topomerge.datasets.buildings.furniture import compute_footprints
-from topomerge.datasets.core.builder import BuildReport, BuildRow, BuildSettings, build_set, check_sharing, make_item
+from topomerge.datasets.core.builder import (
+    BuildReport,
+    BuildRow,
+    BuildSettings,
+    build_set,
+    check_sharing,
+    make_item,
+    select_items,
+)
 from topomerge.datasets.core.building import Building, Difficulty
 from topomerge.datasets.core.solids import build_rotation
 from topomerge.datasets.pairs.grid_pairs import GRID_FORMAT, LONGEST_GRID_PAIR, WEIGHTS, build_pair_arrays, unpack_pair
@@ -197,6 +205,7 @@ class LookalikeRecipe:
         again: of each kind, so many beside: the first one of the two places, visited a second time. They belong together; without
             them whatever is learned takes the look of these buildings for a sign of look-alikes.
         seed: of the draw of the set.
+        limit: only so many of all pairs (`core.builder.select_items`); 0: all.
     """
 
     name: str = "lookalikes"
@@ -206,6 +215,12 @@ class LookalikeRecipe:
     scaled: float = 0.1
     seed: int = 0
     again: dict[str, int] = field(default_factory=dict)
+    limit: int = 0
+
+    @property
+    def manifest(self) -> str:
+        """Name of the manifest; one of a part of the set has its own."""
+        return f"{self.name}-{self.limit}" if self.limit else self.name
 
 
 @dataclass(frozen=True)
@@ -271,10 +286,10 @@ def build_lookalikes(
     """Build the files of a set, made where they are missing, in the order of their items."""
     check_sharing(sharing)
     folder = Path(sharing.cache).resolve() / "grids"
-    items = draw_lookalike_items(recipe)
+    items = select_items(draw_lookalike_items(recipe), recipe.limit)
     begin, step = sharing.part
     tasks = [(item, None, str(folder)) for item in items[begin - 1 :: step]]
-    report = build_set(folder.parent / f"{recipe.name}.jsonl", tasks, make_lookalike, sharing, log_line)
+    report = build_set(folder.parent / f"{recipe.manifest}.jsonl", tasks, make_lookalike, sharing, log_line)
     return [path for item in items if (path := folder / f"{item.name}.npz").exists()], report
 
 

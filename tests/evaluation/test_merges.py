@@ -10,6 +10,7 @@ import pytest
 from topomerge.datasets.buildings.procedural import make_building
 
 from topomerge.errors import InputError
+from topomerge.evaluation.merge_report import compute_headline
 from topomerge.evaluation.tasks import run_task
 from topomerge.types import Sim3
 
@@ -117,3 +118,19 @@ def test_what_a_row_tells_of_a_pose(module) -> None:
     assert (far["right"], far["fine"], far["wrong_storey"]) == (False, False, True)
     assert outcome(truth, pair)["fine"] and outcome(truth, pair)["scale"] == 1
     assert outcome(None, pair) == {"err": None, "scale": None, "right": False, "fine": False, "wrong_storey": False}
+
+
+def test_figures_of_the_readme_count_what_was_measured() -> None:
+    def row(split: str, err: tuple[float, float, float], believed: bool, **more: object) -> dict[str, object]:
+        about = {"set": split, "kind": "overlap", "common": 100.0, "sensors": ["tls", "tls"], "building": "x", "source": "ipad"}
+        return {**about, "err": err, "believed": believed, "answered": True, "probability": 0.5, "hard": [], **more}
+
+    rows = [
+        row("real", (0.05, 0.0, 0.1), True), row("real", (0.3, 0.0, 0.1), False), row("real", (4.0, 0.0, 0.1), True),
+        row("lookalikes", (9.0, 0.0, 0.0), True, lookalike="storeys", kind="other-building", tellable=False, physical="y"),
+        row("lookalikes", (9.0, 0.0, 0.0), True, lookalike="mirror", kind="other-building", tellable=True, physical="y"),
+        row("lookalikes", (9.0, 0.0, 0.0), False, lookalike="mirror", kind="other-building", tellable=True, physical="y"),
+    ]  # fmt: skip
+    figures = compute_headline(rows, None)
+    assert figures["merges-real"][0] == "2; 1; 1; 1" and figures["merges-real"][1].startswith("3 pairs of 1 site")
+    assert figures["false-storeys"] == ("1", "1 pairs") and figures["false-lookalikes"] == ("2; 1", "3 pairs")

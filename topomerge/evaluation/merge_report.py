@@ -192,6 +192,18 @@ def tabulate_boxes(rows: Sequence[Row]) -> str:
     return write_table(("kind", "pairs", "merged right", "merged wrong", "probabilities (+ right pose)"), lines)
 
 
+def count_real(rows: Sequence[Row], split: str) -> tuple[str, str] | None:
+    """Count the real pairs of a set that are right, fine, merged, and merged wrongly; None without any."""
+    mine = [r for r in rows if r["set"] == split]
+    if not mine:
+        return None
+    merged_ones = [r for r in mine if r["believed"]]
+    right, fine = sum(map(is_good, mine)), sum(is_good(r, (0.1, 1.0)) for r in mine)
+    wrong = sum(map(is_false_merge, merged_ones))
+    sites = len({get_physical_building(r) for r in mine})
+    return f"{right}; {fine}; {len(merged_ones) - wrong}; {wrong}", f"{len(mine)} pairs of {sites} site{'s' * (sites > 1)}"
+
+
 def compute_headline(rows: Sequence[Row], settings: object) -> dict[str, tuple[str, str]]:
     """Compute the figures of the README that there are rows of."""
     rows = [r for r in rows if r.get("kind") and r["set"] != "boxes" and not is_broken(r)]
@@ -209,6 +221,15 @@ def compute_headline(rows: Sequence[Row], settings: object) -> dict[str, tuple[s
     strangers = [r for r in apart if r["negative"] == "stranger"]
     if strangers:
         out["false-strangers"] = str(sum(map(is_false_merge, strangers))), f"{len(strangers)} pairs"
+    alike = [r for r in apart if r["set"] == "lookalikes" and r["kind"] != "overlap"]
+    for name, some in (("false-storeys", [r for r in alike if r["lookalike"] == "storeys"]), ("false-lookalikes", alike)):
+        if some:
+            false = [r for r in some if is_false_merge(r)]
+            hidden = f"; {sum(not is_tellable(r) for r in false)}" if name == "false-lookalikes" else ""
+            out[name] = f"{len(false)}{hidden}", f"{len(some)} pairs"
+    for name, split in (("merges-real", "real"), ("merges-office", "development")):
+        if figure := count_real(rows, split):
+            out[name] = figure
     if {r["set"] for r in rows} >= {"test", "strangers", "lookalikes"}:
         rate, low, high = (100 * v for v in compute_rate(apart))
         out["false-prior"] = f"{rate:.0f} % [{low:.0f}, {high:.0f}]", f"{len(apart)} pairs"

@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import combinations
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -102,7 +103,8 @@ def tabulate(rows: Sequence[Row], settings: TaskSettings) -> dict[str, str]:
 
 def find_pairs(name: str, settings: TaskSettings, log_line: LogFn) -> Items:
     """Find the simulated pairs of a split."""
-    files = make_pair_files(name, settings.cache, settings.jobs, log_line)
+    limit = 0 if name.endswith(DRAWN) else settings.data.limit  # a drawing is not of every pair
+    files = make_pair_files(name, settings.cache, settings.jobs, log_line, limit)
     if name.endswith(DRAWN):
         files = [file for file in files if load_grids(file).about["kind"] == "overlap"]
     return {file.stem: (file, name) for file in files[: settings.data.limit or None]}
@@ -165,7 +167,8 @@ def compare_pose(pose: Sim3 | None, pair: GridPair) -> Row:
 
 def find_strangers(name: str, settings: TaskSettings, log_line: LogFn) -> Items:
     """Find neighbours in a shuffled order of the pairs of a split: map a of one, b of another."""
-    files = make_pair_files("test", settings.cache, settings.jobs, log_line)
+    enough = ceil(settings.data.limit / (STRIDE - 1))
+    files = make_pair_files("test", settings.cache, settings.jobs, log_line, enough)
     order = np.random.default_rng(0).permutation(len(files))
     blocks = [order[start : start + STRIDE] for start in range(0, len(order), STRIDE)]
     couples = [(files[i], files[j]) for block in blocks for i in block for j in block if i != j]
@@ -258,7 +261,7 @@ def classify_strangers(one: Row, other: Row) -> str:
 def find_lookalikes(name: str, settings: TaskSettings, log_line: LogFn) -> Items:
     """Find look-alikes."""
     split = "train" if name.startswith("train") else "test"
-    files = make_lookalike_files(split, settings.cache, settings.jobs, log_line)
+    files = make_lookalike_files(split, settings.cache, settings.jobs, log_line, settings.data.limit)
     return {file.stem: (file,) for file in files[: settings.data.limit or None]}
 
 

@@ -281,21 +281,22 @@ class LookalikeBuild(Build):
     data: LookalikeRecipe = field(default_factory=LookalikeRecipe)  # type: ignore[assignment]
 
 
-def make_pair_files(split: str, cache: str, jobs: int, log_line: LogFn) -> list[Path]:
-    """Make the files of a split, ``test_drawings`` among them, that are missing; all in their order.
+def make_pair_files(split: str, cache: str, jobs: int, log_line: LogFn, limit: int = 0) -> list[Path]:
+    """Make the files of a split, ``test_drawings`` among them, that are missing; all, or so many of them, in their order.
 
     Raises:
         InputError: nothing tells where the real plans are, of which many pairs are.
     """
     find_real_data()
-    settings = read_recipe(split, (f"cache={cache}", f"jobs={jobs}"))
+    settings = read_recipe(split, (f"cache={cache}", f"jobs={jobs}", f"data.limit={limit}"))
     made = build_drawings if split.endswith(DRAWN) else build_grids
     return list(made(settings.data, settings, log_line)[0])
 
 
-def make_lookalike_files(split: str, cache: str, jobs: int, log_line: LogFn) -> list[Path]:
-    """Make the files of look-alikes of a split that are missing; all in their order."""
-    settings = compose("build", LookalikeBuild, [f"data={LOOKALIKE_SETS[split]}", f"cache={cache}", f"jobs={jobs}"])
+def make_lookalike_files(split: str, cache: str, jobs: int, log_line: LogFn, limit: int = 0) -> list[Path]:
+    """Make the files of look-alikes of a split that are missing; all, or so many of them, in their order."""
+    words = [f"data={LOOKALIKE_SETS[split]}", f"data.limit={limit}", f"cache={cache}", f"jobs={jobs}"]
+    settings = compose("build", LookalikeBuild, words)
     paths, report = build_lookalikes(settings.data, settings, log_line)
     log_line(f"{report.items} pairs, {report.made} made now; refused: {report.refused}")
     return paths

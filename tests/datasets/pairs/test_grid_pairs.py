@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 
 import numpy as np
-from topomerge.datasets.pairs.grid_pairs import GRID_EDGE, build_grid_arrays, unpack_pair
+import pytest
+from topomerge.datasets.core.builder import select_items
+from topomerge.datasets.pairs.grid_pairs import GRID_EDGE, GridRecipe, build_grid_arrays, draw_grid_items, unpack_pair
 
+from topomerge.errors import InputError
 from topomerge.types import VoxelGrid
 
 
@@ -19,3 +22,17 @@ def test_floor_past_the_last_wall_comes_back():
     pair = unpack_pair("x", {**sides, "truth": np.eye(4), "about": about})
     assert pair.a.shape == pair.free[0].shape == (6, 7, 3) and pair.b.shape == (5, 6, 3) and pair.free[1] is None
     assert np.array_equal(pair.a.cells, walls.cells) and np.array_equal(pair.free[0].cells, floor.cells)
+
+
+def test_a_larger_selection_holds_a_smaller_one() -> None:
+    items = list(range(50))
+    few, more = select_items(items, 5), select_items(items, 20)
+    assert set(few) < set(more) and few == sorted(few) and len(few) == 5
+    assert select_items(items, 0) == select_items(items, 80) == items
+    with pytest.raises(InputError, match=r"data\.limit"):
+        select_items(items, -1)
+
+
+def test_a_part_of_a_set_holds_items_of_the_whole_set() -> None:
+    whole, part = (draw_grid_items(GridRecipe(sets=[6, 3], limit=limit))[0] for limit in (0, 4))
+    assert len(part) == 4 and {item.name for item in part} < {item.name for item in whole}
