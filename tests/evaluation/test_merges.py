@@ -122,11 +122,22 @@ def test_what_a_row_tells_of_a_pose(module) -> None:
 
 def test_figures_of_the_readme_count_what_was_measured() -> None:
     def row(split: str, err: tuple[float, float, float], believed: bool, **more: object) -> dict[str, object]:
-        about = {"set": split, "kind": "overlap", "common": 100.0, "sensors": ["tls", "tls"], "building": "x", "source": "ipad"}
-        return {**about, "err": err, "believed": believed, "answered": True, "probability": 0.5, "hard": [], **more}
+        about = {"set": split, "kind": "overlap", "common": 100.0, "sensors": ["tls", "tls"], "building": "x"}
+        return {
+            **about,
+            "name": "halmstad/HIH_01-HIH_02",
+            "source": "halmstad",
+            "err": err,
+            "believed": believed,
+            "answered": True,
+            "probability": 0.5,
+            "hard": [],
+            **more,
+        }
 
     rows = [
         row("real", (0.05, 0.0, 0.1), True), row("real", (0.3, 0.0, 0.1), False), row("real", (4.0, 0.0, 0.1), True),
+        row("real", (0.0, 0.0, 0.0), True, name="carmen/csail-first-last", source="carmen"),  # of one capture
         row("lookalikes", (9.0, 0.0, 0.0), True, lookalike="storeys", kind="other-building", tellable=False, physical="y"),
         row("lookalikes", (9.0, 0.0, 0.0), True, lookalike="mirror", kind="other-building", tellable=True, physical="y"),
         row("lookalikes", (9.0, 0.0, 0.0), False, lookalike="mirror", kind="other-building", tellable=True, physical="y"),

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from topomerge.datasets.real.sources import find_captures
 from topomerge.evaluation.documents import group_rows, write_table
 from topomerge.evaluation.false_merges import (
     ORIGINS,
@@ -193,8 +194,11 @@ def tabulate_boxes(rows: Sequence[Row]) -> str:
 
 
 def count_real(rows: Sequence[Row], split: str) -> tuple[str, str] | None:
-    """Count the real pairs of a set that are right, fine, merged, and merged wrongly; None without any."""
-    mine = [r for r in rows if r["set"] == split]
+    """Count the real pairs of a set that are right, fine, merged, and merged wrongly; of ``real`` those of two captures only.
+
+    None without any.
+    """
+    mine = [r for r in rows if r["set"] == split and (split != "real" or is_independent(r))]
     if not mine:
         return None
     merged_ones = [r for r in mine if r["believed"]]
@@ -202,6 +206,12 @@ def count_real(rows: Sequence[Row], split: str) -> tuple[str, str] | None:
     wrong = sum(map(is_false_merge, merged_ones))
     sites = len({get_physical_building(r) for r in mine})
     return f"{right}; {fine}; {len(merged_ones) - wrong}; {wrong}", f"{len(mine)} pairs of {sites} site{'s' * (sites > 1)}"
+
+
+def is_independent(row: Row) -> bool:
+    """Are the maps of a real pair of two captures (`datasets.real.sources.find_captures`)?"""
+    one, other = find_captures(str(row["source"]), row["name"].split("/", 1)[1])
+    return one != other
 
 
 def compute_headline(rows: Sequence[Row], settings: object) -> dict[str, tuple[str, str]]:
