@@ -210,8 +210,12 @@ def test_a_task_is_trained_exported_read_and_judged(task, words, tmp_path, monke
     assert find_weights(task, "").is_file() and evaluate_task(task, words(task, f"folder={tmp_path / 'eval'}"), quiet).scores
 
 
+# The trainer knows no task by name: two tasks stand for all of them, the others are tried with the slow tests.
+SAMPLED = [pytest.param(t, marks=() if t in ("room_matcher", "wall_segmentation") else pytest.mark.slow) for t in NETWORKS]
+
+
 @pytest.mark.longer
-@pytest.mark.parametrize("task", list(NETWORKS))
+@pytest.mark.parametrize("task", SAMPLED)
 def test_resumed_equals_uninterrupted(task, words, tmp_path, monkeypatch) -> None:
     jobs = dict.fromkeys(("plan_segmentation", "grid_segmentation"), plan_segmentation.PlanJob)
     jobs |= {"door_classification": door_classification.DoorJob}
@@ -240,7 +244,7 @@ def test_resumed_equals_uninterrupted(task, words, tmp_path, monkeypatch) -> Non
 
 
 @pytest.mark.longer
-@pytest.mark.parametrize("task", list(NETWORKS))
+@pytest.mark.parametrize("task", SAMPLED)
 def test_two_processes_keep_the_same_weights(task, words, tmp_path) -> None:
     """torchrun with gloo: both processes make other batches and end with the same weights; the run is written once."""
     script = tmp_path / "both.py"
