@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from tests.matching.turned_maps import turned
 from tests.scenes_map import building
-from topomerge.embedding.sheets import build_sheet_arrays, estimate_wall_directions, rasterise_sheet
+from topomerge.embedding.sheets import build_sheet_arrays, rasterise_sheet
 from topomerge.embedding.surroundings import (
     CEILING_UNIT,
     CROP,
@@ -23,6 +23,7 @@ from topomerge.embedding.surroundings import (
     WIDE_PART,
     cut_crops,
 )
+from topomerge.structure.directions import estimate_wall_directions
 from topomerge.types import TopometricMap
 
 PLANE = {name: k for k, name in enumerate(CROP_PLANES)}

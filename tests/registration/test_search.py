@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from topomerge.matching.poses import DIRECTION_STEP, PoseHypothesis, compute_direction_profile, pair_storeys
+from topomerge.matching.poses import PoseHypothesis, pair_storeys
 from topomerge.registration.search import SEARCH, find_height_offsets, find_scale_candidates, select_strongest
+from topomerge.structure.directions import DIRECTION_STEP, compute_direction_profile
 from topomerge.types import Sim3
 
 NAN = float("nan")

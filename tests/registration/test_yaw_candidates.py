@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from topomerge.matching.poses import compute_direction_profile
 from topomerge.registration.search import find_yaw_candidates, select_distinct_yaws
+from topomerge.structure.directions import compute_direction_profile
 
 
 def test_yaw_candidates_of_a_pentagon():

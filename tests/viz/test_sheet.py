@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.scenes_map import building
-from topomerge.viz.plan import compute_frame, rasterize_storeys
-from topomerge.viz.svg import estimate_wall_direction, fill_rooms, lay_out
+from topomerge.viz.plan import Frame, StoreyPlan, compute_frame, rasterize_storeys
+from topomerge.viz.svg import build_sheet, fill_rooms, lay_out
 
 
 @pytest.mark.parametrize("degrees", [-40, -20, 0, 10, 30, 44])
@@ -18,7 +18,9 @@ def test_walls_run_along_the_paper(degrees: float) -> None:
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     x, y = np.abs(c * i + s * j), np.abs(-s * i + c * j)
     walls = ((x < 80) & (y < 50)) & ~((x < 77) & (y < 47))
-    assert np.degrees(estimate_wall_direction(walls)) == pytest.approx(degrees, abs=1.0)
+    plan = StoreyPlan(np.where((x < 77) & (y < 47), 0, -1).astype(np.int32), (x < 80) & (y < 50), walls)
+    sheet = build_sheet([plan], Frame(np.zeros(2), 0.1, (240, 240), np.zeros(2, np.int64), 1))
+    assert (np.degrees(sheet.turn) + degrees + 45) % 90 - 45 == pytest.approx(0.0, abs=1.0)
 
 
 def test_paper_and_building() -> None:

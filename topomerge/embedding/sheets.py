@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
 
 from topomerge.embedding.surroundings import CEILING_UNIT, GAP, SHEET_PIXEL, SHEET_PLANES, TIE
 from topomerge.extraction.plans.storey_plan import (
@@ -20,6 +19,7 @@ from topomerge.extraction.plans.storey_plan import (
     is_observed_band,
 )
 from topomerge.kernels.rasters import compute_column_bits
+from topomerge.structure.directions import estimate_wall_directions
 from topomerge.types import Array, TopometricMap
 
 FURNITURE_STEP = 1.0  # m above the floor, between low and high things
@@ -27,11 +27,7 @@ FULL_SHARE = 0.5  # of a pixel's area, from which on it is full: walls are thinn
 HIGHEST = 5.0  # m over the floor
 BELOW_FLOOR = 0.3  # m
 DOOR_RADIUS = 0.5  # m about a door's middle that is marked
-TURN_STEPS = (np.radians(1.0), np.radians(0.1))  # in which the direction of walls is sought
 MOST_DOORS = 8  # of a room
-MOST_DIRECTIONS, DIRECTIONS_APART = 3, np.radians(10.0)  # of walls that are told apart
-OTHER_DIRECTION = 0.15  # of the sharpness of the first direction, beyond what any has, that another one must have
-MOST_WALLS = 6000  # columns whose direction is taken
 BIN = 0.1  # m, into which walls are projected; columns are laid no farther apart
 
 
@@ -177,37 +173,6 @@ def _locate_room_doors(map: TopometricMap) -> Array:
     near = place < MOST_DOORS
     out[room[near], place[near]] = centre[near]
     return out
-
-
-def estimate_wall_directions(walls: Array) -> tuple[float, ...]:
-    """Return directions in [0, pi/2), rad, along which walls (n, 2), m, line up, the sharpest first: there they fall into
-    the fewest, fullest bins of both axes; 0 without any walls."""
-    if not len(walls):
-        return (0.0,)
-    walls = walls[np.linspace(0, len(walls) - 1, min(len(walls), MOST_WALLS)).astype(int)]
-    walls = walls - walls.mean(axis=0)
-    turns = np.arange(-45, 45) * TURN_STEPS[0]
-    sharpness = np.array([_measure_sharpness(walls, float(turn)) for turn in turns])
-    excess = sharpness - np.median(sharpness)
-    around = ndimage.maximum_filter1d(sharpness, 2 * round(DIRECTIONS_APART / TURN_STEPS[0]) - 1, mode="wrap")
-    peaks = np.flatnonzero((sharpness == around) & (excess >= OTHER_DIRECTION * excess.max()))
-    best = peaks[np.argsort(-sharpness[peaks], kind="stable")[:MOST_DIRECTIONS]]
-    return tuple(_refine_direction(walls, float(turns[k])) % (np.pi / 2) for k in best)
-
-
-def _refine_direction(walls: Array, turn: float) -> float:
-    around = round(TURN_STEPS[0] / TURN_STEPS[1])
-    turns = turn + np.arange(-around, around) * TURN_STEPS[1]
-    return float(turns[int(np.argmax([_measure_sharpness(walls, float(near)) for near in turns]))])
-
-
-def _measure_sharpness(walls: Array, turn: float) -> float:
-    """Sum of squares of how many walls fall into each bin of both axes; bins are blurred, so that none is cut in two."""
-    total = 0.0
-    for values in _rotate_points(walls, turn).T:
-        counts = np.bincount(np.floor((values - values.min()) / BIN).astype(np.int64)).astype(float)
-        total += float((counts**2).sum() + (counts[1:] * counts[:-1]).sum())
-    return total
 
 
 def _rotate_points(points: Array, turn: float) -> Array:

@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.kernels import registration, run_in_slices
+from topomerge.structure.directions import DIRECTION_STEP, compute_direction_profile
 from topomerge.types import Array, Sim3
 
 LARGEST_LOG_ODDS = 7.0
@@ -173,7 +174,6 @@ HEAD_HEIGHT = 2.0  # m above the floor
 CEILING_SLACK = 0.15  # m below a ceiling that still are it
 LINTEL_REACH = 0.5  # m from walls: nearer, what is above a head is part of the wall
 TALL_HEIGHTS = (2.0, 2.5)  # m above the floor: little furniture is that high
-DIRECTION_STEP = 0.5  # degrees, of the direction profile
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,24 +279,6 @@ def compute_distance(mask: Array, edge: float) -> Array:
     if not mask.any():
         return np.full(mask.shape, DISTANCE_CAP, np.float32)
     return np.minimum(edt.edt(~mask, anisotropy=(edge, edge)), DISTANCE_CAP).astype(np.float32)
-
-
-def compute_direction_profile(walls: Array, edge: float, most: int = 6000) -> Array:
-    """(360,) float64: for each direction in steps of 0.5 degrees, how much the walls' projection across it is heaped up."""
-    if not len(walls):
-        return np.zeros(int(180 / DIRECTION_STEP))
-    rng = np.random.default_rng(0)
-    points = walls if len(walls) <= most else walls[rng.permutation(len(walls))[:most]]
-    points = points - points.mean(axis=0) + rng.uniform(-edge / 2, edge / 2, points.shape)  # else the raster lines up at 0 and 90
-    angles = np.radians(np.arange(0, 180, DIRECTION_STEP))
-    across = points @ np.stack([-np.sin(angles), np.cos(angles)])
-    rows = np.floor(across / 0.2).astype(np.int64)
-    rows -= rows.min()
-    width = int(rows.max()) + 1
-    flat = (rows + np.arange(len(angles)) * width).ravel()
-    heaps = np.bincount(flat, minlength=len(angles) * width).reshape(len(angles), width).astype(float)
-    sharp: Array = (heaps**2).sum(axis=1) / len(points)
-    return np.clip(sharp - np.median(sharp), 0, None)
 
 
 SAME_POSE = PoseTolerance(0.4, float(np.radians(2.0)), 0.03)

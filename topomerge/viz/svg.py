@@ -12,6 +12,7 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.io.rooms_ply import assign_room_colours
+from topomerge.structure.directions import estimate_wall_directions
 from topomerge.types import LANDMARK_KINDS, Array, TopometricMap, find_room_names
 from topomerge.viz.plan import Frame, Place, StoreyPlan, compute_frame, find_label_places, format_hex_colour, rasterize_storeys
 from topomerge.viz.tables import (
@@ -103,7 +104,8 @@ def build_sheet(plans: list[StoreyPlan], frame: Frame, key: str = "", turn: floa
     pixels = np.argwhere(mask)
     points = frame.compute_centre(pixels) if len(pixels) else frame.low[None]
     if turn is None:
-        turn = -estimate_wall_direction(np.any([plan.wall for plan in plans], axis=0))
+        walls = frame.compute_centre(np.argwhere(np.any([plan.wall for plan in plans], axis=0)))
+        turn = float((np.pi / 4 - estimate_wall_directions(walls)[0]) % (np.pi / 2) - np.pi / 4)  # the nearest to none
         turn = 0.0 if abs(turn) < UPRIGHT_ANGLE else turn
         wide, high = np.ptp(points @ build_rotation(turn).T, axis=0)
         if turn and high > TALL * wide:
@@ -112,22 +114,6 @@ def build_sheet(plans: list[StoreyPlan], frame: Frame, key: str = "", turn: floa
     low, top = turned.min(axis=0) - frame.size, turned.max(axis=0) + frame.size
     width, height = np.round(100 * (top - low)).astype(int).tolist()
     return Sheet(frame, key, float(turn), np.array([low[0], top[1]]), (width, height))
-
-
-def estimate_wall_direction(mask: Array) -> float:
-    """rad in (-pi/4, pi/4], in which most walls of a raster run; walls at a right angle count as one direction.
-
-    The gradient of the blurred raster stands across walls; its angles are averaged fourfold, so that the four sides of a
-    room are one.
-    """
-    from scipy import ndimage
-
-    if mask.sum() < 3:
-        return 0.0
-    field = np.pad(mask, 4).astype(np.float32)
-    dx, dy = (ndimage.gaussian_filter(field, 1.5, order=order) for order in ((1, 0), (0, 1)))
-    fourfold = ((dx + 1j * dy) ** 4).sum() / max(float((np.hypot(dx, dy) ** 4).sum()), 1e-12)
-    return float(np.angle(fourfold) / 4) if abs(fourfold) > 0.05 else 0.0
 
 
 CLOSED = 0.3  # m: gaps in a room's cells up to twice this are closed: scan lines on a floor, legs of tables
