@@ -20,6 +20,7 @@ from benchmarks.peers.thresholds import PeerVerdict, apply_refinement, is_possib
 from topomerge.evaluation.documents import build_stamp, write_blocks
 from topomerge.evaluation.documents import write_table as table
 from topomerge.evaluation.false_merges import Row, classify_negative, is_false_merge, is_good
+from topomerge.evaluation.headline import FIGURES, write_headline
 from topomerge.evaluation.merge_report import format_share, modality
 from topomerge.evaluation.merges import FINE
 from topomerge.statistics import compute_precision_recall
@@ -30,6 +31,7 @@ METHOD_TITLES = {
     "ours": "topomerge", "learned": "topomerge, rooms matched by learning", "kiss02": "KISS-Matcher 0.2 m",
     "kiss03": "KISS-Matcher 0.3 m", "fpfh": "FPFH + RANSAC", "fgr": "FGR",
 }  # fmt: skip
+HEADLINE_AREA = 80.0  # m2 in common
 LEVELS = (1.0, 0.99, 0.95)  # of precision, at which recall is told
 ANSWER_HEADS = (
     "pairs", "right %", "within 0.1 m, 1° %", "before ICP", "right and believed", "wrong and believed", "over the cap",
@@ -284,7 +286,16 @@ def format_section(folder: Path) -> str:
     return "\n\n".join(part for part in parts if part)
 
 
+def compute_headline(rows: Sequence[Row]) -> dict[str, tuple[str, str]]:
+    """Compute the README's figure: pairs of 3D scans that share 80 m² or more, right by us and by KISS-Matcher."""
+    large = [r for r in rows if modality(r) == ORDINARY and is_possible(r) and r["common"] >= HEADLINE_AREA]
+    mine = {name: [r for r in large if r["method"] == name] for name in ("ours", "kiss02", "kiss03")}
+    shares = [f"{format_share(some, is_good)} %" for some in mine.values() if some]
+    return {"peers-right": ("; ".join(shares), f"{len(mine['ours'])} of these pairs")} if len(shares) == len(mine) else {}
+
+
 if __name__ == "__main__":
     page = Path(sys.argv[1])
     stamp = build_stamp(f"python -m benchmarks.peers.tables {page}", ("topomerge.registration.pipeline", "topomerge.metrics"))
+    write_headline(FIGURES, compute_headline(load_answers("test", load_verdicts())), stamp)
     write_blocks(page, {"peers": format_section(page.parent.parent)}, stamp)

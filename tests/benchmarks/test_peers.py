@@ -317,3 +317,16 @@ def test_points_of_pairs_of_another_version_are_not_simulated(module, monkeypatc
     monkeypatch.setattr(pairs, "load_raw_items", lambda names: {})
     with pytest.raises(InputError, match="old.npz: was made by another version.*task=merges data=test"):
         next(pairs.iter_peer_pairs("raw", set()))
+
+
+def test_the_figure_of_the_readme_needs_all_three_methods(module) -> None:
+    compute_headline = module("tables").compute_headline
+    about = {"name": "x", "kind": "overlap", "sensors": ["tls", "depth"], "building": "b", "source": "procedural"}
+    rows = [
+        {**about, "believed": True, "common": common, "method": method, "err": (0.1 if method == "ours" else 2.0, 0.0, 0.5)}
+        for method in ("ours", "kiss02", "kiss03")
+        for common in (100.0, 20.0)
+    ]
+    result, of = compute_headline(rows)["peers-right"]
+    assert of == "1 of these pairs" and [part.split()[0] for part in result.split("; ")] == ["100", "0", "0"]
+    assert not compute_headline([row for row in rows if row["method"] != "kiss03"])

@@ -19,7 +19,7 @@ from tests.recipes import SMALL_HOUSES
 from topomerge.config import compose
 from topomerge.errors import InputError
 from topomerge.evaluation import predict as predicting
-from topomerge.evaluation.evaluate import claim, evaluate
+from topomerge.evaluation.evaluate import claim, compute_headline, evaluate
 from topomerge.evaluation.settings import (
     Evaluation,
     Pairs,
@@ -182,6 +182,11 @@ def test_two_simulated_pairs_from_beginning_to_end(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(predicting, "describe_maps", never)
     again = evaluate(replace(settings, write=str(tmp_path / "results.md")))
     assert json.dumps(again.ranks) == json.dumps(first.ranks)
-    assert "<!-- evaluation:begin -->" in (tmp_path / "results.md").read_text()
+    text = (tmp_path / "results.md").read_text()
+    assert "<!-- evaluation:begin -->" in text and "made by `python evaluate.py`" in text
+    trained = [{**row, "variant": "pretrained"} for row in first.ranks if row["variant"] == "engineered"]
+    (name, (result, of)), *none = compute_headline([*first.ranks, *trained], settings).items()
+    assert name == "ranking" and not none and len(set(result.split("; "))) == 1 and of.endswith("held-out pairs")
+    assert not compute_headline(first.ranks, settings)
     with pytest.raises(InputError, match="other settings"):
         evaluate(replace(settings, k=[0]))

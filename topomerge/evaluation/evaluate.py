@@ -17,7 +17,10 @@ from topomerge.datasets.pairs.items import Recipe
 from topomerge.datasets.pairs.own_pairs import build_own_sets, check_own_path
 from topomerge.datasets.real.maps import build_real_pairs
 from topomerge.errors import InputError
+from topomerge.evaluation.documents import build_stamp
 from topomerge.evaluation.figures import save_figures
+from topomerge.evaluation.groups import compute_value
+from topomerge.evaluation.headline import write_headline
 from topomerge.evaluation.merge_tables import (
     select_last_variant,
     tabulate_descriptor_effect,
@@ -32,6 +35,8 @@ from topomerge.evaluation.settings import Evaluation, check, collect_prediction_
 from topomerge.evaluation.tables import (
     BY,
     Table,
+    format_value,
+    group_by_variant,
     iter_long_rows,
     tabulate_groups,
     tabulate_matching,
@@ -91,9 +96,24 @@ def evaluate(settings: Evaluation, log_line: LogFn = lambda text: None, command:
     for name, rows in (("matches", matches), ("ranks", ranks), ("merges", merges)):
         write_csv(rows, folder / f"{name}.csv")
     summary = "\n\n".join([head, *(t.format_markdown() for t in tabulate_short(matches, ranks, merges, settings))])
-    if settings.write:
-        write_section(Path(settings.write), settings.section, summary)
+    if settings.write or settings.headline:
+        stamp = build_stamp(command or "python evaluate.py", CODE, [path.stem for path in files])
+        if settings.write:
+            write_section(Path(settings.write), settings.section, f"{stamp.write_comment()}\n\n{summary}")
+        if settings.headline:
+            write_headline(Path(settings.headline), compute_headline(ranks, settings), stamp)
     return Scores(matches, ranks, merges, summary, folder)
+
+
+def compute_headline(ranks: list[Row], settings: Evaluation) -> dict[str, tuple[str, str]]:
+    """Compute the README's figure: recall@1 of the trained embedder and of the baseline; none without both."""
+    of = group_by_variant(ranks)
+    trained = [name for name in of if name not in settings.descriptors and " k=" not in name]
+    if settings.baseline not in of or not trained:
+        return {}
+    values = [compute_value(of[name], "recall@1", settings.rounds) for name in (trained[0], settings.baseline)]
+    pairs = f"{values[0].pairs} {'real' if settings.data.real else 'held-out'} pairs"
+    return {"ranking-real" if settings.data.real else "ranking": ("; ".join(map(format_value, values)), pairs)}
 
 
 def _write(path: Path, text: str) -> None:

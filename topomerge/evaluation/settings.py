@@ -67,6 +67,7 @@ class Evaluation:
         rounds: of the bootstrap.
         write: a Markdown file, to the marked section of which a short table goes; empty: none.
         section: the name of that mark.
+        headline: a file of figures for the README, of which ``ranking`` or ``ranking-real`` is written; empty: none.
         remake: make predictions again that are there.
         plugins: modules that are imported first, as they register something (`topomerge.registry`).
     """
@@ -95,6 +96,7 @@ class Evaluation:
     rounds: int = 2000
     write: str = ""
     section: str = "evaluation"
+    headline: str = ""
     remake: bool = False
     plugins: list[str] = field(default_factory=list)
 
