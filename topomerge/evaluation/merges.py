@@ -4,7 +4,7 @@
 Sets: ``test`` and ``test_drawings`` (simulated pairs, and maps with floor plans), ``strangers`` and ``drawn_strangers`` (maps of
 two places), ``real`` and ``real_strangers`` (TOPOMERGE_DATA), ``lookalikes``, ``boxes`` (worlds of boxes, made by another
 simulator); to develop on ``train``, ``train_drawings``, ``development`` (a real floor) and ``storeys``. ``data.limit`` is so many
-pairs of each.
+pairs of each, of strangers three times as many.
 
 Right: within 0.5 m and 5 degrees (fine: 0.1 m, 1 degree) in the middle of what both maps saw; of slices and drawings horizontally
 and on the right storey. Rows are kept when the code changes (a run takes hours), and that is told. Seconds are of the processor.
@@ -55,6 +55,7 @@ COPIED = ("sensors", "kind", "overlap", "differs", "walls_differ", "scaled")
 LOOKALIKE = ("lookalike", "furniture", "tellable", "amount", "repeats", "building")
 STOREYS = ("campus", "rmf", "mall", "utexas")  # sources whose plans of one building are storeys of it
 STRIDE = 7  # pairs are laid out in blocks of so many pairs, so that few maps are in memory at once
+STRANGERS_EACH = 3  # pairs of strangers for each pair that a limit allows: they need no more maps
 STRANGERS, BOX_SEEDS = 757, 8  # pairs of strangers, and of each kind of worlds of boxes, if no limit is given
 Items = dict[str, tuple[Any, ...]]
 __all__ = ["MAKERS", "Settings", "compute_headline", "list_inputs", "measure", "tabulate"]
@@ -167,12 +168,13 @@ def compare_pose(pose: Sim3 | None, pair: GridPair) -> Row:
 
 def find_strangers(name: str, settings: TaskSettings, log_line: LogFn) -> Items:
     """Find neighbours in a shuffled order of the pairs of a split: map a of one, b of another."""
-    enough = ceil(settings.data.limit / (STRIDE - 1))
+    most = STRANGERS_EACH * settings.data.limit or STRANGERS
+    enough = ceil(most / (STRIDE - 1)) if settings.data.limit else 0
     files = make_pair_files("test", settings.cache, settings.jobs, log_line, enough)
     order = np.random.default_rng(0).permutation(len(files))
     blocks = [order[start : start + STRIDE] for start in range(0, len(order), STRIDE)]
     couples = [(files[i], files[j]) for block in blocks for i in block for j in block if i != j]
-    return {f"{a.stem}+{b.stem}": (a, b, "test") for a, b in couples[: settings.data.limit or STRANGERS]}
+    return {f"{a.stem}+{b.stem}": (a, b, "test") for a, b in couples[:most]}
 
 
 def find_drawn_strangers(name: str, settings: TaskSettings, log_line: LogFn) -> Items:
