@@ -299,6 +299,7 @@ class _Processes:
         for process in self._started:
             process.join(GRACE)
             process.kill()  # of one that has ended, nothing is left to kill
+            process.join()
         self._threads.shutdown(cancel_futures=True)
 
     def submit(self, path: str) -> Future[LoadedMap]:
