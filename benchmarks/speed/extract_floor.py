@@ -51,10 +51,10 @@ def measure_in_process(floors: int, preset: str = "default", points: int = 6_000
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()[-1])
 
 
-def main(most: int = 16, points: int = 6_000_000) -> None:
+def main(most: int = 16, points: int = 6_000_000, repeat: int = 3) -> None:
     """Print the lines; `most` floors at the most. With 1 the figure of the README is written."""
     measure_in_process(1, points=100_000)
-    one = min((measure_in_process(1, points=points) for _ in range(3)), key=lambda m: m["seconds"])
+    one = min((measure_in_process(1, points=points) for _ in range(repeat)), key=lambda m: m["seconds"])
     thesis = measure_in_process(1, "thesis", points)
     print_line("extract_floor", one["seconds"], thesis["seconds"])
     if most == 1 and points == 6_000_000:
@@ -64,7 +64,9 @@ def main(most: int = 16, points: int = 6_000_000) -> None:
     for step, seconds in one["steps"].items():
         print(f"#   {step}: {seconds:.2f} s")
     print(f"# {one['cells']} cells, {one['rooms']} rooms, peak {one['peak_mb']:.0f} MB; thesis: {thesis['rooms']} rooms")
-    small = min((measure_in_process(1, points=points // 3) for _ in range(3)), key=lambda m: m["seconds"])
+    if most < 2:
+        return
+    small = min((measure_in_process(1, points=points // 3) for _ in range(repeat)), key=lambda m: m["seconds"])
     for place in ("beside", "above"):
         floors = 2
         while floors <= most:

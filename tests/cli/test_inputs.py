@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -72,6 +73,37 @@ def test_any_number_of_processes_gives_the_same_maps(clouds: list[str], began: l
         assert np.array_equal(one.map.grid.cells, other.map.grid.cells)
         assert other.read_seconds > 0 and (other.extract_seconds > 0) == (one.extract_seconds > 0)
     assert not psutil.Process().children()[1:]  # but for Python's own tracker of resources
+
+
+def test_processes_start_before_the_maps_are_asked_for(clouds: list[str], began: list[str]) -> None:
+    """They import and read while a command checks what it was given."""
+    with inputs.InputMaps(clouds[:2], choose(2)) as maps:
+        wait_for(lambda: len(psutil.Process().children()) > 1)  # Python's own tracker of resources, and the other process
+        assert not began
+        loaded = list(maps)
+        assert not psutil.Process().children()[1:]  # they do not wait for the end of the command
+    assert [one.map.source for one in loaded] == clouds[:2] and len(began) == 1
+    with inputs.InputMaps(clouds[:2], choose(2)):
+        pass  # a command that refuses what it was given
+    assert not psutil.Process().children()[1:]
+
+
+def test_what_is_needed_later_is_imported_while_another_process_works(clouds: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    other: Future[inputs.LoadedMap] = Future()
+    here: Future[inputs.LoadedMap] = Future()
+    other.set_running_or_notify_cancel()
+    here.set_result(inputs.LoadedMap(topomerge.extract(np.load("b.npy")), 0.0))
+    monkeypatch.setattr(inputs, "_load_future", lambda *_: here)
+    monkeypatch.setattr(inputs._Processes, "__enter__", lambda self: self)
+    monkeypatch.setattr(inputs._Processes, "submit", lambda self, path: other if path == "a.npy" else Future())
+    with inputs.InputMaps(clouds[:2], choose(2), ["later", "never"]) as maps:
+
+        def note(name: str) -> None:
+            assert name == "later"
+            other.set_result(here.result())
+
+        monkeypatch.setattr(inputs, "import_module", note)
+        assert next(iter(maps)) is here.result()
 
 
 def test_the_first_file_that_is_wrong_is_named(run: Run, clouds: list[str]) -> None:

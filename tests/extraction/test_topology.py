@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from topomerge.extraction.plans.storey_plan import Floor
-from topomerge.extraction.topology import find_edges
+from topomerge.extraction.topology import _find_columns, find_edges
 from topomerge.types import STOREY_DTYPE, Array, VoxelGrid
 
 EDGE = 0.05
@@ -86,3 +86,10 @@ def test_rooms_of_two_storeys_meet_at_stairs():
 
 def test_rooms_without_a_gap_have_no_door():
     assert not len(edges_of(rooms_with_gap(0)))
+
+
+def test_each_column_comes_once_in_ascending_order():
+    cells = np.random.default_rng(0).integers(0, 9, (200, 3)).astype(np.int32)
+    columns = _find_columns(cells)
+    np.testing.assert_array_equal(columns, np.unique(cells[:, :2], axis=0))
+    assert columns.dtype == cells.dtype

@@ -14,7 +14,8 @@ import pytest
 from tests.samples import box_points
 from topomerge.errors import InputError
 from topomerge.io import frame, read_chunks, read_points
-from topomerge.io.points import PointSample, warn_about
+from topomerge.io import points as reading
+from topomerge.io.points import PointSample, compute_flatness, warn_about
 from topomerge.types import VoxelGrid
 
 
@@ -198,3 +199,11 @@ def test_importing_the_readers_is_cheap() -> None:
     code = f"import sys, topomerge.io; print(*(set('{heavy}'.split()) & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
+
+
+def test_marked_and_sorted_cells_show_the_same_flatness(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.random.default_rng(0).uniform(0, (5, 4, 2.5), (3000, 3))
+    points[:1500, 2] = 0.04
+    marked = compute_flatness(points, *np.percentile(points, (1, 99), axis=0))
+    monkeypatch.setattr(reading, "MOST_SLAB_CELLS", 0)
+    assert marked == compute_flatness(points, *np.percentile(points, (1, 99), axis=0)) and marked[2] > 0.3

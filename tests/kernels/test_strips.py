@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from topomerge.kernels.images import fill_strips
-from topomerge.kernels.rasters import find_strongest_line
+from topomerge.kernels.rasters import find_strongest_line, weigh_by_distance
 
 STEP = np.array([0.05, 0.025, 0.2])
 
@@ -65,3 +65,28 @@ def test_the_line_with_most_weight_is_voted_for():
     angles = np.linspace(0, np.pi, 60, endpoint=False)
     angle, offset = find_strongest_line(points, np.ones(len(points)), angles, 0.04)
     assert angle == pytest.approx(0.3, abs=0.06) and offset == pytest.approx(0.7, abs=0.06)
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_points_far_from_the_line_weigh_less(given):
+    def weigh_slowly(points, weights, along, scales):
+        weight = weights
+        for scale in scales:
+            middle = np.average(points, axis=0, weights=weight)
+            scatter = (points - middle).T @ ((points - middle) * weight[:, None])
+            unit = along if along.any() else np.linalg.eigh(scatter)[1][:, 1]
+            off = (points - middle) @ (-unit[1], unit[0])
+            weight = weights / (1 + (off / scale) ** 2)
+        return weight
+
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        angle, t = rng.uniform(0, np.pi), rng.uniform(0, 4, 50)
+        unit = np.array([np.cos(angle), np.sin(angle)])
+        points = t[:, None] * unit + rng.normal(0, 0.02, (50, 2))
+        points[:3] += 0.3 * np.array([-unit[1], unit[0]])
+        weights, scales = rng.uniform(0.01, 0.1, 50), np.array([0.05, 0.03, 0.015])
+        along = unit if given else np.zeros(2)
+        weight = weigh_by_distance(points, weights, along, scales)
+        np.testing.assert_allclose(weight, weigh_slowly(points, weights, along, scales), rtol=1e-9)
+        assert (weight[:3] < 0.05 * weights[:3]).all()

@@ -1,8 +1,8 @@
 """The maps that the inputs of a command stand for: read from a .tmap, or extracted from anything else, large ones side by side.
 
 Extraction holds the interpreter's lock for most of its time, so that threads gain nothing: each core has a process of its own.
-They are spawned, as locks and threads do not survive a fork. A started process imports for about a second before it works: small
-clouds are extracted here.
+They are spawned, as locks and threads do not survive a fork. A started process imports for about a second before it works, while
+this one imports as well: it is started before anything else is done (`InputMaps`). Very small clouds are extracted here.
 """
 
 from __future__ import annotations
@@ -13,10 +13,11 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,10 +33,11 @@ if TYPE_CHECKING:
 
 # Advice of the readers that only `extract` can take: --scale and --poses of `merge` are others.
 EXTRACT_ADVICE = ("--resolution", "--poses", "--topic", "--scale", "--spacing")
-LEAST_SIZE = 8_000_000  # bytes of a cloud, from which a process for it is worth its start (docs/benchmarks.md)
+LEAST_SIZE = 500_000  # bytes of a cloud, from which a process for it is worth its start (docs/benchmarks.md)
 COMPRESSION = {".laz": 6, ".e57": 2}  # of the bytes of a point, against PLY and LAS
 MEMORY_START, MEMORY_GROWTH = 600_000_000, 8  # bytes that extraction takes at most: to start with, and for each byte of the cloud
 WORKER_OPTIONS = ("voxel_size", "up", "unit", "one_frame", "sensor", "text", "verbose")
+EXTRACTION_MODULES = ("topomerge.extraction.extract", "topomerge.io.points")
 GRACE = 2.0  # s that a process has to end by itself
 Starter = Callable[[str], Report | None]  # title of a task -> what moves its bar
 
@@ -96,36 +98,85 @@ def load_input_map(path: str, args: argparse.Namespace) -> TopometricMap:
 
 
 def iter_input_maps(paths: Sequence[str], args: argparse.Namespace) -> Generator[LoadedMap, None, None]:
-    """Yield the maps of the inputs in their order: of a .tmap, or extracted with the `CLOUD_OPTIONS` that were given. They do not
-    depend on the number of processes.
+    """Yield the maps of the inputs in their order (`InputMaps`).
 
     Raises:
         InputError: one can't be read or extracted; the line names the file.
     """
-    large = {path: size for path in paths if not is_map(path) and (size := measure_input(path)) >= LEAST_SIZE}
-    processes = count_processes(list(large.values()), getattr(args, "jobs", None)) if len(large) > 1 else 1
-    if processes == 1:
-        for path in paths:
-            with ProgressBars(enabled=not getattr(args, "quiet", False)) as bars:
-                loaded = _load_map(path, args, bars.start_task)
+    with InputMaps(paths, args) as maps:
+        yield from maps
+
+
+class InputMaps:
+    """The maps of the inputs in their order: of a .tmap, or extracted with the `CLOUD_OPTIONS` that were given. They do not
+    depend on the number of processes.
+
+    Processes start with the context, so that they import while a command checks what it was given; all end with it.
+
+    Args:
+        paths: of the inputs.
+        args: of the command.
+        ahead: modules that the command needs afterwards; they are imported while another process works.
+    """
+
+    def __init__(self, paths: Sequence[str], args: argparse.Namespace, ahead: Sequence[str] = ()) -> None:
+        self._paths, self._args, self._ahead = list(paths), args, list(ahead)
+        sizes = {path: measure_input(path) for path in paths if not is_map(path)}
+        self._large = {path for path, size in sizes.items() if size >= LEAST_SIZE}
+        large = [sizes[path] for path in self._large]
+        self._processes = count_processes(large, getattr(args, "jobs", None)) if len(large) > 1 else 1
+        self._stack = ExitStack()
+        self._begun: dict[int, Future[LoadedMap]] = {}
+        self._first = 0  # input that is not begun
+
+    def __enter__(self) -> InputMaps:
+        if self._processes > 1:
+            with ExitStack() as stack:
+                bars = stack.enter_context(ProgressBars(enabled=not getattr(self._args, "quiet", False)))
+                self._others = stack.enter_context(_Processes(self._processes - 1, self._args, bars))
+                self._begin(self._processes)
+                self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def __iter__(self) -> Iterator[LoadedMap]:
+        """Yield the maps, once; the processes end with the last one.
+
+        Raises:
+            InputError: as `iter_input_maps`.
+        """
+        for loaded in self._iter_shared() if self._processes > 1 else self._iter_alone():
             warn(loaded.map.warnings)
             yield loaded
-        return
-    with ProgressBars(enabled=not getattr(args, "quiet", False)) as bars, _Processes(processes - 1, args, bars) as others:
-        begun: dict[int, Future[LoadedMap]] = {}
-        first = 0
-        for k in range(len(paths)):
-            for n in range(first, last := min(k + processes + 1, len(paths))):  # more maps are never in memory
-                begun[n] = others.submit(paths[n]) if paths[n] in large else Future()
-            first = last
+        self._stack.close()
+
+    def _begin(self, last: int) -> None:
+        """Hand the inputs before `last` to the processes; what is small is left to this one."""
+        for path in self._paths[self._first : last]:
+            self._begun[self._first] = self._others.submit(path) if path in self._large else Future()
+            self._first += 1
+
+    def _iter_alone(self) -> Iterator[LoadedMap]:
+        for path in self._paths:
+            with ProgressBars(enabled=not getattr(self._args, "quiet", False)) as bars:
+                loaded = _load_map(path, self._args, bars.start_task)
+            yield loaded
+
+    def _iter_shared(self) -> Iterator[LoadedMap]:
+        begun, others = self._begun, self._others
+        for k in range(len(self._paths)):
+            self._begin(k + self._processes + 1)  # more maps are never in memory
             while not begun[k].done():
                 here = next((n for n in sorted(begun) if begun[n].cancel()), None)  # the first that no process has taken
-                if here is None:
+                if here is not None:
+                    begun[here] = _load_future(self._paths[here], self._args, others.name_bars(self._paths[here]))
+                elif self._ahead:
+                    import_module(self._ahead.pop(0))
+                else:
                     break
-                begun[here] = _load_future(paths[here], args, others.name_bars(paths[here]))
-            loaded = begun.pop(k).result()
-            warn(loaded.map.warnings)
-            yield loaded
+            yield begun.pop(k).result()
 
 
 def _load_future(path: str, args: argparse.Namespace, start_task: Starter) -> Future[LoadedMap]:
@@ -144,11 +195,11 @@ def _load_map(path: str, args: argparse.Namespace, start_task: Starter) -> Loade
     Raises:
         InputError: as `iter_input_maps`.
     """
-    from topomerge.edits.apply import load_corrected_map
-
     began = time.perf_counter()
     try:
         if is_map(path):
+            from topomerge.edits.apply import load_corrected_map
+
             topomap = load_corrected_map(path, getattr(args, "edits", None))
         else:
             from topomerge.extraction.extract import extract
@@ -218,11 +269,11 @@ def estimate_free_memory(root: Path = Path("/")) -> int:
 
 
 class _Processes:
-    """Processes that extract clouds, each with a thread here that gives it work and passes on what it tells. All end with the
-    context, however it is left.
+    """Processes that extract clouds, each with a thread here that gives it work and passes on what it tells. All start with the
+    context and end with it, however it is left.
 
     Args:
-        count: of processes; those that get no work are not started.
+        count: of processes.
     """
 
     def __init__(self, count: int, args: argparse.Namespace, bars: ProgressBars) -> None:
@@ -232,9 +283,12 @@ class _Processes:
         self._started: list[SpawnProcess] = []
         self._lock = threading.Lock()
         self._leaving = False
+        self._count = count
         self._threads = ThreadPoolExecutor(count, "extract", _keep_interrupts_away)
 
     def __enter__(self) -> _Processes:
+        for _ in range(self._count):
+            self._threads.submit(self._get_process)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -245,6 +299,7 @@ class _Processes:
         for process in self._started:
             process.join(GRACE)
             process.kill()  # of one that has ended, nothing is left to kill
+            process.join()
         self._threads.shutdown(cancel_futures=True)
 
     def submit(self, path: str) -> Future[LoadedMap]:
@@ -321,6 +376,8 @@ def _work(connection: Connection[Any, Any], options: argparse.Namespace, shows_p
     exit_on_signals()
     debug = options.verbose > 1 or os.environ.get("TOPOMERGE_DEBUG", "") not in ("", "0")
     show_log(options.verbose, debug)
+    for name in EXTRACTION_MODULES:  # before there is work
+        import_module(name)
     _share_cores(options.cores)
 
     def start_task(title: str) -> Report | None:

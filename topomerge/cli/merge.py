@@ -26,7 +26,7 @@ from topomerge.cli.console import (
     warn,
     write_out,
 )
-from topomerge.cli.inputs import check_cloud_options, collect_reading_options, is_map, iter_input_maps
+from topomerge.cli.inputs import InputMaps, check_cloud_options, collect_reading_options, is_map, iter_input_maps
 from topomerge.cli.move import plan_merge, save_plan
 from topomerge.cli.options import (
     BELIEF_OPTIONS,
@@ -135,6 +135,7 @@ def _compute_middle(result: MergeResult, k: int) -> np.ndarray:
     return middle
 
 
+MERGE_MODULES = ("topomerge.fusion.pipeline", "topomerge.viz.merge_report")
 MERGE_OUTPUTS = ("merge.json", "report.html", "merged.ply", "map.tmap")
 
 
@@ -144,19 +145,19 @@ def run_merge(args: argparse.Namespace) -> int:
         instead = "a folder is one map; name the files in it" if Path(args.inputs[0]).is_dir() else "give another one"
         raise InputError(f"{args.inputs[0]}: merge takes two maps or more, 1 given; {instead}")
     check_inputs(args.inputs)
-    with open_output_folder(args.output) as folder:
+    with InputMaps(args.inputs, args, MERGE_MODULES) as inputs, open_output_folder(args.output) as folder:
         files = choose_point_files(args.inputs, folder) if args.points else {}
         check_outputs([*(folder / name for name in MERGE_OUTPUTS), *files.values()], args.inputs)
         try:
-            return _merge(args, folder, files)
+            return _merge(args, inputs, folder, files)
         except OSError as error:
             raise InputError(f"{folder}: can't be written ({error.strerror or error}); give another place") from error
 
 
-def _merge(args: argparse.Namespace, folder: Path, files: Mapping[int, Path]) -> int:
+def _merge(args: argparse.Namespace, inputs: InputMaps, folder: Path, files: Mapping[int, Path]) -> int:
     belief = collect_belief_options(args)
     _check_choices(args)
-    loaded = list(iter_input_maps(args.inputs, args))
+    loaded = list(inputs)
     maps = [replace(one.map, source=path) for one, path in zip(loaded, args.inputs, strict=True)]
     choices = collect_given(args, "force", "rigid")
     poses = _read_decisions(maps, folder, args) or args.poses

@@ -68,6 +68,13 @@ class Kernel:
         return np.ascontiguousarray(self.offsets[taking_part]), self.weights[taking_part]
 
     @cached_property
+    def half(self) -> Array:
+        """(m, 3) int64 offsets and their opposites, one of each two: a neighbour's neighbour, whichever way it is said."""
+        offsets = self.stencil[0]
+        both = np.unique(np.concatenate([offsets, -offsets]), axis=0)
+        return np.asarray(both[[tuple(o) > (0, 0, 0) for o in both.tolist()]])
+
+    @cached_property
     def runs(self) -> tuple[Array, Array]:
         """Upright runs of equal weight, nearest column first: (m, 4) int64 dx, dy, lowest, highest dz; (m,) weights."""
         offsets, weights = self.stencil

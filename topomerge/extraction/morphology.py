@@ -23,9 +23,7 @@ def label_components(grid: VoxelGrid, neighbourhood: Kernel | None = None, group
     Returns:
         (n,) int64, numbered from 0 in the order of their first cells, -1 for cells left out.
     """
-    offsets = (neighbourhood or build_von_neumann()).stencil[0]
-    both = np.unique(np.concatenate([offsets, -offsets]), axis=0)  # a neighbour's neighbour, whichever way it is said
-    half = both[[tuple(o) > (0, 0, 0) for o in both.tolist()]]
+    half = (neighbourhood or build_von_neumann()).half
     group = np.zeros(len(grid), np.int64) if group is None else np.asarray(group, np.int64)
     return kernel.label_components(grid.cells, *grid._bricks, half, group)
 

@@ -125,7 +125,7 @@ def _edge(
     """One row of EDGE_DTYPE from the cells (`rows`) of two rooms that touch."""
     pair = np.unique(room[rows])
     cells = navigable.cells[rows]
-    middle, along, span = _extent(np.unique(cells[:, :2], axis=0))
+    middle, along, span = _extent(_find_columns(cells))
     narrow = _find_narrowest_place(navigable, room, pair, cells)
     if narrow is not None and narrow[2] <= span:
         middle, along, span = narrow
@@ -156,6 +156,13 @@ def _find_rows_under(navigable: VoxelGrid, middle: Array, contact: Array) -> Arr
     rows = navigable.find_rows(window)
     rows = rows[rows >= 0]
     return rows[~navigable.contains(navigable.cells[rows].astype(np.int64) - (0, 0, 1))]  # the floor, not what was dilated
+
+
+def _find_columns(cells: Array) -> Array:
+    """(k, 2) columns of cells, each once, ascending."""
+    size = int(cells[:, 1].max()) + 1
+    codes = np.unique(cells[:, 0].astype(np.int64) * size + cells[:, 1])
+    return np.column_stack([codes // size, codes % size]).astype(cells.dtype)
 
 
 def _extent(plan: Array) -> tuple[Array, Array, float]:

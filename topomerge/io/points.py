@@ -37,7 +37,7 @@ from topomerge.types import (
 )
 
 LARGE, HIGH = 2000.0, 100.0  # m, extents beyond what is scanned as one building
-SLAB_THICKNESS = 0.1  # m
+SLAB_THICKNESS, MOST_SLAB_CELLS = 0.1, 1 << 26  # m; cells that are marked, 64 MB: more are sorted
 STOREY_HEIGHT = 4.5  # m
 LOWEST_ROOM, HIGHEST_ROOM = 2.0, 3.6  # m, usual heights of a room
 DEGREES_ACROSS = 0.1  # degrees, 11 km: no scan of a building is as wide
@@ -133,8 +133,12 @@ def compute_flatness(points: Array, low: Array, high: Array) -> list[float]:
     """Share of the surface that lies in the strongest slab across x, y and z; the surface is counted in occupied cells."""
     inside = points[((points >= low - SLAB_THICKNESS) & (points <= high + SLAB_THICKNESS)).all(axis=1)]
     cells = np.floor((inside - inside.min(axis=0)) / SLAB_THICKNESS).astype(np.int64)
-    ny, nz = (int(n) for n in cells.max(axis=0)[1:] + 1)
-    codes = np.unique((cells[:, 0] * ny + cells[:, 1]) * nz + cells[:, 2])
+    nx, ny, nz = (int(n) for n in cells.max(axis=0) + 1)
+    codes = (cells[:, 0] * ny + cells[:, 1]) * nz + cells[:, 2]
+    if few := nx * ny * nz <= MOST_SLAB_CELLS:
+        occupied = np.zeros(nx * ny * nz, bool)
+        occupied[codes] = True
+    codes = np.flatnonzero(occupied) if few else np.unique(codes)
     slabs = (codes // (ny * nz), codes // nz % ny, codes % nz)
     return [float(np.convolve(np.bincount(s), (1, 1)).max() / len(codes)) for s in slabs]
 
@@ -279,10 +283,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Format:
-    """A family of files, or of folders (no suffixes).
-
-    `fixed`: the format states its own unit and up axis, so those given don't apply; `takes`: options that only it knows.
-    """
+    """A family of files, or of folders (no suffixes). `fixed`: it states its own unit and up axis, those given don't apply;
+    `takes`: options that only it knows."""
 
     name: str
     module: str
@@ -335,7 +337,6 @@ def list_suffixes() -> tuple[str, ...]:
 
 def read_points(path: str | Path, *, progress: Progress | None = None, **options: Any) -> PointCloud:
     """Read the points of a file as one cloud, in metres, z up: ``read_points("a.ply", up="y", unit="mm")``.
-
     Landmarks in a file beside it (docs/landmarks.md) come along.
 
     Args:

@@ -108,8 +108,10 @@ def _fill(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
             x, y = points[p, 0] - frames[line, 0], points[p, 1] - frames[line, 1]
             ax, ay = frames[line, 2], frames[line, 3]
             ox, oy = frames[line, 4], frames[line, 5]
-            u = int((x * ax + y * ay) // step[0])
             v = (x * ox + y * oy) / step[1] - 0.5
+            if not -1.0 <= v < out.shape[1]:  # most of them; the exact divisions below are slow
+                continue
+            u = int((x * ax + y * ay) // step[0])
             w = int((points[p, 2] - frames[line, 6]) // step[2])
             if u < 0 or u >= sizes[line] or w < 0 or w >= out.shape[2]:
                 continue

@@ -366,3 +366,37 @@ def find_strongest_line(points, weights, angles, width):  # type: ignore[no-unty
             if two > best:
                 best, angle, offset = two, a, low + (k + 1) * width
     return angle, offset
+
+
+@compile_ahead("f8[:,::1], f8[::1], f8[::1], f8[::1]")
+def weigh_by_distance(points, weights, along, scales):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """(n,) weights of points, those far from the line through most of them counting less (Cauchy).
+
+    Args:
+        points: (n, 2) m.
+        weights: (n,).
+        along: (2,) direction of the line; zeros: that of least squares.
+        scales: (k,) m, of each round: what is as far off counts half in the next one.
+    """
+    weight = weights.copy()
+    for scale in scales:
+        total, x, y = 0.0, 0.0, 0.0
+        for i in range(len(points)):
+            total += weight[i]
+            x += weight[i] * points[i, 0]
+            y += weight[i] * points[i, 1]
+        x, y = x / total, y / total
+        c, s = along[0], along[1]
+        if c == 0.0 and s == 0.0:
+            xx, xy, yy = 0.0, 0.0, 0.0
+            for i in range(len(points)):
+                u, v = points[i, 0] - x, points[i, 1] - y
+                xx += weight[i] * u * u
+                xy += weight[i] * u * v
+                yy += weight[i] * v * v
+            angle = 0.5 * np.arctan2(2 * xy, xx - yy)
+            c, s = np.cos(angle), np.sin(angle)
+        for i in range(len(points)):
+            off = (points[i, 1] - y) * c - (points[i, 0] - x) * s
+            weight[i] = weights[i] / (1 + (off / scale) ** 2)
+    return weight

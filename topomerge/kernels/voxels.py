@@ -64,16 +64,6 @@ def _run_radix_pass(keys, rows, shift, keys_out, rows_out):  # type: ignore[no-u
         starts[d] += 1
 
 
-@compile_ahead("u8[::1], i8[::1]")
-def _select_first_of_each(keys, rows):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    count = 0
-    for i in range(len(keys)):
-        if i == 0 or keys[i] != keys[i - 1]:
-            rows[count] = rows[i]
-            count += 1
-    return count
-
-
 def find_unique_rows(codes: NDArray[np.uint64]) -> NDArray[np.int64]:
     """Return rows that put (n,) codes in ascending order, each code once at its first mention: `np.unique`'s index.
 
@@ -86,7 +76,9 @@ def find_unique_rows(codes: NDArray[np.uint64]) -> NDArray[np.int64]:
     for shift in range(0, int(codes.max()).bit_length(), DIGIT):
         _run_radix_pass(keys, rows, np.uint64(shift), other_keys, other_rows)
         keys, other_keys, rows, other_rows = other_keys, keys, other_rows, rows
-    return rows[: _select_first_of_each(keys, rows)].copy()
+    fresh = np.ones(len(keys), bool)
+    np.not_equal(keys[1:], keys[:-1], out=fresh[1:])
+    return rows[fresh]
 
 
 def encode(cells: NDArray[Any]) -> NDArray[np.uint64]:

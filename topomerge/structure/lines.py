@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from topomerge.kernels.rasters import find_strongest_line
+from topomerge.kernels.rasters import find_strongest_line, weigh_by_distance
 from topomerge.types import Array
 
 HOUGH_TURN = np.radians(3.0)
@@ -16,6 +16,7 @@ LEAST_LINE = 0.35  # m of wall on a line
 LINE_GAP = 1.5  # m: a longer gap parts two lines
 DENSE = 0.35  # share of a line's length that is wall: things that line up by chance are fewer
 FIT_SCALE = 0.015  # m: points this far off count half
+FIT_SCALES = np.array([0.05, 0.03, *[FIT_SCALE] * 5])  # m, of the rounds before the last
 MOST_LINES = 80  # of a room
 ALIGNED, SHORT_ALIGNED = np.radians(1.5), np.radians(7.0)  # lines this near to a main direction have it
 SHORT_LINE = 1.5  # m
@@ -119,15 +120,11 @@ def _fit_line(points: Array, weights: Array, main: float | None) -> Line:
 
 def _fit_least_squares(points: Array, weights: Array, along: Array | None = None) -> tuple[Array, Array]:
     """A point and the direction of the line, points far off counting less (Cauchy); the direction may be given."""
-    given, weight = along, weights
-    for scale in (0.05, 0.03, *[FIT_SCALE] * 6):
-        middle = weight @ points / weight.sum()
-        if given is None:
-            along = np.linalg.svd((points - middle) * np.sqrt(weight)[:, None], full_matrices=False)[2][0]
-        assert along is not None
-        off = (points - middle) @ (-along[1], along[0])
-        weight = weights / (1 + (off / scale) ** 2)
-    assert along is not None
+    given = np.zeros(2) if along is None else along
+    weight = weigh_by_distance(points, weights, given, FIT_SCALES)
+    middle = weight @ points / weight.sum()
+    if along is None:
+        along = np.linalg.svd((points - middle) * np.sqrt(weight)[:, None], full_matrices=False)[2][0]
     return middle, along
 
 

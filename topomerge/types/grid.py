@@ -19,14 +19,17 @@ Array = NDArray[Any]
 LogFn = Callable[[str], None]  # is called with a line of progress
 
 
-def require(condition: bool, message: str) -> None:
+def require(condition: bool, message: str, *values: object) -> None:
     """Refuse what a type can't hold.
+
+    Args:
+        message: of the error; in place of each {} comes one of the values, which are printed only then.
 
     Raises:
         ValueError: the condition does not hold.
     """
     if not condition:
-        raise ValueError(message)
+        raise ValueError(message.format(*values))
 
 
 def wrap_to_turn(angle: Any, turn: float) -> Any:
@@ -61,17 +64,19 @@ class VoxelGrid:
     properties: Mapping[str, Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        require(self.edge > 0 and np.isfinite(self.edge), f"edge length must be above 0 m, not {self.edge}")
-        require(np.shape(self.origin) == (3,) and bool(np.isfinite(self.origin).all()), f"origin must be (3,), not {self.origin}")
-        require(self.cells.ndim == 2 and self.cells.shape[1] == 3, f"cells must be (n, 3), not {self.cells.shape}")
-        require(self.cells.dtype == np.int32, f"cells must be int32, not {self.cells.dtype}")
-        require(all(0 < s <= voxels.AXIS_LIMIT for s in self.shape), f"grid shape {self.shape} is outside 1..{voxels.AXIS_LIMIT}")
+        require(self.edge > 0 and np.isfinite(self.edge), "edge length must be above 0 m, not {}", self.edge)
+        whole = np.shape(self.origin) == (3,) and bool(np.isfinite(self.origin).all())
+        require(whole, "origin must be (3,), not {}", self.origin)
+        require(self.cells.ndim == 2 and self.cells.shape[1] == 3, "cells must be (n, 3), not {}", self.cells.shape)
+        require(self.cells.dtype == np.int32, "cells must be int32, not {}", self.cells.dtype)
+        fits = all(0 < s <= voxels.AXIS_LIMIT for s in self.shape)
+        require(fits, "grid shape {} is outside 1..{}", self.shape, voxels.AXIS_LIMIT)
         if len(self.cells):
             low, high = _compute_extent(self.cells)
-            require(bool((low >= 0).all() and (high < self.shape).all()), f"cells {low}..{high} outside {self.shape}")
+            require(bool((low >= 0).all() and (high < self.shape).all()), "cells {}..{} outside {}", low, high, self.shape)
             require(bool((self.codes[1:] > self.codes[:-1]).all()), "cells must be unique and in Morton order")
         for name, values in self.properties.items():
-            require(len(values) == len(self.cells), f"property {name} must have one row a cell")
+            require(len(values) == len(self.cells), "property {} must have one row a cell", name)
 
     @staticmethod
     def from_cells(
@@ -84,10 +89,10 @@ class VoxelGrid:
         """A grid from cells in any order; a repeated cell comes once, with the properties of their first mention."""
         cells = np.asarray(cells).reshape(-1, 3)
         if len(cells):  # before the codes: they hold 21 bits an axis, and a cell beyond would take the place of another
-            require(np.issubdtype(cells.dtype, np.integer), f"cells must be integers, not {cells.dtype}")
+            require(np.issubdtype(cells.dtype, np.integer), "cells must be integers, not {}", cells.dtype)
             low, high = _compute_extent(cells)
             inside = bool((low >= 0).all() and (high < voxels.AXIS_LIMIT).all())
-            require(inside, f"cells {low}..{high} not in 0..{voxels.AXIS_LIMIT}")
+            require(inside, "cells {}..{} not in 0..{}", low, high, voxels.AXIS_LIMIT)
         cells = np.ascontiguousarray(cells, np.int32)
         first = voxels.find_unique_rows(voxels.encode(cells))
         unique_cells = np.ascontiguousarray(cells[first])
