@@ -77,6 +77,13 @@ def check_straight(page, corners, near):
     length = np.hypot(*sides.T)
     assert length[0] == pytest.approx(length[2], rel=0.02) and length[1] == pytest.approx(length[3], rel=0.02)
     assert length[0] / length[1] == pytest.approx(600 / 410, rel=near)
+    seen = move_places(sheet, WALLS)
+    assert length[0] * length[1] == pytest.approx(measure_area(seen), rel=0.15)  # pixels are as large as they were
+
+
+def measure_area(ring):
+    x, y = ring.T
+    return 0.5 * abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))
 
 
 WALLS = np.array([[120, 90], [720, 90], [720, 500], [120, 500]], float)
@@ -123,6 +130,14 @@ def test_light_floor_among_dark_walls_is_no_blueprint_and_no_page():
 
 def paint_noisy(grey, rng):
     return (np.repeat(grey[..., None], 3, axis=2) * 255 + rng.normal(0, 2, (*grey.shape, 3))).clip(0, 255).astype(np.uint8)
+
+
+def test_paper_as_grey_as_unknown_is_paper_where_nothing_is_lighter():
+    page = draw().picture.astype(float)
+    grey = (60 + page / 255 * 145).astype(np.uint8)  # a faint print on paper of 205
+    assert find_page(grey) is not None
+    grey[100:200, 100:200] = 254  # the floor of a grid
+    assert find_page(grey) is None
 
 
 def test_a_plan_on_a_dark_screen_has_its_rooms(tmp_path):

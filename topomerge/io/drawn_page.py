@@ -14,6 +14,7 @@ from topomerge.types import Array
 LEAST_PIXELS = 100  # of a side of a page
 BRIGHT, BRIGHT_SHARE = 0.6, 0.8  # of the brightness, and of the pixels along the border of a page
 GREY_OF_UNKNOWN, GREY_WIDTH, GREY_SHARE = 205, 6, 0.03  # levels of 255: a robot's grid has so much of it
+LEAST_LIGHTER = 0.005  # of the pixels of a grid are floor; where none is lighter, the grey is that of paper
 UNKNOWN_BORDER = 0.1  # of the pixels along the border of a grid, at least, are unknown
 COLOURLESS = 8  # levels of 255 between red, green and blue
 FEW_LEVELS, NEARLY_ALL = 3, 0.995  # a robot's grid has so many greys for so many of its pixels
@@ -92,7 +93,7 @@ def is_robot_grid(picture: Array) -> bool:
     histogram = np.bincount(levels.ravel() + 1, minlength=257)[1:] / levels.size
     window = slice(GREY_OF_UNKNOWN - GREY_WIDTH, GREY_OF_UNKNOWN + GREY_WIDTH + 1)
     unknown = histogram[window]
-    if unknown.sum() <= GREY_SHARE or unknown.max() <= 0.6 * unknown.sum():
+    if unknown.sum() <= GREY_SHARE or unknown.max() <= 0.6 * unknown.sum() or histogram[window.stop :].sum() < LEAST_LIGHTER:
         return False
     border = np.concatenate([levels[0], levels[-1], levels[:, 0], levels[:, -1]])
     around = ((border >= window.start) & (border < window.stop)).mean()
@@ -173,7 +174,7 @@ def refine_corners(picture: Array, corners: Array, reach: float) -> Array:
             fit = np.linalg.lstsq(design * weight[:, None], offset * weight, rcond=None)[0]
             weight = 1 / (1 + ((offset - design @ fit) / width) ** 2)
         ends = [start + outward * (fit[0] - fit[1] / 2), end + outward * (fit[0] + fit[1] / 2)]
-        lines.append(np.cross(*(np.append(e, 1.0) for e in ends)))
+        lines.append(np.cross(np.append(ends[0], 1.0), np.append(ends[1], 1.0)))
     met = np.array([np.cross(lines[k - 1], lines[k]) for k in range(4)])
     with np.errstate(divide="ignore", invalid="ignore"):
         met = met[:, :2] / met[:, 2:]
@@ -253,7 +254,7 @@ def cut_sheet(picture: Array, corners: Array) -> tuple[Array, Array]:
 
 def _estimate_foreshortening(corners: Array, shape: tuple[int, ...]) -> float:
     """By how much wider a page is than its sides are long on the picture, for their height (a camera of usual lens)."""
-    half = np.hypot(*shape) / 2
+    half = float(np.hypot(shape[0], shape[1])) / 2
     points = np.column_stack([(corners - np.array(shape[::-1]) / 2) / half, np.ones(4)])
     sides = [np.cross(points[k], points[(k + 1) % 4]) for k in range(4)]
     across, along = np.cross(sides[0], sides[2]), np.cross(sides[1], sides[3])
@@ -404,7 +405,7 @@ def warp_picture(picture: Array, step: Array) -> tuple[Array, Array]:
     corners = np.array([[0, 0, 1], [w - 1, 0, 1], [w - 1, h - 1, 1], [0, h - 1, 1]], float) @ np.linalg.inv(step).T
     corners = corners[:, :2] / corners[:, 2:]
     centre = move_places(np.linalg.inv(step), np.array([[(w - 1) / 2, (h - 1) / 2]]))[0]
-    grow = 1.0 / np.sqrt(measure_growth(step, centre))
+    grow = np.sqrt(measure_growth(step, centre))  # so much finer, and a pixel stays as large as it was
     low, size = corners.min(axis=0), np.ptp(corners, axis=0) * grow
     size = np.minimum(np.ceil(size) + 1, MOST_GROWTH * np.array([w, h]))
     step = step @ np.array([[1 / grow, 0, low[0]], [0, 1 / grow, low[1]], [0, 0, 1]])
