@@ -10,10 +10,17 @@ from scipy import ndimage
 from tests.io.test_drawings import draw, draw_case, one_hot
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
-from topomerge.io.drawing import ParsedDrawing, PictureText, TracedDrawing, build_stairs_landmarks, find_structure
+from topomerge.io.drawing import (
+    ParsedDrawing,
+    PictureText,
+    TracedDrawing,
+    build_stairs_landmarks,
+    find_structure,
+    parse_drawing,
+)
 from topomerge.io.drawn_page import DrawnPage, find_homography, find_page, move_places
 from topomerge.io.drawn_storeys import find_storeys, parse_storey
-from topomerge.io.grid import build_drawn_pieces
+from topomerge.io.grid import build_drawn_pieces, read_picture
 from topomerge.io.piece import ReadOptions
 from topomerge.io.points import read_points
 from topomerge.networks.drawing import DRAWING_CLASSES
@@ -165,6 +172,41 @@ def test_a_blueprint_has_its_rooms(tmp_path):
     Image.fromarray((np.array([20, 60, 140]) * (1 - share) + 240 * share).astype(np.uint8)).save(path)
     map = extract(read_points(path, resolution=0.02, text=False))
     assert len(map.rooms) == 5 and any("dark lines on light paper" in warning for warning in map.warnings)
+
+
+@pytest.mark.parametrize("how", ["turned", "mirrored", "transparent", "16 bits", "JPEG", "half as large"])
+def test_the_same_plan_in_other_files(tmp_path, how):
+    sheet = Image.open(draw_case(tmp_path / "plan.png"))
+    path, factor = tmp_path / ("a.jpg" if how == "JPEG" else "a.png"), 1.0
+    if how == "turned":
+        sheet = sheet.transpose(Image.Transpose.ROTATE_90)
+    elif how == "mirrored":
+        sheet = sheet.transpose(Image.Transpose.FLIP_LEFT_RIGHT)
+    elif how == "transparent":
+        sheet.putalpha(Image.fromarray(((np.asarray(sheet).mean(axis=2) < 250) * 255).astype(np.uint8)))
+    elif how == "16 bits":
+        sheet = Image.fromarray(np.asarray(sheet.convert("L")).astype(np.uint16) * 257)
+    elif how == "half as large":
+        sheet, factor = sheet.resize((380, 300), Image.Resampling.BOX), 2.0
+    sheet.save(path)
+    page = find_page(read_picture(path))
+    assert page is not None and not page.mended
+    parsed = parse_drawing(page.picture, 0.02 * factor)
+    assert int(ndimage.label(parsed.free & ~parsed.door)[1]) == 5
+
+
+def test_a_picture_of_a_cat_has_no_walls(tmp_path):
+    cat = Image.new("RGB", (400, 400), "white")
+    pen = ImageDraw.Draw(cat)
+    pen.polygon(((120, 150), (130, 60), (190, 120)), fill=(90, 70, 50))
+    pen.polygon(((280, 150), (270, 60), (210, 120)), fill=(90, 70, 50))
+    pen.ellipse((110, 100, 290, 300), fill=(120, 95, 70))
+    for x in (160, 240):
+        pen.ellipse((x - 12, 170, x + 12, 200), fill=(60, 160, 60))
+    cat.save(tmp_path / "cat.png")
+    with pytest.raises(InputError, match="no walls around a room") as refusal:
+        read_points(tmp_path / "cat.png", resolution=0.02, text=False)
+    assert "cat.png" in str(refusal.value) and "\n" not in str(refusal.value)
 
 
 @pytest.mark.parametrize(

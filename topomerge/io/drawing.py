@@ -26,6 +26,7 @@ SMALLEST_STAIRS = 0.8  # m2
 USUAL_SCALE = 25.0  # px/m, where none is known
 WALL_NEAR = 0.5  # m from a room: what lies farther off is no wall of the building
 GAP = 3  # px of walls that the network missed
+SQUARE, LEAST_STRAIGHT = 7, 0.3  # degrees; of the outline of walls, at least: of a ring .17, of plans .38 to .9
 TREAD = 0.3  # m, usual depth
 WALLED = 0.4  # of a room's outline is wall or door, at least
 FOOT, INCH = 0.3048, 0.0254  # m
@@ -167,6 +168,19 @@ def measure_walled_share(label: Array, count: int, wall: Array) -> Array:
         outline = ndimage.binary_dilation(part, np.ones((3, 3)), 2) & ~part
         out[number - 1] = wall[wide][outline].mean() if outline.any() else 0.0
     return out
+
+
+def measure_straight_share(wall: Array) -> float:
+    """Measure the share of the outline of a mask (h, w) that runs along its two commonest directions, square to each other."""
+    smooth = ndimage.gaussian_filter(wall.astype(np.float32), 1.5)
+    across, along = ndimage.sobel(smooth, axis=0), ndimage.sobel(smooth, axis=1)
+    weight = np.hypot(across, along)
+    angle = (np.degrees(np.arctan2(across, along)) % 90.0).astype(int) % 90
+    counts = np.bincount(angle.ravel(), weight.ravel(), 90)
+    if not counts.any():
+        return 0.0
+    window = np.convolve(np.concatenate([counts, counts[: 2 * SQUARE]]), np.ones(2 * SQUARE + 1), "valid")
+    return float(window.max() / counts.sum())
 
 
 def drop_small(mask: Array, least: float) -> Array:
@@ -312,7 +326,7 @@ def trace_drawing(
     stated = None if paper is None else find_stated_scale(texts or ())
     known = resolution if resolution is not None or stated is None or paper is None else paper * stated
     drawing = parse_drawing(picture, known)
-    if not drawing.free.any():
+    if not drawing.free.any() or measure_straight_share(drawing.occupied) < LEAST_STRAIGHT:
         raise InputError(f"{path}: no walls around a room were found in it; if it is a robot's grid, give --no-drawing")
     said = [f"{path.name}: was read as a drawn plan, without its page, texts and furniture"]
     if page.mended:
