@@ -16,9 +16,9 @@ from topomerge.io.drawing import (
     estimate_scale,
     find_name,
     find_structure,
-    is_drawing,
     parse_lengths,
 )
+from topomerge.io.drawn_page import find_page
 from topomerge.io.points import read_points
 from topomerge.networks.drawing import DRAWING_CLASSES, compute_drawing_probabilities
 
@@ -156,25 +156,27 @@ def test_a_text_of_another_room_is_outvoted_and_doors_are_the_last_resort():
     assert not by_doors.written and by_doors.resolution == pytest.approx(1 / 30, rel=0.2) and by_doors.spread > 0.1
 
 
+def paint(grey):
+    """A picture of greys of 0..1."""
+    return np.repeat(np.round(grey * 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
 def test_grids_of_robots_are_no_drawings():
     grid = np.full((200, 200), 205 / 255)
     grid[50:150, 50:150] = 254 / 255
     grid[50:150, 50] = 0
-    clear = np.zeros(grid.shape, bool)
-    assert not is_drawing(grid, clear)
-    page = draw().picture.mean(axis=2) / 255
-    assert is_drawing(page, np.zeros(page.shape, bool))
-    assert not is_drawing(1 - page, np.zeros(page.shape, bool))
-    assert not is_drawing(page[:50, :50], np.zeros((50, 50), bool))
+    assert find_page(paint(grid)) is None
+    page = find_page(draw().picture)
+    assert page is not None and not page.mended and (page.matrix == np.eye(3)).all()
+    assert find_page(draw().picture[:50, :50]) is None
 
 
 def test_rooms_painted_in_colours_as_bright_as_unknown_are_no_grid():
     page = np.full((200, 200, 3), 255, np.uint8)
     page[50:150, 50:150] = 222, 205, 188
-    bright = page.mean(axis=2) / 255
-    assert is_drawing(bright, np.zeros(bright.shape, bool), page)
+    assert find_page(page) is not None
     page[50:150, 50:150] = 205
-    assert not is_drawing(page.mean(axis=2) / 255, np.zeros(bright.shape, bool), page)
+    assert find_page(page) is None
 
 
 def test_floor_without_walls_is_no_room():

@@ -126,7 +126,12 @@ EXTRACT = Command(
             const=False,
             help="dark pixels of a plain image are walls, also where it is a page with a drawn plan",
         ),
-        build_option("--page", type=parse_count, metavar="N", help="page of a PDF, from 1 (default: the only one with content)"),
+        build_option(
+            "--page",
+            type=parse_count,
+            metavar="N",
+            help="page of a PDF, from 1 (default: the only one with content), or plan of a picture",
+        ),
         build_option("--extrude", type=parse_positive, metavar="H", help="m of wall height for 2D maps (default 2.5)"),
         build_option("--ceiling", action="store_true", help="close 2D maps with a ceiling"),
         build_option(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +26,19 @@ from topomerge.evaluation.documents import group_rows, write_mean, write_share, 
 from topomerge.evaluation.tasks import Row, TaskSettings, find_optional_data, limit_cases, measure_missing
 from topomerge.extraction.extract import extract
 from topomerge.io.drawing import estimate_scale, find_name, parse_drawing, read_texts
+from topomerge.io.drawn_page import find_page, move_places
 from topomerge.io.points import read_points
 from topomerge.metrics import match_places, score_rooms
-from topomerge.networks.drawing import DOOR, WALL, WINDOW
+from topomerge.networks.drawing import DOOR, PAGE, WALL, WINDOW
 from topomerge.types import Array, LogFn, TopometricMap
 
-MAKERS = ("topomerge.io.drawing", "topomerge.io.grid", "topomerge.networks.drawing", "topomerge.extraction.extract")
+MAKERS = (
+    "topomerge.io.drawing",
+    "topomerge.io.drawn_page",
+    "topomerge.io.grid",
+    "topomerge.networks.drawing",
+    "topomerge.extraction.extract",
+)
 LARGEST_SIDE, FEWEST_ROOMS = 1100, 3  # px of a page; rooms of a plan
 WALL_NEAR, DOOR_NEAR, SCALE_NEAR = 0.1, 0.5, 0.03  # m, m, share
 EVERY = {"r2v": 3, "campus": 1, "procedural": 1}  # of a source's plans, every n-th
@@ -115,6 +122,7 @@ def measure_page(page: Page, texts: bool) -> Row:
         Image.fromarray(drawing.picture).save(path)
         try:
             map = extract(read_points(path, resolution=resolution))
+            drawing = straighten_truth(drawing)
         except ValueError as error:
             return row | {"failed": str(error).partition(": ")[2], "iou": 0.0, "precision": 0.0, "recall": 0.0, "walls": 0.0}
     row |= score_map(map, drawing, resolution)
@@ -127,6 +135,21 @@ def measure_page(page: Page, texts: bool) -> Row:
         names = [t for t in drawing.texts if t.room >= 0 and find_name(t.text)]
         row["names"] = [sum(_is_read(t, found, drawing) for t in names), len(names)]
     return row
+
+
+def straighten_truth(drawing: Drawing) -> Drawing:
+    """Return a drawing and its truth as they lie on the page that is read."""
+    page = find_page(drawing.picture)
+    if page is None or not page.mended:
+        return drawing
+    height, width = page.picture.shape[:2]
+    columns, rows = np.meshgrid(np.arange(width), np.arange(height))
+    places = np.rint(move_places(page.matrix, np.column_stack([columns.ravel(), rows.ravel()]))).astype(int)
+    column, row = np.clip(places, 0, np.array(drawing.classes.shape[::-1]) - 1).T
+    inside = ((places >= 0) & (places < drawing.classes.shape[::-1])).all(axis=1)
+    rooms = np.where(inside, drawing.rooms[row, column], -1).reshape(height, width).astype(np.int16)
+    classes = np.where(inside, drawing.classes[row, column], PAGE).reshape(height, width).astype(np.uint8)
+    return replace(drawing, picture=page.picture, classes=classes, rooms=rooms)
 
 
 def _is_read(text: Any, found: Sequence[Any], drawing: Drawing) -> bool:

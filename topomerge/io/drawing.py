@@ -5,28 +5,29 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
 
 from topomerge.errors import InputError
+from topomerge.io.drawn_page import DrawnPage, move_places
 from topomerge.io.pictures import load_text_reader
 from topomerge.io.sightings import clean_text
-from topomerge.networks.drawing import DOOR, FLOOR, PAGE, WALL, WINDOW, compute_drawing_probabilities
+from topomerge.networks.drawing import DOOR, FLOOR, PAGE, STAIRS, WALL, WINDOW, compute_drawing_probabilities
 from topomerge.networks.network import Run
 from topomerge.types import Array, Landmarks, build_landmarks, join_landmarks
 
 FINEST, COARSEST = 0.04, 0.12  # m a pixel: what the network was trained on lies between 0.02 and 0.125
 LONGEST_SIDE = 640  # px at which a picture of unknown scale is looked at
-BRIGHT, BRIGHT_SHARE = 0.6, 0.8  # of the brightness, and of the pixels along the border of a page
-GREY_OF_UNKNOWN, GREY_WIDTH, GREY_SHARE = 205, 6, 0.03  # levels of 255: a robot's grid has so much of it
-COLOURLESS = 8  # levels of 255 between red, green and blue
 SMALLEST_ROOM, SMALLEST_WALL, SMALLEST_DOOR = 0.7, 0.35, 0.04  # m2: less is a letter or a mark
+SMALLEST_STAIRS = 0.8  # m2
 USUAL_SCALE = 25.0  # px/m, where none is known
 WALL_NEAR = 0.5  # m from a room: what lies farther off is no wall of the building
 GAP = 3  # px of walls that the network missed
+SQUARE, LEAST_STRAIGHT = 7, 0.3  # degrees; of the outline of walls, at least: of a ring .17, of plans .38 to .9
+TREAD = 0.3  # m, usual depth
 WALLED = 0.4  # of a room's outline is wall or door, at least
 FOOT, INCH = 0.3048, 0.0254  # m
 PLAUSIBLE_AREA, PLAUSIBLE_SIDE = (0.8, 3000.0), (0.6, 100.0)  # m2, m
@@ -64,6 +65,7 @@ class ParsedDrawing:
     Args:
         occupied: (h, w) bool, walls and windows; free: floor and open doors; door, window: (h, w) bool.
         zoom: pixels of these for each of the picture.
+        stairs: (h, w) bool, treads; None: there are none.
     """
 
     occupied: Array
@@ -71,6 +73,7 @@ class ParsedDrawing:
     door: Array
     window: Array
     zoom: float
+    stairs: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -88,31 +91,7 @@ class DrawingScale:
     written: bool = True
 
 
-LEAST_PIXELS = 100  # of a side of a page
 SMALL_PICTURE = 1000  # px of its longer side, below which letters are enlarged
-
-
-def is_drawing(bright: Array, clear: Array, picture: Array | None = None) -> bool:
-    """Return whether a picture is a drawing on a page, and not the grid of a robot.
-
-    Args:
-        bright: (h, w) of 0..1; clear: (h, w) bool, transparent.
-        picture: (h, w, 3) uint8, its colours: what has any is no grey of unknown.
-    """
-    if min(bright.shape) < LEAST_PIXELS or not has_bright_border(bright, clear):
-        return False
-    levels = np.round(np.nan_to_num(np.where(clear, 1.0, bright)).clip(0, 1) * 255).astype(np.int32)
-    grey = np.ones(levels.shape, bool) if picture is None else np.ptp(picture, axis=2) <= COLOURLESS
-    histogram = np.bincount(levels[grey], minlength=256) / levels.size
-    unknown = histogram[GREY_OF_UNKNOWN - GREY_WIDTH : GREY_OF_UNKNOWN + GREY_WIDTH + 1]
-    return not (unknown.sum() > GREY_SHARE and unknown.max() > 0.6 * unknown.sum())
-
-
-def has_bright_border(bright: Array, clear: Array) -> bool:
-    """Return whether the border of a picture is that of a page: (h, w) of 0..1, and whether it is transparent."""
-    lines = [np.where(clear[at], 1.0, bright[at]) for at in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1])]
-    levels = np.round(np.nan_to_num(np.concatenate(lines)).clip(0, 1) * 255)
-    return bool((levels > BRIGHT * 255).mean() >= BRIGHT_SHARE)
 
 
 def parse_drawing(picture: Array, resolution: float | None = None, network: Run | None = None) -> ParsedDrawing:
@@ -175,7 +154,9 @@ def find_structure(probability: Array, zoom: float, scale: float | None) -> Pars
     doors, _ = ndimage.label(door)
     door &= np.isin(doors, np.unique(doors[ndimage.binary_dilation(rooms, np.ones((3, 3)), 2)]))
     near = ndimage.distance_transform_edt(~(rooms | door)) <= WALL_NEAR * known
-    return ParsedDrawing(occupied & near, rooms | door, door, window & near, zoom)
+    treads = ndimage.binary_closing(kind == STAIRS, np.ones((3, 3)), max(round(TREAD / 2 * known), 1))
+    stairs = drop_small(treads & rooms, SMALLEST_STAIRS * known**2)
+    return ParsedDrawing(occupied & near, rooms | door, door, window & near, zoom, stairs)
 
 
 def measure_walled_share(label: Array, count: int, wall: Array) -> Array:
@@ -187,6 +168,19 @@ def measure_walled_share(label: Array, count: int, wall: Array) -> Array:
         outline = ndimage.binary_dilation(part, np.ones((3, 3)), 2) & ~part
         out[number - 1] = wall[wide][outline].mean() if outline.any() else 0.0
     return out
+
+
+def measure_straight_share(wall: Array) -> float:
+    """Measure the share of the outline of a mask (h, w) that runs along its two commonest directions, square to each other."""
+    smooth = ndimage.gaussian_filter(wall.astype(np.float32), 1.5)
+    across, along = ndimage.sobel(smooth, axis=0), ndimage.sobel(smooth, axis=1)
+    weight = np.hypot(across, along)
+    angle = (np.degrees(np.arctan2(across, along)) % 90.0).astype(int) % 90
+    counts = np.bincount(angle.ravel(), weight.ravel(), 90)
+    if not counts.any():
+        return 0.0
+    window = np.convolve(np.concatenate([counts, counts[: 2 * SQUARE]]), np.ones(2 * SQUARE + 1), "valid")
+    return float(window.max() / counts.sum())
 
 
 def drop_small(mask: Array, least: float) -> Array:
@@ -304,32 +298,39 @@ class TracedDrawing:
 
 def trace_drawing(
     path: Path,
-    picture: Array,
+    page: DrawnPage,
     resolution: float | None,
     texts: Sequence[PictureText] | None = None,
-    page: float | None = None,
+    paper: float | None = None,
     text: bool | None = None,
 ) -> TracedDrawing:
     """Find walls and floor of a drawing, and how large it is.
 
     Args:
         path: for messages.
-        picture: (h, w, 3) uint8.
+        page: of the drawing.
         resolution: m a pixel; None: by what is written on it, or by its doors.
-        texts: of the picture, if they are known; None: they are read where a reader is installed, unless `text` is False.
-        page: m of paper a pixel, where the file says so: "1:100" is a scale then.
+        texts: of the picture that holds the page, if they are known; None: they are read where a reader is installed, unless
+            `text` is False.
+        paper: m of paper a pixel, where the file says so: "1:100" is a scale then.
 
     Raises:
         InputError: it shows no room, or nothing says how large it is.
     """
+    picture = page.picture
     if texts is None:
         texts = read_texts(picture) if text is not False else ()
-    stated = None if page is None else find_stated_scale(texts or ())
-    known = resolution if resolution is not None or stated is None or page is None else page * stated
+    elif page.mended:
+        places = move_places(np.linalg.inv(page.matrix), np.array([t.place for t in texts]).reshape(-1, 2))
+        texts = [replace(t, place=(float(x), float(y))) for t, (x, y) in zip(texts, places, strict=True)]
+    stated = None if paper is None else find_stated_scale(texts or ())
+    known = resolution if resolution is not None or stated is None or paper is None else paper * stated
     drawing = parse_drawing(picture, known)
-    if not drawing.free.any():
+    if not drawing.free.any() or measure_straight_share(drawing.occupied) < LEAST_STRAIGHT:
         raise InputError(f"{path}: no walls around a room were found in it; if it is a robot's grid, give --no-drawing")
     said = [f"{path.name}: was read as a drawn plan, without its page, texts and furniture"]
+    if page.mended:
+        said.append(f"{path.name}: its page was {', '.join(page.mended)} first; places are those on that page")
     if resolution is None:
         scale = estimate_scale(drawing, texts or ())
         if known is not None and not (scale and scale.written and abs(np.log(scale.resolution / known)) > AGREEING):
@@ -377,6 +378,17 @@ def build_name_landmarks(
         confidence = np.array([t.confidence for _, t in some])
         parts.append(build_landmarks(kind, [name for name, _ in some], source, places, sigma=NAME_SIGMA, confidence=confidence))
     return join_landmarks(parts)
+
+
+def build_stairs_landmarks(
+    stairs: Array | None, resolution: float, corner: tuple[float, float], height: float, source: str
+) -> Landmarks:
+    """Build an object "stairs" in the middle of each flight of a mask (h, w); the rest as `build_name_landmarks`."""
+    label, count = ndimage.label(np.zeros((1, 1), bool) if stairs is None else stairs)
+    middles = np.array(ndimage.center_of_mass(label > 0, label, np.arange(1, count + 1))).reshape(-1, 2)
+    x, y = corner[0] + (middles[:, 1] + 0.5) * resolution, corner[1] + (len(label) - middles[:, 0] - 0.5) * resolution
+    places = np.stack([x, y, np.full(count, height)], axis=1)
+    return build_landmarks("object", ["stairs"] * count, source, places, sigma=NAME_SIGMA)
 
 
 def read_texts(picture: Array) -> tuple[PictureText, ...] | None:

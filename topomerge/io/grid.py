@@ -6,7 +6,7 @@ import math
 import reprlib
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -15,14 +15,9 @@ from scipy import ndimage
 
 from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError
-from topomerge.io.drawing import (
-    NAME_HEIGHT,
-    TracedDrawing,
-    build_name_landmarks,
-    has_bright_border,
-    is_drawing,
-    trace_drawing,
-)
+from topomerge.io.drawing import NAME_HEIGHT, TracedDrawing, build_name_landmarks, build_stairs_landmarks, trace_drawing
+from topomerge.io.drawn_page import find_page
+from topomerge.io.drawn_storeys import find_storeys
 from topomerge.io.piece import (
     BLOCK_POINTS,
     MOST_POINTS,
@@ -32,13 +27,14 @@ from topomerge.io.piece import (
     build_count_error,
     build_damage_error,
 )
-from topomerge.types import Array, Landmarks
+from topomerge.types import Array, Landmarks, join_landmarks
 
 JUDGED_FLOOR = 4.0  # m2 of floor below which nothing is judged
 OUTSIDE_SHARE = 1 / 3  # of the floor: more outside of every wall is suspicious; of real maps that are read rightly up to .26 is
 FEW_WALLS = 4  # of 8 directions in which a place outside of the walls meets one, at most
 PIXELS_LOOKED_AT = 4_000_000  # of a larger picture every second, third ... pixel
 BODY_RADIUS = 0.25  # m; floor where no body fits is no floor but the lines of walls
+SLAB = 0.3  # m between the walls of a drawn storey and the next floor
 NARROW, WIDE = 0.1, 0.3  # of the pixels of walls, at most, and of floor, at least, that lie deeper than that in what is like them
 
 
@@ -225,8 +221,9 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         if options.resolution is not None:
             raise InputError(f"{path}: states its own resolution of {plan.resolution:g} m; leave --resolution out")
         occupied, free, doubts = read_pixels(path, plan)
-    elif options.drawing and has_bright_border(*(page := read_image(path))) and is_drawing(*page, drawn := read_picture(path)):
-        yield from build_drawn_pieces(path, trace_drawing(path, drawn, options.resolution, text=options.text), options)
+    elif options.drawing and (page := find_page(read_picture(path))) is not None:
+        traced = trace_drawing(path, page, options.resolution, text=options.text)
+        yield from build_drawn_pieces(path, traced, options, options.page)
         return
     elif options.resolution is None:
         beside = next((b for b in (path.with_suffix(".yaml"), path.with_suffix(".yml")) if b.is_file()), None)
@@ -235,18 +232,37 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     else:
         plan = Plan(path, options.resolution)
         occupied, free, doubts = read_pixels(path, plan)
+    if options.page is not None:
+        raise InputError(f"{path}: is no page with drawn plans; leave --page out")
     yield Piece(np.empty((0, 3)), warnings=(*plan.warnings, *doubts), landmarks=names, done=0.1)
     # The grid is metric already; only a --scale is left to undo in the lengths that are given in metres.
     yield from extrude(path, occupied, free, plan, options)
 
 
-def build_drawn_pieces(path: Path, traced: TracedDrawing, options: ReadOptions) -> Iterator[Piece]:
-    """Yield the floor and the walls of a drawing, and the names of its rooms."""
-    drawing, plan = traced.drawing, Plan(path, traced.resolution)
-    height = NAME_HEIGHT / options.factor
-    names = build_name_landmarks(traced.texts, drawing.free, plan.resolution, (0.0, 0.0), height, path.name)
-    yield Piece(np.empty((0, 3)), warnings=traced.warnings, done=0.1, landmarks=names)
-    yield from extrude(path, drawing.occupied, drawing.free, plan, options)
+def build_drawn_pieces(path: Path, traced: TracedDrawing, options: ReadOptions, number: int | None = None) -> Iterator[Piece]:
+    """Yield the floor and the walls of each storey of a drawing, the names of its rooms and its stairs.
+
+    Args:
+        number: of the only plan that is read, from 1; None: all.
+
+    Raises:
+        InputError: there is no plan of this number.
+    """
+    storeys, warnings = find_storeys(path, traced, number)
+    height = (options.extrude + SLAB) / options.factor
+    parts, grids = [], []
+    for level, storey in enumerate(storeys):
+        plan = Plan(path, traced.resolution, (*storey.corner, 0.0))
+        at = storey.corner, NAME_HEIGHT / options.factor + level * height, path.name
+        parts.append(build_name_landmarks(traced.texts, storey.free, plan.resolution, *at))
+        parts.append(build_stairs_landmarks(storey.stairs, plan.resolution, *at))
+        grids.append(plan)
+    yield Piece(np.empty((0, 3)), warnings=(*traced.warnings, *warnings), done=0.1, landmarks=join_landmarks(parts))
+    closed = options if len(storeys) == 1 else replace(options, ceiling=True)  # else the next floor is the ceiling
+    for level, (storey, plan) in enumerate(zip(storeys, grids, strict=True)):
+        for piece in extrude(path, storey.occupied, storey.free, plan, closed):
+            raised = piece.points + [0.0, 0.0, level * height] if level else piece.points
+            yield replace(piece, points=raised, done=0.1 + 0.9 * (level + piece.done) / len(storeys))
 
 
 def read_picture(path: Path) -> Array:

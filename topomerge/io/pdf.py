@@ -16,6 +16,7 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.drawing import PictureText, trace_drawing
+from topomerge.io.drawn_page import DrawnPage, find_page
 from topomerge.io.grid import build_drawn_pieces
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_head, read_in_subprocess
 from topomerge.types import Array
@@ -54,7 +55,9 @@ def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
     with document:
         page = document[choose_page(path, document, options.page)]
         picture, texts, dots = draw_page(path, page)
-    traced = trace_drawing(path, picture, options.resolution, texts or None, POINT / dots, options.text)
+    traced = trace_drawing(
+        path, find_page(picture) or DrawnPage(picture), options.resolution, texts or None, POINT / dots, options.text
+    )
     yield from build_drawn_pieces(path, traced, options)
 
 

@@ -130,7 +130,7 @@ class ReadOptions:
             of a topic with poses. None: what lies beside the scans, or what the bag holds.
         one_frame: read all files of a folder as parts of one cloud, whose points lie in one frame.
         topic: of a bag, where it has several with points or maps.
-        page: of a PDF file, from 1; None: the only one that holds anything.
+        page: of a PDF file, from 1; None: the only one that holds anything. Of a picture with several plans: which; None: all.
         text: read signs and tags on pictures. True: must; None: where the packages for that are installed; False: don't.
     """
 

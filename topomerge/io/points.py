@@ -318,7 +318,7 @@ FORMATS = (
     Format("a DXF drawing", "dxf", (".dxf",), extra="dxf", takes=("extrude", "ceiling")),
     Format("a PDF drawing", "pdf", (".pdf",), fixed=True, extra="pdf", takes=(*DRAWN, "page")),
     Format("an SVG drawing", "svg", (".svg",), fixed=True, extra="svg", takes=DRAWN),
-    Format("a floor plan", "grid", (".yaml", ".yml", *PICTURES), fixed=True, takes=DRAWN),
+    Format("a floor plan", "grid", (".yaml", ".yml", *PICTURES), fixed=True, takes=(*DRAWN, "page")),
 )
 SCAN_FOLDER = Format("a folder of scans", "scan_folder", (), takes=("poses",))
 TILES_FOLDER = Format("a folder of files of one frame", "tiles", (), takes=("one_frame",))
@@ -344,7 +344,8 @@ def read_points(path: str | Path, *, progress: Progress | None = None, **options
         progress: called now and then with the share done and a text.
         options: those of `topomerge.io.piece.ReadOptions`: ``up``, ``unit``, ``scale`` of the coordinates; ``resolution``,
             ``extrude``, ``ceiling`` of floor plans; ``spacing`` of points on surfaces; ``doors`` of building models; ``poses``
-            and ``topic`` of scans; ``one_frame`` of a folder of parts of one cloud; ``text`` of pictures; ``page`` of a PDF.
+            and ``topic`` of scans; ``one_frame`` of a folder of parts of one cloud; ``text`` of pictures; ``page`` of a PDF
+            or, of a picture with several plans, which.
 
     Raises:
         InputError: anything that keeps the file from being read, or a wrong option, in one line.

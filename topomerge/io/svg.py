@@ -17,6 +17,7 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.drawing import PictureText, trace_drawing
+from topomerge.io.drawn_page import DrawnPage, find_page
 from topomerge.io.grid import build_drawn_pieces
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_in_subprocess
 from topomerge.types import Array
@@ -50,7 +51,8 @@ def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
     zoom = min(max(longest, SHORTEST_SIDE), LONGEST_SIDE) / longest
     picture = draw_svg(path, root, size, zoom)
     page = 0.0254 / PIXELS_AN_INCH / zoom if paper else None
-    traced = trace_drawing(path, picture, options.resolution, find_svg_texts(root, size, zoom) or None, page, options.text)
+    drawn = find_page(picture) or DrawnPage(picture)
+    traced = trace_drawing(path, drawn, options.resolution, find_svg_texts(root, size, zoom) or None, page, options.text)
     yield from build_drawn_pieces(path, traced, options)
 
 

@@ -1,0 +1,331 @@
+"""Pages of drawings as pictures show them: on tables and screens, tilted, in shade, light on dark, several plans on a sheet."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image, ImageDraw
+from scipy import ndimage
+
+from tests.io.test_drawings import draw, draw_case, one_hot
+from topomerge.errors import InputError
+from topomerge.extraction.extract import extract
+from topomerge.io.drawing import (
+    ParsedDrawing,
+    PictureText,
+    TracedDrawing,
+    build_stairs_landmarks,
+    find_structure,
+    parse_drawing,
+)
+from topomerge.io.drawn_page import DrawnPage, find_homography, find_page, move_places
+from topomerge.io.drawn_storeys import find_storeys, parse_storey
+from topomerge.io.grid import build_drawn_pieces, read_picture
+from topomerge.io.piece import ReadOptions
+from topomerge.io.points import read_points
+from topomerge.networks.drawing import DRAWING_CLASSES
+
+SHEET = 842, 595  # px, of A4
+
+
+def draw_sheet():
+    """An A4 page with three rooms as outlines of walls, 3 px wide."""
+    sheet = Image.new("RGB", SHEET, "white")
+    pen = ImageDraw.Draw(sheet)
+    for box in ((120, 90, 720, 500), (120, 90, 420, 300), (420, 90, 720, 300)):
+        pen.rectangle(box, outline="black", width=3)
+    return sheet
+
+
+def photograph(sheet, tilt=25.0, pan=-15.0, roll=5.0, table=(60, 40, 30), shade=0.4, zoom=1.0):
+    """Photograph a sheet with a camera of usual lens: the picture, and the (4, 2) corners of the sheet on it."""
+    size = np.array([1000, 760])
+    half, focal = np.hypot(*size) / 2, 1.3 * np.hypot(*size) / 2
+    t, p, r = np.radians([tilt, pan, roll])
+    about_x = np.array([[1, 0, 0], [0, np.cos(t), -np.sin(t)], [0, np.sin(t), np.cos(t)]])
+    about_y = np.array([[np.cos(p), 0, np.sin(p)], [0, 1, 0], [-np.sin(p), 0, np.cos(p)]])
+    about_z = np.array([[np.cos(r), -np.sin(r), 0], [np.sin(r), np.cos(r), 0], [0, 0, 1]])
+    w, h = sheet.size
+    flat = np.array([[0, 0], [w, 0], [w, h], [0, h]], float)
+    space = np.column_stack([flat - [w / 2, h / 2], np.zeros(4)]) @ (about_z @ about_y @ about_x).T + [0, 0, 1.5 * half / zoom]
+    corners = space[:, :2] / space[:, 2:] * focal + size / 2
+    step = find_homography(corners, flat)
+    how = tuple(size.tolist()), Image.Transform.PERSPECTIVE, (step / step[2, 2]).ravel()[:8], Image.Resampling.BICUBIC
+    on = np.asarray(Image.new("L", sheet.size, 255).transform(*how)) > 0
+    rng = np.random.default_rng(1)
+    out = np.where(on[..., None], np.asarray(sheet.transform(*how), float), np.array(table, float))
+    light = 1 - shade * np.linspace(0, 1, size[0])[None, :, None]
+    out = ndimage.gaussian_filter(out * light, (0.6, 0.6, 0)) + rng.normal(0, 3, out.shape)
+    return out.clip(0, 255).astype(np.uint8), corners
+
+
+@pytest.mark.parametrize(("tilt", "pan", "roll"), [(0, 0, 0), (30, 0, 0), (25, -15, 5), (-20, 20, -10)])
+@pytest.mark.parametrize("table", [(60, 40, 30), (20, 20, 20), (150, 150, 155)])
+def test_a_photographed_page_is_cut_out_and_straight(tilt, pan, roll, table):
+    picture, corners = photograph(draw_sheet(), tilt, pan, roll, table)
+    page = find_page(picture)
+    assert page is not None and page.mended[0].startswith("cut out")
+    h, w = page.picture.shape[:2]
+    assert w / h == pytest.approx(SHEET[0] / SHEET[1], rel=0.01)
+    found = move_places(page.matrix, np.array([[0, 0], [w, 0], [w, h], [0, h]], float))
+    assert np.abs(found - corners).max() < 12
+    assert np.median(page.picture[:10]) > 225 and np.median(page.picture[:, -10:]) > 225  # lit evenly
+    check_straight(page, corners, 0.02)
+
+
+def check_straight(page, corners, near):
+    """The outer walls on a page stand square to each other, as long as they are drawn but for one factor."""
+    w, h = SHEET
+    sheet = find_homography(np.array([[0, 0], [w, 0], [w, h], [0, h]], float), corners)
+    walls = move_places(np.linalg.inv(page.matrix), move_places(sheet, WALLS))
+    sides = np.roll(walls, -1, axis=0) - walls
+    off = np.degrees(np.arctan2(sides[:, 1], sides[:, 0])) - [0, 90, 180, -90]
+    assert np.abs((off + 180) % 360 - 180).max() < 0.8
+    length = np.hypot(*sides.T)
+    assert length[0] == pytest.approx(length[2], rel=0.02) and length[1] == pytest.approx(length[3], rel=0.02)
+    assert length[0] / length[1] == pytest.approx(600 / 410, rel=near)
+    seen = move_places(sheet, WALLS)
+    assert length[0] * length[1] == pytest.approx(measure_area(seen), rel=0.15)  # pixels are as large as they were
+
+
+def measure_area(ring):
+    x, y = ring.T
+    return 0.5 * abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))
+
+
+WALLS = np.array([[120, 90], [720, 90], [720, 500], [120, 500]], float)
+
+
+@pytest.mark.parametrize(("tilt", "pan", "roll"), [(25, 0, 0), (20, -15, 4)])
+def test_a_page_that_fills_the_picture_is_straightened_by_its_lines(tilt, pan, roll):
+    picture, corners = photograph(draw_sheet(), tilt, pan, roll, table=(255, 255, 255), shade=0.3)
+    page = find_page(picture)
+    assert page is not None and "straightened by its lines" in page.mended
+    check_straight(page, corners, 0.06)
+
+
+def test_a_straight_photograph_and_a_drawing_with_an_oblique_wing_stay():
+    picture, _ = photograph(draw_sheet(), 0, 0, 0, table=(255, 255, 255), shade=0.3)
+    assert "straightened by its lines" not in find_page(picture).mended
+    sheet = draw_sheet()
+    pen = ImageDraw.Draw(sheet)
+    for k in range(12):
+        pen.line((150, 320 + 8 * k, 650, 380 + 8 * k), fill="black", width=2)
+    assert not find_page(np.asarray(sheet)).mended
+
+
+@pytest.mark.parametrize("paper", [(0, 0, 0), (20, 60, 140), (70, 75, 80)])
+def test_light_lines_on_dark_paper_are_turned(paper):
+    share = 1 - draw().picture.mean(axis=2, keepdims=True) / 255
+    picture = (np.array(paper) * (1 - share) + 240 * share).astype(np.uint8)
+    page = find_page(picture)
+    assert page.mended == ("turned into dark lines on light paper",)
+    true = draw().picture.mean(axis=2)
+    assert np.abs(page.picture.mean(axis=2) - true)[(true < 5) | (true > 250)].mean() < 12
+
+
+def test_light_floor_among_dark_walls_is_no_blueprint_and_no_page():
+    rng = np.random.default_rng(0)
+    grid = np.full((300, 300), 0.1)
+    grid[40:140, 40:260] = grid[150:260, 40:140] = grid[150:260, 150:260] = 0.95
+    noisy = paint_noisy(grid, rng)
+    assert find_page(noisy) is None
+    room = np.full((300, 300), 0.1)
+    room[40:260, 40:260] = 0.95
+    assert find_page(paint_noisy(room, rng)) is None  # a page without a line on it
+
+
+def paint_noisy(grey, rng):
+    return (np.repeat(grey[..., None], 3, axis=2) * 255 + rng.normal(0, 2, (*grey.shape, 3))).clip(0, 255).astype(np.uint8)
+
+
+def test_paper_as_grey_as_unknown_is_paper_where_nothing_is_lighter():
+    page = draw().picture.astype(float)
+    grey = (60 + page / 255 * 145).astype(np.uint8)  # a faint print on paper of 205
+    assert find_page(grey) is not None
+    grey[100:200, 100:200] = 254  # the floor of a grid
+    assert find_page(grey) is None
+
+
+def test_a_plan_on_a_dark_screen_has_its_rooms(tmp_path):
+    screen = Image.new("RGB", (960, 720), (50, 50, 50))
+    screen.paste(Image.open(draw_case(tmp_path / "plan.png")), (100, 60))
+    path = tmp_path / "screen.png"
+    screen.resize((959, 719), Image.Resampling.BILINEAR).save(path)  # as screens show it: lines have soft edges
+    map = extract(read_points(path, resolution=0.02, text=False))
+    assert len(map.rooms) == 5 and len(map.edges) == 4 and any("cut out" in warning for warning in map.warnings)
+
+
+@pytest.mark.longer
+def test_a_photograph_of_a_plan_has_its_rooms(tmp_path):
+    picture, _ = photograph(Image.open(draw_case(tmp_path / "plan.png")), 20, -10, 3)
+    path = tmp_path / "photo.png"
+    Image.fromarray(picture).save(path)
+    map = extract(read_points(path, resolution=0.026, text=False))
+    assert len(map.rooms) == 5 and (map.rooms["outside"] < 0.5).all()
+
+
+def test_a_blueprint_has_its_rooms(tmp_path):
+    sheet = np.asarray(Image.open(draw_case(tmp_path / "plan.png")))
+    path = tmp_path / "blue.png"
+    share = 1 - sheet.mean(axis=2, keepdims=True) / 255
+    Image.fromarray((np.array([20, 60, 140]) * (1 - share) + 240 * share).astype(np.uint8)).save(path)
+    map = extract(read_points(path, resolution=0.02, text=False))
+    assert len(map.rooms) == 5 and any("dark lines on light paper" in warning for warning in map.warnings)
+
+
+@pytest.mark.parametrize("how", ["turned", "mirrored", "transparent", "16 bits", "JPEG", "half as large"])
+def test_the_same_plan_in_other_files(tmp_path, how):
+    sheet = Image.open(draw_case(tmp_path / "plan.png"))
+    path, factor = tmp_path / ("a.jpg" if how == "JPEG" else "a.png"), 1.0
+    if how == "turned":
+        sheet = sheet.transpose(Image.Transpose.ROTATE_90)
+    elif how == "mirrored":
+        sheet = sheet.transpose(Image.Transpose.FLIP_LEFT_RIGHT)
+    elif how == "transparent":
+        sheet.putalpha(Image.fromarray(((np.asarray(sheet).mean(axis=2) < 250) * 255).astype(np.uint8)))
+    elif how == "16 bits":
+        sheet = Image.fromarray(np.asarray(sheet.convert("L")).astype(np.uint16) * 257)
+    elif how == "half as large":
+        sheet, factor = sheet.resize((380, 300), Image.Resampling.BOX), 2.0
+    sheet.save(path)
+    page = find_page(read_picture(path))
+    assert page is not None and not page.mended
+    parsed = parse_drawing(page.picture, 0.02 * factor)
+    assert int(ndimage.label(parsed.free & ~parsed.door)[1]) == 5
+
+
+def test_a_picture_of_a_cat_has_no_walls(tmp_path):
+    cat = Image.new("RGB", (400, 400), "white")
+    pen = ImageDraw.Draw(cat)
+    pen.polygon(((120, 150), (130, 60), (190, 120)), fill=(90, 70, 50))
+    pen.polygon(((280, 150), (270, 60), (210, 120)), fill=(90, 70, 50))
+    pen.ellipse((110, 100, 290, 300), fill=(120, 95, 70))
+    for x in (160, 240):
+        pen.ellipse((x - 12, 170, x + 12, 200), fill=(60, 160, 60))
+    cat.save(tmp_path / "cat.png")
+    with pytest.raises(InputError, match="no walls around a room") as refusal:
+        read_points(tmp_path / "cat.png", resolution=0.02, text=False)
+    assert "cat.png" in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "rank"),
+    [
+        ("GROUND FLOOR", 0),
+        ("Erdgeschoss 1:100", 0),
+        ("EG", 0),
+        ("Rez-de-chaussée", 0),
+        ("First floor", 1),
+        ("1. OG", 1),
+        ("2nd Floor Plan", 2),
+        ("Second floor", 2),
+        ("Étage 3", 3),
+        ("Basement", -1),
+        ("Kellergeschoss", -1),
+        ("Lower ground floor", -1),
+        ("Dachgeschoss", 100),
+        ("Källare", -1),
+        ("KITCHEN", None),
+        ("BEDROOM 2", None),
+        ("13.4 m²", None),
+        ("1:100", None),
+    ],
+)
+def test_titles_name_storeys(text, rank):
+    assert parse_storey(text) == rank
+
+
+def trace_two(shift=(6, 3), titles=("FIRST FLOOR", "GROUND FLOOR"), other=False):
+    """Two storeys of a flat beside each other on a sheet of 0.05 m a pixel, the right one lower by some pixels."""
+    occupied, free, door = (np.zeros((240, 460), bool) for _ in range(3))
+    boxes = ((10, 20), (230 + shift[1], 20 + shift[0]))
+    for number, (column, row) in enumerate(boxes):
+        w, h = (60, 190) if other and number else (180, 140)
+        occupied[row : row + h, column : column + w] = True
+        middle = column + (w // 2 if not number else w // 3)
+        for left, right in ((column + 4, middle - 2), (middle + 2, column + w - 4)):
+            free[row + 4 : row + h - 4, left:right] = True
+        door[row + 60 : row + 78, middle - 2 : middle + 2] = True
+    free |= door
+    occupied &= ~free
+    texts = tuple(PictureText(t, (c + 60.0, r + 165.0), 10.0, 1.0) for t, (c, r) in zip(titles, boxes, strict=False))
+    return TracedDrawing(ParsedDrawing(occupied, free, door, np.zeros_like(free), 1.0), 0.05, texts, ())
+
+
+def test_two_plans_on_a_sheet_are_storeys_over_each_other(tmp_path):
+    storeys, warnings = find_storeys(tmp_path / "a.png", trace_two(), None)
+    assert len(storeys) == 2 and "2 plans" in warnings[0] and "titles" in warnings[0]
+    lower, upper = storeys
+    assert np.nonzero(lower.free)[1].min() > 230 and np.nonzero(upper.free)[1].max() < 230  # as their titles say
+    corner = [np.array([np.nonzero(s.free)[1].min() * 0.05, -np.nonzero(s.free)[0].max() * 0.05]) + s.corner for s in storeys]
+    assert np.abs(corner[0] - corner[1]).max() <= 0.2
+    in_order, said = find_storeys(tmp_path / "a.png", trace_two(titles=()), None)
+    assert np.nonzero(in_order[0].free)[1].max() < 230 and "order" in said[0]
+
+
+def test_plans_that_do_not_fit_stay_beside_each_other_and_one_can_be_chosen(tmp_path):
+    traced = trace_two(titles=(), other=True)
+    storeys, warnings = find_storeys(tmp_path / "a.png", traced, None)
+    assert len(storeys) == 1 and (storeys[0].free == traced.drawing.free).all() and "side by side" in warnings[0]
+    one, _ = find_storeys(tmp_path / "a.png", traced, 2)
+    assert len(one) == 1 and np.nonzero(one[0].free)[1].min() > 230
+    with pytest.raises(InputError, match="has 2 plans; --page 3 is none of them"):
+        find_storeys(tmp_path / "a.png", traced, 3)
+
+
+def test_storeys_of_a_sheet_are_extracted(tmp_path):
+    pieces = list(build_drawn_pieces(tmp_path / "a.png", trace_two(), ReadOptions()))
+    assert [p.done for p in pieces] == sorted(p.done for p in pieces)
+    points = np.concatenate([p.points for p in pieces])
+    path = tmp_path / "two.xyz"
+    np.savetxt(path, points, fmt="%.3f")
+    map = extract(read_points(path))
+    assert len(map.storeys) == 2 and len(map.rooms) == 4
+    assert sorted(np.bincount(map.rooms["storey"]).tolist()) == [2, 2]
+
+
+def test_a_small_drawing_beside_a_plan_is_no_storey(tmp_path):
+    traced = trace_two(titles=())
+    drawing = traced.drawing
+    keep = np.ones(drawing.free.shape, bool)
+    keep[:, 230:] = False
+    keep[20:60, 240:300] = True
+    small = replace(drawing, occupied=drawing.occupied & keep, free=drawing.free & keep, door=drawing.door & keep)
+    storeys, warnings = find_storeys(tmp_path / "a.png", replace(traced, drawing=small), None)
+    assert len(storeys) == 1 and not warnings and (storeys[0].free == small.free).all()
+
+
+def test_treads_are_stairs_and_a_landmark():
+    classes = np.full((200, 200), DRAWING_CLASSES.index("page"))
+    classes[10:190, 10:190] = DRAWING_CLASSES.index("wall")
+    classes[14:186, 14:186] = DRAWING_CLASSES.index("floor")
+    classes[40:120:6, 30:52] = DRAWING_CLASSES.index("stairs")
+    parsed = find_structure(one_hot(classes), 1.0, 20.0)
+    assert parsed.stairs is not None and int(ndimage.label(parsed.stairs)[1]) == 1
+    landmarks = build_stairs_landmarks(parsed.stairs, 0.05, (0.0, 0.0), 1.2, "a.png")
+    assert landmarks.get_values() == ["stairs"] and landmarks.is_kind("object").all()
+    np.testing.assert_allclose(landmarks.table["position"][0], [41 * 0.05, (200 - 78) * 0.05, 1.2], atol=0.15)
+    assert len(build_stairs_landmarks(None, 0.05, (0.0, 0.0), 1.2, "a.png").table) == 0
+
+
+def test_pages_are_what_they_were_without_what_is_mended():
+    page = find_page(draw().picture)
+    assert isinstance(page, DrawnPage) and (page.picture == draw().picture).all()
+
+
+def test_a_grid_has_no_plan_to_choose(tmp_path):
+    grid = np.full((200, 200), 205, np.uint8)
+    grid[50:150, 50:150] = 254
+    grid[50:150, 50] = 0
+    Image.fromarray(grid).save(tmp_path / "grid.png")
+    with pytest.raises(InputError, match="no page with drawn plans"):
+        read_points(tmp_path / "grid.png", resolution=0.05, page=1)
+
+
+def test_titles_are_drawn_and_read_nowhere_else(tmp_path):
+    """The name of a room that is also that of a storey is no title: it lies in the room."""
+    traced = trace_two(titles=())
+    inside = (PictureText("Attic", (60.0, 80.0), 8.0, 1.0), PictureText("Hall", (300.0, 80.0), 8.0, 1.0))
+    _, warnings = find_storeys(tmp_path / "a.png", replace(traced, texts=inside), None)
+    assert "order" in warnings[0]
