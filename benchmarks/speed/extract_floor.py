@@ -2,7 +2,8 @@
 
 The peer of `extract_floor` is the thesis preset on the same points. `beside_n` compares n floors beside each other with n times
 the seconds of one, `above_n` the same one above the other: a ratio of 1 is linear growth, above 1 is better. Run from the root:
-``python -m benchmarks.speed.extract_floor [most floors]``. Each measurement is a process of its own, after one that compiles.
+``python -m benchmarks.speed.extract_floor [most floors]``. Each measurement is a process of its own, after one that compiles; one
+alone: ``--measure FLOORS default POINTS PLACE``, of `STEPS`.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import json
 import resource
 import subprocess
 import sys
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from topomerge.evaluation.documents import build_stamp
 from topomerge.evaluation.headline import FIGURES, write_headline
 
 STOREY_GAP = 0.4  # m
+STEPS = {"beside": (WIDTH + 1, 0, 0), "above": (0, 0, STOREY_HEIGHT + STOREY_GAP), "apart": (WIDTH + 95, 0, 0)}  # m
 
 
 def measure(floors: int, preset: str, points: int, place: str) -> dict[str, Any]:
@@ -30,14 +32,15 @@ def measure(floors: int, preset: str, points: int, place: str) -> dict[str, Any]
 
     extract(storey(60_000), preset=preset)  # loads what was compiled
     cloud = storey(points)
-    step = np.array([0, 0, STOREY_HEIGHT + STOREY_GAP] if place == "above" else [WIDTH + 1, 0, 0], np.float32)
+    step = np.array(STEPS[place], np.float32)
     chunks = (PointCloud(cloud + i * step) for i in range(floors))
-    began = perf_counter()
+    began, worked = perf_counter(), process_time()
     result = extract(chunks, preset=preset)
-    seconds = perf_counter() - began
+    seconds, worked = perf_counter() - began, process_time() - worked
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return {
         "seconds": seconds,
+        "processor": worked,
         "steps": dict(result.seconds),
         "peak_mb": peak,
         "rooms": len(result.rooms),
