@@ -37,8 +37,7 @@ from topomerge.types import (
 )
 
 LARGE, HIGH = 2000.0, 100.0  # m, extents beyond what is scanned as one building
-SLAB_THICKNESS = 0.1  # m
-STOREY_HEIGHT = 4.5  # m
+SLAB_THICKNESS, STOREY_HEIGHT = 0.1, 4.5  # m
 LOWEST_ROOM, HIGHEST_ROOM = 2.0, 3.6  # m, usual heights of a room
 DEGREES_ACROSS = 0.1  # degrees, 11 km: no scan of a building is as wide
 DEGREES_TALLER = 20.0  # times as tall (m) as across (degrees): no building in metres is
@@ -50,8 +49,7 @@ class PointSample:
     """A thinned copy of all points seen so far, of bounded size."""
 
     def __init__(self, limit: int = 400_000) -> None:
-        self.limit = limit
-        self.step = 1
+        self.limit, self.step = limit, 1
         self.parts: list[Array] = []
 
     def add(self, points: Array) -> None:
@@ -313,6 +311,7 @@ FORMATS = (
     Format("an RTAB-Map database", "rtabmap", (".db",)),
     Format("a ScanNet recording", "sens", (".sens",)),
     Format("a state of Cartographer", "pbstream", (".pbstream",), fixed=True, takes=("extrude", "ceiling")),
+    Format("a pose graph of slam_toolbox", "karto", (".posegraph",), fixed=True),
     Format("a DXF drawing", "dxf", (".dxf",), extra="dxf", takes=("extrude", "ceiling")),
     Format("a PDF drawing", "pdf", (".pdf",), fixed=True, extra="pdf", takes=(*DRAWN, "page")),
     Format("an SVG drawing", "svg", (".svg",), fixed=True, extra="svg", takes=DRAWN),
@@ -404,6 +403,8 @@ def detect_format(path: Path) -> Format:
     else:
         if path.suffix.lower() == ".tmap":
             raise InputError(f"{path}: is a map already; give the scan that it was made of, or see it with `topomerge info`")
+        if path.suffix.lower() == ".data" and path.with_suffix(".posegraph").is_file():
+            raise InputError(f"{path}: belongs to {path.stem}.posegraph; give that file, this one is read with it")
         readable = " ".join(s[1:] for s in list_suffixes())
         raise InputError(f"{path}: unknown suffix {path.suffix or '(none)'}; rename or export it as one of {readable}")
     if path.exists() and not path.is_file():
