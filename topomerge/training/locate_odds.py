@@ -17,7 +17,7 @@ from scipy.optimize import minimize
 from topomerge.datasets.core.builder import limit_threads
 from topomerge.datasets.pairs.localisation import SCANS, load_located_map, make_located_map, make_located_scan
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.locate import FEATURES, LOCATE, describe_scan, find_places, prepare_query
+from topomerge.fusion.atlas.locate import FEATURES, LOCATE, find_places, prepare_query
 from topomerge.fusion.atlas.place_index import PlaceIndex
 from topomerge.io.maps import load_map
 from topomerge.matching.poses import wrap_yaw
@@ -33,12 +33,11 @@ DIGITS = 4
 
 
 class LocateRows(NamedTuple):
-    """A scan: number of its building, (n, 11) features of its poses, (n,) which are right, and (3,) of the scan itself."""
+    """A scan: number of its building, (n, 11) features of its poses and (n,) which are right."""
 
     building: int
     x: Array
     y: Array
-    about: Array
 
 
 def build_rows(split: str, count: int, folder: Path, log_line: LogFn) -> list[LocateRows]:
@@ -74,37 +73,36 @@ def build_row(index: PlaceIndex, own: Any, split: str, number: int, kind: str, s
         and abs(wrap_yaw(j.pose.yaw - pose.yaw)) < RIGHT[1]
         for j in judged
     ]
-    features = np.array([j.features for j in judged])
-    return LocateRows(number, features, np.array(right), describe_scan(query)) if judged else None
+    return LocateRows(number, np.array([j.features for j in judged]), np.array(right)) if judged else None
 
 
-def fit_choice(rows: Sequence[LocateRows]) -> tuple[Array, Array]:
-    """Fit (11,) weights of the features and (3,) of the scan's for "nowhere"."""
+def fit_choice(rows: Sequence[LocateRows]) -> tuple[Array, float]:
+    """Fit (11,) weights of the features and the odds of "nowhere"."""
     size = np.concatenate([r.x for r in rows]).std(axis=0) + 1e-9
     count = len(size)
 
     def loss(w: Array) -> tuple[float, Array]:
         total, slope = 0.0, np.zeros_like(w)
         for r in rows:
-            z = np.append(r.x / size @ w[:count], r.about @ w[count:])
+            z = np.append(r.x / size @ w[:count], w[count])
             true = np.append(r.y, not r.y.any())
             total += float(np.logaddexp.reduce(z) - np.logaddexp.reduce(z[true]))
             gap = np.exp(z - np.logaddexp.reduce(z))
             gap[true] -= np.exp(z[true] - np.logaddexp.reduce(z[true]))
-            slope += np.append(gap[:-1] @ r.x / size, gap[-1] * r.about)
+            slope += np.append(gap[:-1] @ r.x / size, gap[-1])
         slope /= len(rows)
         slope[:count] += 2 * SHRINK * w[:count]
         return total / len(rows) + SHRINK * float(w[:count] @ w[:count]), slope
 
-    fitted: Array = minimize(loss, np.zeros(count + len(rows[0].about)), jac=True, method="L-BFGS-B").x
-    return fitted[:count] / size, fitted[count:]
+    fitted: Array = minimize(loss, np.zeros(count + 1), jac=True, method="L-BFGS-B").x
+    return fitted[:count] / size, float(fitted[count])
 
 
-def score_choices(rows: Sequence[LocateRows], weights: Array, nowhere: Array) -> dict[str, float]:
+def score_choices(rows: Sequence[LocateRows], weights: Array, nowhere: float) -> dict[str, float]:
     """Score a fit: mean log loss of the choice; shares of scans that are believed and right, and believed and wrong."""
     losses, right, wrong = [], 0, 0
     for r in rows:
-        z = np.append(r.x @ weights, r.about @ nowhere)
+        z = np.append(r.x @ weights, nowhere)
         p = np.exp(z - np.logaddexp.reduce(z))
         losses.append(-np.log(max(float(p[:-1][r.y].sum() if r.y.any() else p[-1]), 1e-9)))
         best = int(p[:-1].argmax())
@@ -124,7 +122,7 @@ def fit_locate(settings: LocateOdds, log_line: LogFn) -> FitResult:
             scores += [(len(own), score_choices(own, *fit_choice([r for r in rows if r.building % FOLDS != fold])))]
     metrics = {name: sum(n * s[name] for n, s in scores) / len(rows) for name in ("log_loss", "right", "wrong")}
     weights, nowhere = fit_choice(rows)
-    found = {"names": list(FEATURES), "weight": np.round(weights, DIGITS).tolist(), "nowhere": np.round(nowhere, DIGITS).tolist()}
+    found = {"names": list(FEATURES), "weight": np.round(weights, DIGITS).tolist(), "nowhere": round(nowhere, DIGITS)}
     return FitResult(found, metrics, {"split": settings.split, "maps": settings.maps, "scans": len(rows)})
 
 
@@ -137,7 +135,7 @@ def judge(settings: LocateOdds, file: Path, log_line: LogFn) -> dict[str, Any]:
     """Score weights on another split."""
     held = json.loads(file.read_text(encoding="utf-8"))
     rows = build_rows("test", settings.maps, Path(settings.cache) / "locate" / "test", log_line)
-    return score_choices(rows, np.array(held["weight"]), np.array(held["nowhere"]))
+    return score_choices(rows, np.array(held["weight"]), float(held["nowhere"]))
 
 
 TASK = Task(LocateOdds, fit, ("log_loss",), judge, "topomerge.fusion.atlas", "locate_odds.json", hours=0.2, lower=("log_loss",))

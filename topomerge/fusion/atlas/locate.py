@@ -45,7 +45,6 @@ LEAST_WALLS = 10  # columns of walls; a scan with fewer tells nothing
 FEATURES = (
     "sharp", "agree", "opposed", "conflict", "off", "missed", "blocked", "unlike_ceiling", "furniture", "moved", "level",
 )  # fmt: skip
-SCAN_FEATURES = ("any", "walls", "slice")  # by which the odds of "nowhere" go: what shows more must fit better
 NEAR, TURNED = 0.8, np.radians(8.0)  # m and rad: poses that are nearer are one
 PLACE_SIGMA, INDEPENDENT = 0.08, 0.1  # m that a wall is off, and share of its columns that count
 MOST_COLUMNS = 400.0  # of walls, of which more tell no more
@@ -306,19 +305,8 @@ def _judge(judge: Judge, storey: int, hypothesis: PoseHypothesis, scorer: Landma
 
 
 def load_odds() -> dict[str, Any]:
-    """Load the weights of `FEATURES`, and those of `SCAN_FEATURES` for "nowhere" (`train.py task=locate_odds`)."""
+    """Load the weights of `FEATURES` and the odds of "nowhere" (`train.py task=locate_odds`)."""
     return read_weights_json("topomerge.fusion.atlas", "locate_odds.json")
-
-
-def describe_scan(query: Query) -> Array:
-    """Describe a scan by (3,) `SCAN_FEATURES`."""
-    walls = min(float(len(query.fields.walls)), MOST_COLUMNS)
-    return np.array([1.0, np.sqrt(walls) / 10.0, float(query.fields.plan.sliced)])
-
-
-def compute_nowhere_odds(query: Query) -> float:
-    """Compute the odds that a scan is of no place of the atlas, before it is looked for."""
-    return float(describe_scan(query) @ load_odds()["nowhere"])
 
 
 def compute_features(judge: Judge, hypothesis: PoseHypothesis) -> Array:
@@ -344,7 +332,7 @@ def decide(index: PlaceIndex, query: Query, judged: Sequence[JudgedPose], settin
     """Decide what to tell of judged poses."""
     if not judged:
         return Location("not here", (), 0, 1.0, "the scan fits nowhere in the atlas")
-    chances, nowhere = compute_probabilities(judged, compute_nowhere_odds(query))
+    chances, nowhere = compute_probabilities(judged, load_odds()["nowhere"])
     places: list[tuple[Place, Array]] = []
     for pose, p in zip(judged, chances.tolist(), strict=True):
         own = index.maps[index.storeys[pose.storey].map]
@@ -383,7 +371,7 @@ def is_telling(query: Query, settings: LocateSettings = LOCATE) -> bool:
     odds = load_odds()
     root = float(np.sqrt(min(len(query.fields.walls), MOST_COLUMNS)))
     best = root * sum(odds["weight"][FEATURES.index(name)] for name in ("sharp", "agree"))
-    return bool(best - compute_nowhere_odds(query) >= np.log(settings.sure / (1 - settings.sure)))
+    return bool(best - odds["nowhere"] >= np.log(settings.sure / (1 - settings.sure)))
 
 
 def _word(places: tuple[Place, ...], nowhere: float, settings: LocateSettings, telling: bool) -> Location:
