@@ -9,6 +9,7 @@ from __future__ import annotations
 import sqlite3
 import sys
 import tempfile
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -22,6 +23,7 @@ from tests.io.test_native_graphs import flat_graph, moved_back
 from tests.io.test_native_rtabmap import poses_of, write_session
 from tests.samples import box_colors, box_points, write_las, write_pcd, write_ply
 from topomerge.evaluation.documents import build_stamp, write_blocks, write_table
+from topomerge.io.karto import build_planar_pose, read_karto_graph
 from topomerge.io.native import NATIVE, Motion, Source, Tally, save_joined
 from topomerge.io.native.pose_graph import read_pose_graph
 from topomerge.types import Array
@@ -67,6 +69,18 @@ def trip_cartographer(spatial: bool) -> Trip:
         return tally, measure(new, old, motion), "Google's protobuf"
 
     return trip
+
+
+def trip_karto(folder: Path) -> tuple[Tally, float, str]:
+    with zipfile.ZipFile(Path(__file__).parent / "karto_archives.zip") as archive:
+        archive.extractall(folder)
+    tally, out = join("karto", folder, Source(folder / "room.posegraph", YAW))
+    before, after = (
+        np.array([build_planar_pose(*pose) for pose in read_karto_graph(path).place_scans()])
+        for path in (folder / "room.posegraph", out)
+    )
+    error = np.abs(after - YAW.matrix @ before)[:, :2].max()
+    return tally, float(error), "our reader; by hand, Boost 1.74"
 
 
 def trip_g2o(text: str, motion: Motion) -> Trip:
@@ -179,6 +193,7 @@ TRIPS: dict[str, Trip] = {
     "RTAB-Map 0.23, two sessions": trip_rtabmap("0.23.0"),
     "Cartographer, in a plane, 2 + 1 trajectories": trip_cartographer(False),
     "Cartographer, in space, 2 + 1 trajectories": trip_cartographer(True),
+    "slam_toolbox, one session": trip_karto,
     "g2o, SE3, two graphs": trip_g2o(GRAPH, TILTED),
     "g2o, SE2, two graphs": trip_g2o(PLANE, YAW),
     "Spark-DSG, two graphs of three rooms, two of them shared": trip_dsg,

@@ -50,8 +50,7 @@ class PointSample:
     """A thinned copy of all points seen so far, of bounded size."""
 
     def __init__(self, limit: int = 400_000) -> None:
-        self.limit = limit
-        self.step = 1
+        self.limit, self.step = limit, 1
         self.parts: list[Array] = []
 
     def add(self, points: Array) -> None:
@@ -315,6 +314,7 @@ FORMATS = (
     Format("an RTAB-Map database", "rtabmap", (".db",)),
     Format("a ScanNet recording", "sens", (".sens",)),
     Format("a state of Cartographer", "pbstream", (".pbstream",), fixed=True, takes=("extrude", "ceiling")),
+    Format("a pose graph of slam_toolbox", "karto", (".posegraph",), fixed=True),
     Format("a DXF drawing", "dxf", (".dxf",), extra="dxf", takes=("extrude", "ceiling")),
     Format("a PDF drawing", "pdf", (".pdf",), fixed=True, extra="pdf", takes=(*DRAWN, "page")),
     Format("an SVG drawing", "svg", (".svg",), fixed=True, extra="svg", takes=DRAWN),
@@ -406,6 +406,8 @@ def detect_format(path: Path) -> Format:
     else:
         if path.suffix.lower() == ".tmap":
             raise InputError(f"{path}: is a map already; give the scan that it was made of, or see it with `topomerge info`")
+        if path.suffix.lower() == ".data" and path.with_suffix(".posegraph").is_file():
+            raise InputError(f"{path}: belongs to {path.stem}.posegraph; give that file, this one is read with it")
         readable = " ".join(s[1:] for s in list_suffixes())
         raise InputError(f"{path}: unknown suffix {path.suffix or '(none)'}; rename or export it as one of {readable}")
     if path.exists() and not path.is_file():

@@ -321,7 +321,11 @@ def pair_storeys(
 
 
 def refine(
-    a: Sequence[PlanFields], b: Sequence[PlanFields], hypotheses: Sequence[PoseHypothesis], scaled: bool = False
+    a: Sequence[PlanFields],
+    b: Sequence[PlanFields],
+    hypotheses: Sequence[PoseHypothesis],
+    scaled: bool = False,
+    sample: int = REFINE.sample,
 ) -> list[PoseHypothesis]:
     """Hypotheses moved to where b's walls lie on those of a, without duplicates; the best first, by the share of walls that meet.
 
@@ -330,6 +334,7 @@ def refine(
     Args:
         a, b: the storeys of the two maps.
         scaled: is the scale refined, too?
+        sample: wall columns of b that a pose is refined by, at most.
     """
     moved: list[PoseHypothesis] = []
     levels: dict[float, list[PoseHypothesis]] = {}
@@ -338,16 +343,18 @@ def refine(
     for offset, group in levels.items():
         pairs = [p for p in pair_storeys(a, b, offset, group[0].transform.scale) if len(p[0].walls) and len(p[1].walls)]
         if pairs:
-            moved += _refine_group(*max(pairs, key=lambda p: min(len(p[0].walls), len(p[1].walls))), group, scaled)
+            moved += _refine_group(*max(pairs, key=lambda p: min(len(p[0].walls), len(p[1].walls))), group, scaled, sample)
     moved.sort(key=lambda h: -h.score)
     return select_distinct_hypotheses(moved, np.append(b[0].middle, 0.0), REFINE.same_pose)
 
 
-def _refine_group(v: PlanFields, w: PlanFields, group: Sequence[PoseHypothesis], scaled: bool) -> list[PoseHypothesis]:
+def _refine_group(
+    v: PlanFields, w: PlanFields, group: Sequence[PoseHypothesis], scaled: bool, sample: int
+) -> list[PoseHypothesis]:
     """The hypotheses of one offset of heights, moved by the walls of one storey of each map."""
     walls = w.walls
-    if len(walls) > REFINE.sample:
-        walls = walls[np.random.default_rng(0).permutation(len(walls))[: REFINE.sample]]
+    if len(walls) > sample:
+        walls = walls[np.random.default_rng(0).permutation(len(walls))[:sample]]
     middle = walls.mean(axis=0)
     start = np.array([[*_place_point(h.transform, middle), h.transform.yaw, np.log(h.transform.scale)] for h in group])
     field = (*v.field, v.plan.edge)

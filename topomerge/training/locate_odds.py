@@ -28,7 +28,7 @@ from topomerge.types import Array, LogFn
 
 RIGHT = (0.5, np.radians(6.0))  # m and rad: a pose that is learned as right
 FOLDS = 6
-SHRINK = 3e-3  # of squared weights of standardised features
+SHRINK = 1e-3  # of squared weights of standardised features
 DIGITS = 4
 
 
@@ -79,17 +79,23 @@ def build_row(index: PlaceIndex, own: Any, split: str, number: int, kind: str, s
 def fit_choice(rows: Sequence[LocateRows]) -> tuple[Array, float]:
     """Fit (11,) weights of the features and the odds of "nowhere"."""
     size = np.concatenate([r.x for r in rows]).std(axis=0) + 1e-9
+    count = len(size)
 
-    def loss(w: Array) -> float:
-        total = 0.0
+    def loss(w: Array) -> tuple[float, Array]:
+        total, slope = 0.0, np.zeros_like(w)
         for r in rows:
-            z = np.append(r.x / size @ w[:-1], w[-1])
-            chosen = z[:-1][r.y] if r.y.any() else z[-1:]
-            total += float(np.logaddexp.reduce(z) - np.logaddexp.reduce(chosen))
-        return total / len(rows) + SHRINK * float(w[:-1] @ w[:-1])
+            z = np.append(r.x / size @ w[:count], w[count])
+            true = np.append(r.y, not r.y.any())
+            total += float(np.logaddexp.reduce(z) - np.logaddexp.reduce(z[true]))
+            gap = np.exp(z - np.logaddexp.reduce(z))
+            gap[true] -= np.exp(z[true] - np.logaddexp.reduce(z[true]))
+            slope += np.append(gap[:-1] @ r.x / size, gap[-1])
+        slope /= len(rows)
+        slope[:count] += 2 * SHRINK * w[:count]
+        return total / len(rows) + SHRINK * float(w[:count] @ w[:count]), slope
 
-    fitted: Array = minimize(loss, np.zeros(len(size) + 1), method="L-BFGS-B").x
-    return fitted[:-1] / size, float(fitted[-1])
+    fitted: Array = minimize(loss, np.zeros(count + 1), jac=True, method="L-BFGS-B").x
+    return fitted[:count] / size, float(fitted[count])
 
 
 def score_choices(rows: Sequence[LocateRows], weights: Array, nowhere: float) -> dict[str, float]:

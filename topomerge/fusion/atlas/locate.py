@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import repeat
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
-from scipy import fft, ndimage
 
 from topomerge.archive import convert_to_plain, read_weights_json
 from topomerge.blas import limit_blas_threads
@@ -23,14 +23,13 @@ from topomerge.extraction.extract import extract
 from topomerge.extraction.navigable import add_crossed_cells
 from topomerge.extraction.scan import Scan, read_scan
 from topomerge.fusion.atlas.place_index import (
-    COARSE_CELL,
     IndexedMap,
     IndexedStorey,
     PlaceIndex,
-    draw_points,
     open_index,
     turn_points,
 )
+from topomerge.fusion.atlas.place_search import score_roughly, search_coarsely
 from topomerge.io.maps import load_map
 from topomerge.io.points import read_chunks
 from topomerge.landmarks.evidence import LandmarkScorer
@@ -56,17 +55,21 @@ LOOSE = 5.0  # m: how far a pose may slide where no wall holds it
 class LocateSettings:
     """Args:
     sure: probability from which on a place, or a few places together, is told.
+    absent: probability from which on "not here" is told.
     coarse: poses that are refined.
     coarse_of_storey: … of one storey.
+    sample: columns of the scan by which these are refined and ranked.
     judged: poses that are judged closely.
     shown: runners-up that are told.
     alike: places between which it "cannot tell", at most.
     """
 
     sure: float = 0.9
-    coarse: int = 80
-    coarse_of_storey: int = 16
-    judged: int = 24
+    absent: float = 0.95
+    coarse: int = 300
+    coarse_of_storey: int = 24
+    sample: int = 400
+    judged: int = 8
     shown: int = 5
     alike: int = 6
 
@@ -256,7 +259,7 @@ def find_places(index: PlaceIndex, query: Query, settings: LocateSettings) -> li
     named = [k for k, _ in index.landmarks.rank(query.map)] if query.map is not None else []
     rough: list[tuple[float, int, PoseHypothesis]] = []
     by_storey: dict[int, list[PoseHypothesis]] = {}
-    for score, storey, pose in search_coarsely(index.storeys, query.fields, settings):
+    for score, storey, pose in search_coarsely(index.storeys, query.fields, settings.coarse, settings.coarse_of_storey):
         by_storey.setdefault(storey, []).append(PoseHypothesis(pose, score))
     scorers: dict[int, LandmarkScorer] = {}
     for number in named[: settings.shown]:
@@ -267,9 +270,9 @@ def find_places(index: PlaceIndex, query: Query, settings: LocateSettings) -> li
     for k, hypotheses in by_storey.items():
         fields, _ = index.storeys[k].load()
         raised = [_put_on_floor(h, fields, query.fields) for h in hypotheses]
-        for moved in refine([fields], [query.fields], raised):
-            rough.append((moved.score, k, moved))
-    rough.sort(key=lambda r: -r[0])
+        moved = refine([fields], [query.fields], raised, sample=settings.sample)
+        rough += zip(score_roughly(fields, query.fields, moved, settings.sample), repeat(k), moved, strict=False)
+    rough.sort(key=lambda r: (-r[0], r[1]))
     chosen, kept = [], rough[: settings.judged]
     kept += [r for r in rough[settings.judged :] if r[2].from_rooms]
     for k in dict.fromkeys(storey for _, storey, _ in kept):
@@ -291,78 +294,6 @@ def _put_on_floor(hypothesis: PoseHypothesis, fields: PlanFields, query: PlanFie
     x, y, _ = hypothesis.transform.translation
     height = fields.plan.floor_guess - query.plan.floor_guess
     return replace(hypothesis, transform=Sim3(hypothesis.transform.yaw, (x, y, float(height))))
-
-
-def search_coarsely(
-    storeys: Sequence[IndexedStorey], query: PlanFields, settings: LocateSettings
-) -> list[tuple[float, int, Sim3]]:
-    """Search storeys in large cells: score, number of the storey and pose without height, best first."""
-    found: list[tuple[float, int, Sim3]] = []
-    turned = _TurnedQuery(query)
-    for k, storey in enumerate(storeys):
-        own = turned.correlate(storey)
-        found += [(score, k, pose) for score, pose in sorted(own, key=lambda f: -f[0])[: settings.coarse_of_storey]]
-    return sorted(found, key=lambda f: (-f[0], f[1]))[: settings.coarse]
-
-
-FARTHEST, CLEAR_WEIGHT, PEAKS = 30.0, 0.75, 8  # m of a scan that is searched by; of a wall on clear floor; of each yaw
-
-
-class _TurnedQuery:
-    """A scan in large cells, at each turn and size of image once."""
-
-    def __init__(self, query: PlanFields) -> None:
-        self.query = query
-        self.walls, self.clear = query.walls, query.plan.compute_points(query.core)
-        both = np.concatenate([self.walls, self.clear])
-        self.reach = min(float(np.hypot(*np.ptp(both, axis=0))), FARTHEST)
-        self.made: dict[tuple[int, tuple[int, int]], tuple[Array, Array, Array, float]] = {}
-
-    def correlate(self, storey: IndexedStorey) -> list[tuple[float, Sim3]]:
-        """Score, and pose without height, at the best peaks of each likely yaw."""
-        coarse = storey.coarse
-        nx, ny = (_find_size(n, self.reach) for n in coarse.walls.shape)
-        room = ((0, nx - coarse.walls.shape[0]), (0, ny - coarse.walls.shape[1]))
-        walls, clear = (np.pad(image, room) for image in (coarse.walls, coarse.clear))
-        near = np.minimum(ndimage.gaussian_filter(walls, 0.6) * 1.6, 1.0)
-        agree, against = fft.rfft2(near - CLEAR_WEIGHT * clear), fft.rfft2(walls) * CLEAR_WEIGHT
-        found: list[tuple[float, Sim3]] = []
-        for yaw in find_yaw_candidates(storey.directions, self.query.profile, 3):
-            step = round(float(np.degrees(yaw - coarse.turn))) % 360
-            own, free, low, total = self._draw(step, (nx, ny))
-            image = fft.irfft2(agree * own - against * free, (nx, ny)) / total
-            for score, i, j in _find_peaks(image, coarse.walls.shape):
-                shift = coarse.low + np.array([i, j]) * COARSE_CELL - low
-                x, y = turn_points(shift[None], coarse.turn)[0].tolist()
-                found.append((score, Sim3(wrap_yaw(coarse.turn + np.radians(step)), (x, y, 0.0))))
-        return found
-
-    def _draw(self, step: int, size: tuple[int, int]) -> tuple[Array, Array, Array, float]:
-        if (step, size) not in self.made:
-            walls, clear = (turn_points(points, np.radians(step)) for points in (self.walls, self.clear))
-            low = np.concatenate([walls, clear]).min(axis=0)
-            cells = (COARSE_CELL / self.query.plan.edge) ** 2
-            drawn = draw_points(walls - low, size, 3.0), draw_points(clear - low, size, cells)
-            spectra = [np.conj(fft.rfft2(image)) for image in drawn]
-            self.made[step, size] = (*spectra, low, max(float(drawn[0].sum()), 1.0))  # type: ignore[assignment]
-        return self.made[step, size]
-
-
-def _find_size(cells: int, reach: float) -> int:
-    """Cells of an image that holds a storey and a scan beside it; few different ones, so that much is shared."""
-    return int(fft.next_fast_len(int(np.ceil((cells + reach / COARSE_CELL) / 16)) * 16, real=True))
-
-
-def _find_peaks(image: Array, shape: tuple[int, ...]) -> list[tuple[float, int, int]]:
-    """Score and shift, in cells, of the highest peaks; a shift beyond the storey is one back."""
-    tops = np.where(image >= ndimage.maximum_filter(image, 3, mode="wrap"), image, -np.inf).ravel()
-    best = np.argpartition(-tops, PEAKS)[:PEAKS]
-    peaks = []
-    for flat in best[np.lexsort((best, -tops[best]))].tolist():
-        i, j = divmod(flat, image.shape[1])
-        if np.isfinite(tops[flat]):
-            peaks.append((float(tops[flat]), i - image.shape[0] * (i > shape[0]), j - image.shape[1] * (j > shape[1])))
-    return peaks
 
 
 def _judge(judge: Judge, storey: int, hypothesis: PoseHypothesis, scorer: LandmarkScorer | None) -> JudgedPose:
@@ -455,7 +386,7 @@ def _word(places: tuple[Place, ...], nowhere: float, settings: LocateSettings, t
         else:
             where = f"cannot tell between {told} places that look alike"
         return Location("ambiguous", places, told, nowhere, where)
-    if nowhere >= 0.5 and telling:
+    if nowhere >= settings.absent and telling:
         reason = f"not here ({nowhere:.2f}): nothing in the atlas fits well enough"
         return Location("not here", places[: settings.shown], 0, nowhere, reason)
     reason = "too many places fit about as well" if telling else "the scan shows too little"

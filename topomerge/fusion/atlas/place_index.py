@@ -33,7 +33,7 @@ INDEX_FOLDER, INDEX_VERSION, KIND = "locate", 1, "file of an index of places"
 ADVICE = "delete the folder `locate` of the atlas, it is made again"
 COARSE_CELL = 0.4  # m
 ROOM_REACH = 1.0  # m, from a place to the floor of its room
-PLANS_AT_ONCE = 48  # storeys whose plans are in memory
+PLANS_AT_ONCE = 96  # storeys whose plans are in memory
 HEAD = ("version", "x", "y", "edge", "base_floor", "base_ceiling", "observed", "sliced", "turn", "low_x", "low_y")
 HIGHEST_SIDE = 20_000  # columns along a side
 

@@ -102,18 +102,21 @@ class Tally:
 
 @dataclass(frozen=True)
 class Format:
-    """A format: what such files are called, their suffixes, the module that writes them, and whether several become one."""
+    """A format: what such files are called, their suffixes, the module that writes them, whether several become one, and the
+    suffix of a file that is written beside."""
 
     name: str
     suffixes: tuple[str, ...]
     module: str
     joins: bool = False
+    companion: str = ""
 
 
 NATIVE = {
     "rtabmap": Format("an RTAB-Map database", (".db",), "rtabmap", joins=True),
     "g2o": Format("a pose graph", (".g2o",), "pose_graph", joins=True),
     "pbstream": Format("a state of Cartographer", (".pbstream",), "pbstream", joins=True),
+    "karto": Format("a pose graph of slam_toolbox", (".posegraph",), "karto", companion=".data"),
     "dsg": Format("a scene graph", (".json",), "scene_graph", joins=True),
     "e57": Format("an E57 file", (".e57",), "stations"),
     "las": Format("a LAS file", (".las", ".laz"), "clouds"),
@@ -195,6 +198,9 @@ def save_joined(form: Format, sources: Sequence[Source], target: Path, doubt: Do
     try:
         with replace_on_success(target) as beside:
             tally: Tally = module.join(sources, beside, doubt or Doubt())
+            if form.companion:
+                with replace_on_success(target.with_suffix(form.companion)) as companion:
+                    beside.with_suffix(form.companion).replace(companion)
     except InputError:
         raise
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, struct.error) as error:

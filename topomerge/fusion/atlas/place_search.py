@@ -1,0 +1,110 @@
+"""Poses of a single scan on the storeys of an atlas: looked for in large cells, and ranked by a few of its columns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import fft, ndimage
+
+from topomerge.fusion.atlas.place_index import COARSE_CELL, IndexedStorey, draw_points, turn_points
+from topomerge.matching.poses import PlanFields, PoseHypothesis, wrap_yaw
+from topomerge.registration.search import find_yaw_candidates
+from topomerge.types import Array, Sim3
+
+FARTHEST, CLEAR_WEIGHT, PEAKS = 30.0, 0.75, 16  # m of a scan that is searched by; of a wall on clear floor; of each yaw
+WALL_ON_CLEAR, CLEAR_ON_WALL = 0.5, 2.0  # of shares of columns, against walls that meet
+
+
+def search_coarsely(
+    storeys: Sequence[IndexedStorey], query: PlanFields, most: int, of_storey: int
+) -> list[tuple[float, int, Sim3]]:
+    """Search storeys in large cells: score, number of the storey and pose without height, best first.
+
+    Args:
+        most: poses, at most.
+        of_storey: ... of one storey.
+    """
+    found: list[tuple[float, int, Sim3]] = []
+    turned = _TurnedQuery(query)
+    for k, storey in enumerate(storeys):
+        own = turned.correlate(storey)
+        found += [(score, k, pose) for score, pose in sorted(own, key=lambda f: -f[0])[:of_storey]]
+    return sorted(found, key=lambda f: (-f[0], f[1]))[:most]
+
+
+class _TurnedQuery:
+    """A scan in large cells, at each turn and size of image once."""
+
+    def __init__(self, query: PlanFields) -> None:
+        self.query = query
+        self.walls, self.clear = query.walls, query.plan.compute_points(query.core)
+        both = np.concatenate([self.walls, self.clear])
+        self.reach = min(float(np.hypot(*np.ptp(both, axis=0))), FARTHEST)
+        self.made: dict[tuple[int, tuple[int, int]], tuple[Array, Array, Array, float]] = {}
+
+    def correlate(self, storey: IndexedStorey) -> list[tuple[float, Sim3]]:
+        """Score, and pose without height, at the best peaks of each likely yaw."""
+        coarse = storey.coarse
+        nx, ny = (_find_size(n, self.reach) for n in coarse.walls.shape)
+        room = ((0, nx - coarse.walls.shape[0]), (0, ny - coarse.walls.shape[1]))
+        walls, clear = (np.pad(image, room) for image in (coarse.walls, coarse.clear))
+        near = np.minimum(ndimage.gaussian_filter(walls, 0.6) * 1.6, 1.0)
+        agree, against = fft.rfft2(near - CLEAR_WEIGHT * clear), fft.rfft2(walls) * CLEAR_WEIGHT
+        found: list[tuple[float, Sim3]] = []
+        for yaw in find_yaw_candidates(storey.directions, self.query.profile, 3):
+            step = round(float(np.degrees(yaw - coarse.turn))) % 360
+            own, free, low, total = self._draw(step, (nx, ny))
+            image = fft.irfft2(agree * own - against * free, (nx, ny)) / total
+            for score, i, j in _find_peaks(image, coarse.walls.shape):
+                shift = coarse.low + np.array([i, j]) * COARSE_CELL - low
+                x, y = turn_points(shift[None], coarse.turn)[0].tolist()
+                found.append((score, Sim3(wrap_yaw(coarse.turn + np.radians(step)), (x, y, 0.0))))
+        return found
+
+    def _draw(self, step: int, size: tuple[int, int]) -> tuple[Array, Array, Array, float]:
+        if (step, size) not in self.made:
+            walls, clear = (turn_points(points, np.radians(step)) for points in (self.walls, self.clear))
+            low = np.concatenate([walls, clear]).min(axis=0)
+            cells = (COARSE_CELL / self.query.plan.edge) ** 2
+            drawn = draw_points(walls - low, size, 3.0), draw_points(clear - low, size, cells)
+            spectra = [np.conj(fft.rfft2(image)) for image in drawn]
+            self.made[step, size] = (*spectra, low, max(float(drawn[0].sum()), 1.0))  # type: ignore[assignment]
+        return self.made[step, size]
+
+
+def _find_size(cells: int, reach: float) -> int:
+    """Cells of an image that holds a storey and a scan beside it; few different ones, so that much is shared."""
+    return int(fft.next_fast_len(int(np.ceil((cells + reach / COARSE_CELL) / 16)) * 16, real=True))
+
+
+def _find_peaks(image: Array, shape: tuple[int, ...]) -> list[tuple[float, int, int]]:
+    """Score and shift, in cells, of the highest peaks; a shift beyond the storey is one back."""
+    tops = np.where(image >= ndimage.maximum_filter(image, 3, mode="wrap"), image, -np.inf).ravel()
+    best = np.argpartition(-tops, PEAKS)[:PEAKS]
+    peaks = []
+    for flat in best[np.lexsort((best, -tops[best]))].tolist():
+        i, j = divmod(flat, image.shape[1])
+        if np.isfinite(tops[flat]):
+            peaks.append((float(tops[flat]), i - image.shape[0] * (i > shape[0]), j - image.shape[1] * (j > shape[1])))
+    return peaks
+
+
+def score_roughly(fields: PlanFields, query: PlanFields, poses: Sequence[PoseHypothesis], sample: int) -> list[float]:
+    """Score refined poses by some columns: walls that meet, less walls of the scan on the map's clear floor, and less what the
+    scan saw to be clear on the map's walls."""
+    walls, clear = (points[:: max(len(points) // sample, 1)] for points in (query.walls, query.plan.compute_points(query.core)))
+    return [
+        pose.score
+        - WALL_ON_CLEAR * _measure_share(walls, fields.core, fields, pose.transform)
+        - CLEAR_ON_WALL * _measure_share(clear, fields.plan.wall, fields, pose.transform)
+        for pose in poses
+    ]
+
+
+def _measure_share(points: Array, mask: Array, fields: PlanFields, pose: Sim3) -> float:
+    """Share of points (n, 2) of a scan that lie on columns of a mask."""
+    at = turn_points(points, pose.yaw) + pose.translation[:2]
+    cells = np.floor((at - fields.plan.origin) / fields.plan.edge).astype(np.int64)
+    cells = cells[((cells >= 0) & (cells < mask.shape)).all(axis=1)]
+    return float(mask[cells[:, 0], cells[:, 1]].sum()) / max(len(points), 1)
