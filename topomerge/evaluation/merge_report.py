@@ -226,7 +226,11 @@ def compute_headline(rows: Sequence[Row], settings: object) -> dict[str, tuple[s
     if large:
         values = (is_good, lambda r: is_good(r, (0.1, 1.0)), lambda r: is_good(r) and r["believed"])
         names = ("merges-right", "merges-fine", "merges-merged")
-        out = {n: (f"{format_share(large, hit)} %", f"{len(large)} pairs") for n, hit in zip(names, values, strict=True)}
+        shares = (format_share(large, hit).partition(" ") for hit in values)
+        out = {
+            n: (f"{value} %{gap}{interval}", f"{len(large)} pairs")
+            for n, (value, gap, interval) in zip(names, shares, strict=True)
+        }
     apart = select_negatives(rows)
     strangers = [r for r in apart if r["negative"] == "stranger"]
     if strangers:
