@@ -165,7 +165,7 @@ def test_a_photograph_of_a_plan_has_its_rooms(tmp_path):
 
 
 def test_a_blueprint_has_its_rooms(tmp_path):
-    sheet = np.asarray(Image.open(draw_case(tmp_path / "plan.png")))
+    sheet = np.asarray(Image.open(draw_case(tmp_path / "plan.png")).resize((759, 599), Image.Resampling.BILINEAR))
     path = tmp_path / "blue.png"
     share = 1 - sheet.mean(axis=2, keepdims=True) / 255
     Image.fromarray((np.array([20, 60, 140]) * (1 - share) + 240 * share).astype(np.uint8)).save(path)

@@ -67,11 +67,12 @@ def find_page(picture: Array) -> DrawnPage | None:
         return None
     matrix, mended, photograph = np.eye(3), [], is_photograph(picture)
     drawn_to_the_edge = has_bright_border(picture) and not photograph
-    if not (drawn_to_the_edge or has_few_levels(picture)) and (corners := find_sheet(picture)) is not None:
+    few = has_few_levels(picture)  # as in a grid, perhaps an inverted one
+    if not (drawn_to_the_edge or few) and (corners := find_sheet(picture)) is not None:
         picture, matrix = cut_sheet(picture, corners)
         mended.append("cut out of what is around its page")
         photograph = is_photograph(picture)
-    if is_blueprint(picture):
+    if not few and is_blueprint(picture):
         picture = invert_picture(picture)
         mended.append("turned into dark lines on light paper")
     if photograph and (lit := even_light(picture)) is not None:
