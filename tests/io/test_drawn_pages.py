@@ -9,6 +9,7 @@ from scipy import ndimage
 
 from tests.io.test_drawings import draw, draw_case
 from topomerge.errors import InputError
+from topomerge.evaluation.drawings import straighten_truth
 from topomerge.extraction.extract import extract
 from topomerge.io.drawing import (
     ParsedDrawing,
@@ -346,3 +347,18 @@ def test_titles_are_drawn_and_read_nowhere_else(tmp_path):
     inside = (PictureText("Attic", (60.0, 80.0), 8.0, 1.0), PictureText("Hall", (300.0, 80.0), 8.0, 1.0))
     _, warnings = find_storeys(tmp_path / "a.png", replace(traced, texts=inside), None)
     assert "order" in warnings[0]
+
+
+def test_the_truth_of_a_page_is_measured_where_it_is_read():
+    drawing = draw()
+    assert straighten_truth(drawing) is drawing
+    screen = np.full((420, 460, 3), 40, np.uint8)
+    at = np.s_[50:370, 54:406]
+    screen[at] = drawing.picture
+    classes, rooms = np.zeros((420, 460), np.uint8), np.full((420, 460), -1, np.int16)
+    classes[at], rooms[at] = drawing.classes, drawing.rooms
+    cut = straighten_truth(replace(drawing, picture=screen, classes=classes, rooms=rooms))
+    assert cut.picture.shape[:2] == cut.rooms.shape == cut.classes.shape and cut.rooms.shape[0] < 330
+    dark = cut.picture.mean(axis=2) < 60
+    walls = ndimage.binary_dilation(np.isin(cut.classes, (2, 3)), iterations=2)
+    assert walls[dark].mean() > 0.5 and cut.rooms.max() == drawing.rooms.max()
