@@ -7,15 +7,16 @@ import pytest
 from PIL import Image, ImageDraw
 from scipy import ndimage
 
-from tests.io.test_drawings import draw, draw_case, one_hot
+from tests.io.test_drawings import draw, draw_case
 from topomerge.errors import InputError
+from topomerge.evaluation.drawings import straighten_truth
 from topomerge.extraction.extract import extract
 from topomerge.io.drawing import (
     ParsedDrawing,
     PictureText,
     TracedDrawing,
     build_stairs_landmarks,
-    find_structure,
+    find_treads,
     parse_drawing,
 )
 from topomerge.io.drawn_page import DrawnPage, find_homography, find_page, move_places
@@ -23,7 +24,6 @@ from topomerge.io.drawn_storeys import find_storeys, parse_storey
 from topomerge.io.grid import build_drawn_pieces, read_picture
 from topomerge.io.piece import ReadOptions
 from topomerge.io.points import read_points
-from topomerge.networks.drawing import DRAWING_CLASSES
 
 SHEET = 842, 595  # px, of A4
 
@@ -166,7 +166,7 @@ def test_a_photograph_of_a_plan_has_its_rooms(tmp_path):
 
 
 def test_a_blueprint_has_its_rooms(tmp_path):
-    sheet = np.asarray(Image.open(draw_case(tmp_path / "plan.png")))
+    sheet = np.asarray(Image.open(draw_case(tmp_path / "plan.png")).resize((759, 599), Image.Resampling.BILINEAR))
     path = tmp_path / "blue.png"
     share = 1 - sheet.mean(axis=2, keepdims=True) / 255
     Image.fromarray((np.array([20, 60, 140]) * (1 - share) + 240 * share).astype(np.uint8)).save(path)
@@ -296,17 +296,35 @@ def test_a_small_drawing_beside_a_plan_is_no_storey(tmp_path):
     assert len(storeys) == 1 and not warnings and (storeys[0].free == small.free).all()
 
 
-def test_treads_are_stairs_and_a_landmark():
-    classes = np.full((200, 200), DRAWING_CLASSES.index("page"))
-    classes[10:190, 10:190] = DRAWING_CLASSES.index("wall")
-    classes[14:186, 14:186] = DRAWING_CLASSES.index("floor")
-    classes[40:120:6, 30:52] = DRAWING_CLASSES.index("stairs")
-    parsed = find_structure(one_hot(classes), 1.0, 20.0)
-    assert parsed.stairs is not None and int(ndimage.label(parsed.stairs)[1]) == 1
-    landmarks = build_stairs_landmarks(parsed.stairs, 0.05, (0.0, 0.0), 1.2, "a.png")
+def draw_stairs(walking, turned, pale=0):
+    """A room of 6 x 5 m with a flight of eight treads of 1 m, at 0.025 m a pixel."""
+    page = Image.new("RGB", (320, 280), "white")
+    pen = ImageDraw.Draw(page)
+    pen.rectangle((40, 40, 280, 240), outline="black", width=6)
+    for k in range(9):
+        pen.line((80, 60 + 11 * k, 120, 60 + 11 * k), fill=(pale, pale, pale), width=1)
+    if walking:
+        pen.line((100, 60, 100, 148), fill=(pale, pale, pale))
+    return np.asarray(page.rotate(90, expand=True) if turned else page)
+
+
+@pytest.mark.parametrize("walking", [False, True])
+@pytest.mark.parametrize("turned", [False, True])
+def test_treads_are_stairs_and_a_landmark(walking, turned):
+    stairs = find_treads(draw_stairs(walking, turned), 0.025)
+    assert int(ndimage.label(stairs)[1]) == 1
+    assert stairs.sum() * 0.025**2 == pytest.approx(1.0 * 2.2, rel=0.1)
+    landmarks = build_stairs_landmarks(stairs, 0.025, (0.0, 0.0), 1.2, "a.png")
     assert landmarks.get_values() == ["stairs"] and landmarks.is_kind("object").all()
-    np.testing.assert_allclose(landmarks.table["position"][0], [41 * 0.05, (200 - 78) * 0.05, 1.2], atol=0.15)
-    assert len(build_stairs_landmarks(None, 0.05, (0.0, 0.0), 1.2, "a.png").table) == 0
+    place = (104 * 0.025, (320 - 220) * 0.025) if turned else (100 * 0.025, (280 - 104) * 0.025)
+    np.testing.assert_allclose(landmarks.table["position"][0], [*place, 1.2], atol=0.1)
+    assert len(build_stairs_landmarks(None, 0.025, (0.0, 0.0), 1.2, "a.png").table) == 0
+
+
+def test_pale_tiles_and_lines_of_other_distances_are_no_stairs():
+    assert not find_treads(draw_stairs(False, False, pale=225), 0.025).any()
+    for resolution in (0.01, 0.05):  # 0.11 and 0.55 m apart
+        assert not find_treads(draw_stairs(False, False), resolution).any()
 
 
 def test_pages_are_what_they_were_without_what_is_mended():
@@ -329,3 +347,18 @@ def test_titles_are_drawn_and_read_nowhere_else(tmp_path):
     inside = (PictureText("Attic", (60.0, 80.0), 8.0, 1.0), PictureText("Hall", (300.0, 80.0), 8.0, 1.0))
     _, warnings = find_storeys(tmp_path / "a.png", replace(traced, texts=inside), None)
     assert "order" in warnings[0]
+
+
+def test_the_truth_of_a_page_is_measured_where_it_is_read():
+    drawing = draw()
+    assert straighten_truth(drawing) is drawing
+    screen = np.full((420, 460, 3), 40, np.uint8)
+    at = np.s_[50:370, 54:406]
+    screen[at] = drawing.picture
+    classes, rooms = np.zeros((420, 460), np.uint8), np.full((420, 460), -1, np.int16)
+    classes[at], rooms[at] = drawing.classes, drawing.rooms
+    cut = straighten_truth(replace(drawing, picture=screen, classes=classes, rooms=rooms))
+    assert cut.picture.shape[:2] == cut.rooms.shape == cut.classes.shape and cut.rooms.shape[0] < 330
+    dark = cut.picture.mean(axis=2) < 60
+    walls = ndimage.binary_dilation(np.isin(cut.classes, (2, 3)), iterations=2)
+    assert walls[dark].mean() > 0.5 and cut.rooms.max() == drawing.rooms.max()

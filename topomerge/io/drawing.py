@@ -12,10 +12,10 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.errors import InputError
-from topomerge.io.drawn_page import DrawnPage, move_places
+from topomerge.io.drawn_page import DrawnPage, find_lines, move_places
 from topomerge.io.pictures import load_text_reader
 from topomerge.io.sightings import clean_text
-from topomerge.networks.drawing import DOOR, FLOOR, PAGE, STAIRS, WALL, WINDOW, compute_drawing_probabilities
+from topomerge.networks.drawing import DOOR, FLOOR, PAGE, WALL, WINDOW, compute_drawing_probabilities
 from topomerge.networks.network import Run
 from topomerge.types import Array, Landmarks, build_landmarks, join_landmarks
 
@@ -27,7 +27,8 @@ USUAL_SCALE = 25.0  # px/m, where none is known
 WALL_NEAR = 0.5  # m from a room: what lies farther off is no wall of the building
 GAP = 3  # px of walls that the network missed
 SQUARE, LEAST_STRAIGHT = 7, 0.3  # degrees; of the outline of walls, at least: of a ring .17, of plans .38 to .9
-TREAD = 0.3  # m, usual depth
+TREAD, FEWEST_TREADS = (0.2, 0.37), 6  # m between two
+TREAD_WIDTH, TREAD_STRONG = (0.4, 4.5), 15.0  # m; levels a pixel: tiles are paler
 WALLED = 0.4  # of a room's outline is wall or door, at least
 FOOT, INCH = 0.3048, 0.0254  # m
 PLAUSIBLE_AREA, PLAUSIBLE_SIDE = (0.8, 3000.0), (0.6, 100.0)  # m2, m
@@ -154,9 +155,45 @@ def find_structure(probability: Array, zoom: float, scale: float | None) -> Pars
     doors, _ = ndimage.label(door)
     door &= np.isin(doors, np.unique(doors[ndimage.binary_dilation(rooms, np.ones((3, 3)), 2)]))
     near = ndimage.distance_transform_edt(~(rooms | door)) <= WALL_NEAR * known
-    treads = ndimage.binary_closing(kind == STAIRS, np.ones((3, 3)), max(round(TREAD / 2 * known), 1))
-    stairs = drop_small(treads & rooms, SMALLEST_STAIRS * known**2)
-    return ParsedDrawing(occupied & near, rooms | door, door, window & near, zoom, stairs)
+    return ParsedDrawing(occupied & near, rooms | door, door, window & near, zoom)
+
+
+def find_treads(picture: Array, resolution: float) -> Array:
+    """Find flights of stairs on a drawing: (h, w) bool, where six lines or more lie as far from each other as treads.
+
+    Args:
+        picture: (h, w, 3) uint8.
+        resolution: m a pixel.
+    """
+    bright = picture.mean(axis=2, dtype=np.float32)
+    out = np.zeros(bright.shape, bool)
+    for flip in (False, True):
+        mask = out.T if flip else out
+        lines = np.array(find_lines(bright, flip, TREAD_WIDTH[0] / resolution, TREAD_STRONG)).reshape(4, -1)
+        x, y, slope, length = lines[:, np.lexsort((lines[0], lines[1]))]
+        x, y, length = x * resolution, y * resolution, length * resolution
+        open_lines = (np.abs(slope) <= 0.03) & (length <= TREAD_WIDTH[1])
+        for start in range(len(x)):
+            if not open_lines[start]:
+                continue
+            alike = open_lines & (np.abs(x - x[start]) <= 0.12) & (np.abs(length - length[start]) <= 0.15 * length[start])
+            flight = [start]
+            for number in np.flatnonzero(alike & (y > y[start])):
+                gap = y[number] - y[flight[-1]]
+                if gap > TREAD[1]:
+                    break
+                if gap >= TREAD[0]:  # else the other edge of the same line
+                    flight.append(int(number))
+            gaps = np.diff(y[flight])
+            if len(flight) >= FEWEST_TREADS and gaps.std() <= 0.12 * gaps.mean():
+                open_lines[flight] = False
+                left, right = x[start] - length[start] / 2, x[start] + length[start] / 2
+                rows, columns = (
+                    slice(int(a / resolution), int(b / resolution) + 1) for a, b in ((y[start], y[flight[-1]]), (left, right))
+                )
+                mask[rows, columns] = True
+    closed = ndimage.binary_closing(np.pad(out, GAP), np.ones((3, 3)), GAP)[GAP:-GAP, GAP:-GAP]  # over the line of walking
+    return drop_small(closed, SMALLEST_STAIRS / resolution**2)
 
 
 def measure_walled_share(label: Array, count: int, wall: Array) -> Array:
@@ -345,6 +382,8 @@ def trace_drawing(
             drawing = parse_drawing(picture, known)
     assert known is not None
     zoom = drawing.zoom
+    treads = resize_picture(np.repeat(find_treads(picture, known)[..., None] * np.uint8(255), 3, axis=2), zoom)[..., 0] > 127
+    drawing = replace(drawing, stairs=treads & ndimage.binary_fill_holes(drawing.free | drawing.occupied))
     placed = [PictureText(t.text, (t.place[0] * zoom, t.place[1] * zoom), t.height * zoom, t.confidence) for t in texts or ()]
     return TracedDrawing(drawing, known / zoom, tuple(placed), tuple(said))
 

@@ -67,11 +67,12 @@ def find_page(picture: Array) -> DrawnPage | None:
         return None
     matrix, mended, photograph = np.eye(3), [], is_photograph(picture)
     drawn_to_the_edge = has_bright_border(picture) and not photograph
-    if not (drawn_to_the_edge or has_few_levels(picture)) and (corners := find_sheet(picture)) is not None:
+    few = has_few_levels(picture)  # as in a grid, perhaps an inverted one
+    if not (drawn_to_the_edge or few) and (corners := find_sheet(picture)) is not None:
         picture, matrix = cut_sheet(picture, corners)
         mended.append("cut out of what is around its page")
         photograph = is_photograph(picture)
-    if is_blueprint(picture):
+    if not few and is_blueprint(picture):
         picture = invert_picture(picture)
         mended.append("turned into dark lines on light paper")
     if photograph and (lit := even_light(picture)) is not None:
@@ -338,7 +339,7 @@ def find_straight_view(picture: Array) -> Array | None:
     middle, half = (np.array(small.shape[1::-1]) - 1) / 2, float(np.hypot(*small.shape[:2])) / 2
     fits, before, after = [], 0.0, 0.0
     for flip in (False, True):
-        x, y, slope, length = find_lines(small.mean(axis=2), flip)
+        x, y, slope, length = find_lines(small.mean(axis=2), flip, LEAST_LINE * max(small.shape))
         if len(x) < FEWEST_LINES:
             return None
         x, y = (x - middle[int(flip)]) / half, (y - middle[1 - int(flip)]) / half
@@ -360,15 +361,21 @@ def find_straight_view(picture: Array) -> Array | None:
     return np.asarray(np.linalg.inv(axes @ flat @ to_unit))
 
 
-def find_lines(bright: Array, flip: bool) -> tuple[Array, Array, Array, Array]:
-    """Find lines within 20 degrees of the horizontal, or of the vertical: their middles along and across, slopes, lengths, px."""
+def find_lines(bright: Array, flip: bool, least: float, strong: float = STRONG) -> tuple[Array, Array, Array, Array]:
+    """Find edges within 20 degrees of the horizontal, or of the vertical: their middles along and across, slopes, lengths, px.
+
+    Args:
+        bright: (h, w) of 0..255.
+        flip: the vertical ones.
+        least: px of their length; strong: levels a pixel.
+    """
     image = bright.T if flip else bright
     smooth = ndimage.gaussian_filter(image, 0.8)
     across, along = ndimage.sobel(smooth, axis=0) / 8, ndimage.sobel(smooth, axis=1) / 8
     found = [np.zeros((0, 4))]
     for sign in (1, -1):
         ridge = sign * across >= ndimage.maximum_filter1d(sign * across, 3, axis=0)
-        edge = ridge & (sign * across > STRONG) & (np.abs(along) <= np.tan(MOST_TURN) * np.abs(across))
+        edge = ridge & (sign * across > strong) & (np.abs(along) <= np.tan(MOST_TURN) * np.abs(across))
         label, count = ndimage.label(edge, np.ones((3, 3)))
         if not count:
             continue
@@ -380,7 +387,7 @@ def find_lines(bright: Array, flip: bool) -> tuple[Array, Array, Array, Array]:
         xx, yy, xy = (np.bincount(number, v, count + 1) / size for v in (dx * dx, dy * dy, dx * dy))
         slope = xy / np.maximum(xx, 1e-9)
         thick, length = np.sqrt(np.maximum(yy - slope * xy, 0)), np.sqrt(12 * xx)
-        kept = (length >= LEAST_LINE * max(image.shape)) & (thick <= LINE_WIDTH)
+        kept = (length >= least) & (thick <= LINE_WIDTH)
         found.append(np.column_stack([x, y, slope, length])[kept])
     x, y, slope, length = np.concatenate(found).T
     return x, y, slope, length

@@ -149,7 +149,7 @@ def place_storeys(plans: Sequence[DrawnStorey], resolution: float, common: float
         score = sum(signal.fftconvolve(a.astype(np.float32), b[::-1, ::-1].astype(np.float32)) for a, b in (floors, walls))
         row, column = np.unravel_index(int(np.argmax(score)), score.shape)
         move = np.array([row, column]) - np.array(floors[1].shape) + 1
-        both = count_common(*floors, move)
+        both = count_common(floors[0], floors[1], move)
         if both < common * (floors[0].sum() + floors[1].sum() - both):
             return None
         shift = shift + move * step
