@@ -408,9 +408,10 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     owner = np.repeat(np.arange(len(points), dtype=np.int32), np.diff(first))
     every = np.concatenate(points)
     for k in range(0, max(len(every), 1), BLOCK_POINTS):
-        about_file = {"poses": np.stack(poses), "warnings": warnings} if k == 0 else {}
-        rows = slice(k, k + BLOCK_POINTS)
-        yield Piece(every[rows], pose_of=owner[rows], done=min((k + BLOCK_POINTS) / max(len(every), 1), 1.0), **about_file)
+        rows, head = slice(k, k + BLOCK_POINTS), k == 0
+        placed = np.stack(poses) if head else None
+        done = min((k + BLOCK_POINTS) / max(len(every), 1), 1.0)
+        yield Piece(every[rows], poses=placed, pose_of=owner[rows], warnings=warnings if head else (), done=done)
 
 
 def build_planar_pose(x: float, y: float, heading: float) -> Array:

@@ -28,7 +28,7 @@ from topomerge.types import Array, LogFn
 
 RIGHT = (0.5, np.radians(6.0))  # m and rad: a pose that is learned as right
 FOLDS = 6
-SHRINK = 1e-3  # of squared weights of standardised features
+SHRINK = 3e-3  # of squared weights of standardised features
 DIGITS = 4
 
 

@@ -66,10 +66,10 @@ class LocateSettings:
 
     sure: float = 0.9
     absent: float = 0.95
-    coarse: int = 300
+    coarse: int = 240
     coarse_of_storey: int = 24
     sample: int = 400
-    judged: int = 8
+    judged: int = 24
     shown: int = 5
     alike: int = 6
 

@@ -63,7 +63,7 @@ def _move_pose(data: bytearray, pose: Members, motion: Motion) -> Array:
     heading = pose["heading"] + (turn - pose["heading"] + np.pi) % (2 * np.pi) - np.pi
     _write_numbers(data, pose["place"]["@x"][0], after[:2, 3])
     _write_numbers(data, pose["@heading"][0], [heading])
-    moved: Array = build_planar_pose(*after[:2, 3].tolist(), turn) @ np.linalg.inv(before)
+    moved: Array = build_planar_pose(float(after[0, 3]), float(after[1, 3]), turn) @ np.linalg.inv(before)
     return moved
 
 
