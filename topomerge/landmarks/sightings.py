@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from topomerge.landmarks.text import estimate_share, fold_text, is_number
-from topomerge.types import LANDMARK_KINDS, Array, TopometricMap
+from topomerge.landmarks.text import estimate_share, is_number
+from topomerge.types import LANDMARK_KINDS, Array, TopometricMap, fold_text
 
 MOST_ROWS = 20_000  # of a kind that are looked at: of more, those that were read most surely
 MOST_SIGHTINGS = 1500  # of a kind that testify: of more, the rarest
