@@ -122,6 +122,9 @@ def test_two_numbers_of_one_door_or_room_stay_and_are_told() -> None:
         (seen("name", "Küche", room=0), seen("name", "kitchen", room=0)),
         (seen("text", "2.113", at=AT_0), seen("text", "2.115", at=AT_0, confidence=0.3)),  # perhaps misread
         (seen("text", "2.113", at=AT_0), seen("text", "2.115", at=AT_1)),
+        (seen("text", "2.113", at=AT_0), seen("text", "2.11", at=AT_0)),  # an end was not read
+        (seen("text", "2.113", at=AT_0), seen("text", "O.113", at=AT_0, confidence=0.4)),
+        (seen("text", "118", at=AT_0), seen("text", "18", at=AT_0)),
         (seen("text", "2.113", at=shifted(AT_2, -1.4)), seen("text", "2.115", at=shifted(AT_2, 1.4))),  # a corridor has many
         (seen("text", "2.113", "2.115", at=AT_0), seen("text", "2.115", at=AT_0)),  # two doors
         (seen("name", "2.113", room=0), seen("text", "2.113", at=AT_0)),

@@ -206,6 +206,10 @@ class _Fusion:
         self._note("tag", first[far], rows[far])
 
     def _note(self, what: str, one: Array, other: Array) -> None:
+        values = self.landmarks.values
+        rows = zip(self.table["value"][one].tolist(), self.table["value"][other].tolist(), strict=True)
+        apart = np.array([what == "tag" or not is_cut_off(values[a], values[b]) for a, b in rows], bool)
+        one, other = one[apart], other[apart]
         self.contradicting += len(one)
         for a, b in list(zip(one.tolist(), other.tolist(), strict=True))[: MOST_LISTED - len(self.contradictions)]:
             apart = float(np.linalg.norm(self.table["position"][a] - self.table["position"][b]))
@@ -213,6 +217,12 @@ class _Fusion:
             room, maps = int(self.table["room"][b]), [int(self.owner[a]), int(self.owner[b])]
             place = {"room": room if room >= 0 else None, "apart_m": round(apart, 2) if np.isfinite(apart) else None}
             self.contradictions.append({"what": what, "values": values, "maps": maps, **place})
+
+
+def is_cut_off(one: str, other: str) -> bool:
+    """May one of two numbers be the other one, of which a reader lost an end: 0.12 and 0.129?"""
+    short, long = sorted((fold_text(one), fold_text(other)), key=len)
+    return len(long) > 2 and len(long) - len(short) == 1 and (long.startswith(short) or long.endswith(short))
 
 
 def _number_strings(values: Sequence[str]) -> Array:
