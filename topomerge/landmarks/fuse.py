@@ -206,10 +206,10 @@ class _Fusion:
         self._note("tag", first[far], rows[far])
 
     def _note(self, what: str, one: Array, other: Array) -> None:
-        values = self.landmarks.values
+        strings = self.landmarks.values
         rows = zip(self.table["value"][one].tolist(), self.table["value"][other].tolist(), strict=True)
-        apart = np.array([what == "tag" or not is_cut_off(values[a], values[b]) for a, b in rows], bool)
-        one, other = one[apart], other[apart]
+        differ = np.array([what == "tag" or not is_cut_off(strings[a], strings[b]) for a, b in rows], bool)
+        one, other = one[differ], other[differ]
         self.contradicting += len(one)
         for a, b in list(zip(one.tolist(), other.tolist(), strict=True))[: MOST_LISTED - len(self.contradictions)]:
             apart = float(np.linalg.norm(self.table["position"][a] - self.table["position"][b]))
