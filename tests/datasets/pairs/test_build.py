@@ -343,4 +343,5 @@ def test_maps_of_a_pair_with_signs_hold_landmarks() -> None:
         np.testing.assert_array_equal(signed[name], plain[name])  # nan is nan
     read = [signed[f"{side}.landmarks"] for side in "ab"]
     both = [(i, j) for i, j in plain["matches"].tolist() if read[0][i, 0] and read[1][j, 0]]
-    assert both and np.mean([read[0][i, 2:] @ read[1][j, 2:] for i, j in both]) > 0.7
+    # A sign beside a door may be given to the room on its other side.
+    assert len(both) > 2 and np.median([read[0][i, 2:] @ read[1][j, 2:] for i, j in both]) > 0.7
