@@ -10,8 +10,17 @@ from topomerge.models.geometry import DoorsEncoder, SurroundingsEncoder, YawAver
 from topomerge.models.nodes import NodeEncoder, Standardizer, build_mlp
 from torch import Tensor, nn
 
-from topomerge.embedding.graph import count_columns
-from topomerge.embedding.network import GRAPH, TABLE_PARTS, Network, check, find_tensor, list_pair_tensors, list_tensors
+from topomerge.embedding.graph import LANDMARK_MASKS, count_columns
+from topomerge.embedding.network import (
+    GRAPH,
+    LANDMARK_PART,
+    TABLE_PARTS,
+    Network,
+    check,
+    find_tensor,
+    list_pair_tensors,
+    list_tensors,
+)
 from topomerge.embedding.surroundings import CROP_SHAPES, DOOR_PART
 from topomerge.registry import POINTS
 
@@ -31,15 +40,31 @@ class Table(nn.Module):
         return out
 
 
+class LandmarkEncoder(nn.Module):
+    """What the landmarks of rooms say (R, n), the first columns of which are masks -> (R, width); 0 of a room without any."""
+
+    def __init__(self, columns: int, width: int, dropout: float) -> None:
+        super().__init__()
+        self.each = build_mlp(columns, 2 * width, width, dropout=dropout)
+
+    def forward(self, values: Tensor) -> Tensor:
+        masks = values[:, : len(LANDMARK_MASKS)].sum(dim=1, keepdim=True)
+        rows: Tensor = self.each(values)
+        return torch.where(masks > 0, rows, torch.zeros_like(rows))
+
+
 class GeometryEncoder(nn.Module):
-    """What each room looks like by itself: (R, width)."""
+    """What each room looks like by itself: (R, width). Landmarks are added to it."""
 
     def __init__(self, network: Network) -> None:
         super().__init__()
         geometry, self.width = network.geometry, network.geometry.width
+        self.landmarks: LandmarkEncoder | None = None
         self.parts = nn.ModuleDict()
         for part in geometry.parts:
-            if part in POINTS:
+            if part == LANDMARK_PART:
+                self.landmarks = LandmarkEncoder(count_columns(part), self.width, network.dropout)
+            elif part in POINTS:
                 self.parts[part] = YawAverage(POINTS[part](self.width), geometry.yaws, geometry.canonical)
             elif part == DOOR_PART:
                 self.parts[part] = DoorsEncoder(self.width, network.dropout)
@@ -47,13 +72,15 @@ class GeometryEncoder(nn.Module):
                 self.parts[part] = SurroundingsEncoder(part, self.width, network.dropout)
             else:
                 self.parts[part] = Table(count_columns(TABLE_PARTS[part]), self.width, network.dropout)
-        self.join = nn.Sequential(nn.LayerNorm(len(self.parts) * self.width), nn.ReLU(), nn.Dropout(network.dropout))
-        self.out = nn.Linear(len(self.parts) * self.width, self.width)
+        joined = len(self.parts) * self.width
+        self.join = nn.Sequential(nn.LayerNorm(joined), nn.ReLU(), nn.Dropout(network.dropout)) if joined else None
+        self.out = nn.Linear(joined, self.width) if joined else None
 
     def forward(self, tensors: Mapping[str, Tensor]) -> Tensor:
         rooms = [module(tensors[find_tensor(part)]) for part, module in self.parts.items()]
-        out: Tensor = self.out(self.join(torch.cat(rooms, dim=1)))
-        return out
+        terms = [self.out(self.join(torch.cat(rooms, dim=1)))] if self.join is not None and self.out is not None else []
+        terms += [] if self.landmarks is None else [self.landmarks(tensors[LANDMARK_PART])]
+        return terms[0] + terms[1] if len(terms) > 1 else terms[0]
 
 
 class Embedder(nn.Module):

@@ -10,7 +10,7 @@ import torch
 
 from topomerge import archive
 from topomerge.embedding.engineered import compute_door_layout
-from topomerge.embedding.graph import count_columns
+from topomerge.embedding.graph import count_columns, hash_landmarks
 from topomerge.embedding.surroundings import CROP, CROP_SHAPES, SHEET_PLANES
 from topomerge.training.batches import add_views
 from topomerge.training.packed_pairs import GraphPair
@@ -43,6 +43,7 @@ def graph(rooms: int = 7, seed: int = 0, points: int = 64) -> dict[str, torch.Te
         "x": 10 * torch.rand((rooms, count_columns("x")), generator=g),
         "engineered": torch.rand((rooms, count_columns("engineered")), generator=g),
         "shapedna": torch.rand((rooms, count_columns("shapedna")), generator=g),
+        "landmarks": _landmarks(rooms, seed),
         "room_points": size * (torch.rand((rooms, points, 3), generator=g) - torch.tensor([0.5, 0.5, 0.0])),
         "edge_index": index,
         "edge_attr": torch.randn((index.shape[1], count_columns("edge_attr")), generator=g),
@@ -54,6 +55,12 @@ def graph(rooms: int = 7, seed: int = 0, points: int = 64) -> dict[str, torch.Te
         "edge_pos": door.repeat(2, 1),
     }
     return add_views({**tensors, **views}, VIEWS)
+
+
+def _landmarks(rooms: int, seed: int) -> torch.Tensor:
+    """Signs in two of three rooms, a chair in every fourth."""
+    texts = [(r, f"{seed}.{100 + r}", 0.9) for r in range(rooms) if r % 3]
+    return torch.from_numpy(hash_landmarks(rooms, texts, [(r, "chair", 1.0) for r in range(0, rooms, 4)]))
 
 
 def _doors(anchor: torch.Tensor) -> torch.Tensor:
@@ -77,7 +84,8 @@ def shuffled(tensors: dict[str, torch.Tensor], seed: int = 0) -> tuple[dict[str,
     rooms, edges = torch.randperm(len(tensors["x"]), generator=g), torch.randperm(len(tensors["edge_attr"]) // 2, generator=g)
     edges = torch.cat([edges, edges + len(edges)])  # an edge and its way back stand half of all apart
     new_room, new_edge = rooms.argsort(), edges.argsort()
-    out = {name: tensors[name][rooms] for name in ("x", "engineered", "shapedna", "room_points", "pos", "anchor", "door_anchor")}
+    of_rooms = ("x", "engineered", "shapedna", "landmarks", "room_points", "pos", "anchor", "door_anchor")
+    out = {name: tensors[name][rooms] for name in of_rooms}
     out |= {"sheet": tensors["sheet"], "sheet_room": new_room[tensors["sheet_room"].long()].to(torch.int16)}
     out["turn"] = tensors["turn"]
     out |= {"edge_index": new_room[tensors["edge_index"][:, edges]], "edge_attr": tensors["edge_attr"][edges]}

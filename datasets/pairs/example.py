@@ -18,8 +18,9 @@ from topomerge.datasets.pairs.atlases import make_atlas
 from topomerge.datasets.pairs.drawing import replace_map_with_plan
 from topomerge.datasets.pairs.evaluation_pair import build_evaluation_arrays, compute_pair_statistics, save_maps
 from topomerge.datasets.pairs.items import SIDES, UNCHANGED, Item, corrupt_pair, get_difficulty
-from topomerge.datasets.pairs.pairs import Atlas, Pair, make_pair
+from topomerge.datasets.pairs.pairs import Atlas, Pair, make_pair, simulate_signs
 from topomerge.datasets.pairs.parts import find_true_matches, match_true_rooms
+from topomerge.datasets.simulation.signs import READERS
 
 from topomerge import archive
 from topomerge.archive import convert_to_plain
@@ -27,7 +28,8 @@ from topomerge.embedding.graph import build_graph_arrays, convert_to_tensors
 from topomerge.embedding.sheets import build_sheet_arrays
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
-from topomerge.types import Array, PointCloud, TopometricMap
+from topomerge.extraction.landmarks import add_landmarks
+from topomerge.types import Array, Landmarks, PointCloud, TopometricMap
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -74,8 +76,8 @@ def make_arrays(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array]
     """
     if item.more:
         return build_several_maps(item, plans)
-    pair = corrupt_pair(_make_first_pair(item, plans), item.change, item.seed)
-    return build_pair_arrays(pair, extract_maps((pair.a, pair.b), item), describe_item(item))
+    pair, signs = _make_first_pair(item, plans)
+    return build_pair_arrays(pair, extract_maps((pair.a, pair.b), item, signs), describe_item(item))
 
 
 def build_several_maps(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array]:
@@ -119,16 +121,16 @@ def _build_map_arrays(
 
 def make_evaluation_arrays(item: Item, plans: Sequence[Sequence[Plan]], folder: Path) -> dict[str, Array]:
     """Make the arrays of `make_arrays` and those for evaluation (`evaluation_pair`); the maps are written into the folder."""
-    pair = corrupt_pair(_make_first_pair(item, plans), item.change, item.seed)
-    maps = extract_maps((pair.a, pair.b), item)
+    pair, signs = _make_first_pair(item, plans)
+    maps = extract_maps((pair.a, pair.b), item, signs)
     arrays = build_pair_arrays(pair, maps, {**describe_item(item), **compute_pair_statistics(pair, maps)})
     arrays |= build_evaluation_arrays(pair, maps, (arrays["a.true_room"], arrays["b.true_room"]))
     save_maps(maps, folder, item.name)
     return arrays
 
 
-def extract_maps(clouds: Sequence[PointCloud], item: Item) -> tuple[TopometricMap, ...]:
-    """Extract the maps of clouds, with the space that rays crossed where they are kept.
+def extract_maps(clouds: Sequence[PointCloud], item: Item, signs: Sequence[Landmarks] = ()) -> tuple[TopometricMap, ...]:
+    """Extract the maps of clouds, with the space that rays crossed where they are kept, and the signs of each, if any.
 
     Raises:
         InputError: hardly a room comes out of one of them.
@@ -136,7 +138,7 @@ def extract_maps(clouds: Sequence[PointCloud], item: Item) -> tuple[TopometricMa
     maps = tuple(extract(cloud, voxel_size=item.voxel_size, carve=item.maps) for cloud in clouds)
     if min(len(m.rooms) for m in maps) < FEWEST_ROOMS:
         raise InputError(f"fewer than {FEWEST_ROOMS} rooms were extracted from a map of {' or '.join(item.sensors)}")
-    return maps
+    return tuple(add_landmarks(m, of) for m, of in zip(maps, signs, strict=True)) if signs else maps
 
 
 def describe_item(item: Item) -> dict[str, Any]:
@@ -148,8 +150,9 @@ def describe_item(item: Item) -> dict[str, Any]:
         del entries["maps"]
     if not item.more:
         del entries["more"]
-    if not item.drifts:
-        del entries["drifts"]
+    for name in ("drifts", "signs"):
+        if not entries[name]:
+            del entries[name]
     return {**entries, "file": f"{item.name}.npz", "asked_overlap": item.overlap, "points_per_room": item.points_per_room}
 
 
@@ -176,13 +179,15 @@ def build_pair_arrays(pair: Pair, maps: Sequence[TopometricMap], item_entries: M
     return arrays
 
 
-def _make_first_pair(item: Item, plans: Sequence[Sequence[Plan]]) -> Pair:
-    """The pair of the first candidate that has one."""
+def _make_first_pair(item: Item, plans: Sequence[Sequence[Plan]]) -> tuple[Pair, list[Landmarks]]:
+    """The pair of the first candidate that has one, changed, and the signs that both maps read; none without."""
 
-    def make(k: int, rng: np.random.Generator) -> Pair:
+    def make(k: int, rng: np.random.Generator) -> tuple[Pair, list[Landmarks]]:
         building, other = build_candidate(item, k, plans)
         pair = make_pair(building, item.pair_settings, rng, other, get_difficulty(item), item.source)
-        return replace_map_with_plan(pair, building) if item.change[0] == "plan" else pair
+        pair = replace_map_with_plan(pair, building) if item.change[0] == "plan" else pair
+        signs = simulate_signs(building, pair, READERS[item.signs]) if item.signs else []
+        return corrupt_pair(pair, item.change, item.seed), signs
 
     return _make_first(item, make)
 

@@ -20,6 +20,7 @@ from topomerge.datasets.pairs.pairs import HARD, Pair, PairSettings
 from topomerge.datasets.plans import splits
 from topomerge.datasets.simulation.scanner import transform_cloud
 from topomerge.datasets.simulation.sensors import get_sensor
+from topomerge.datasets.simulation.signs import READERS
 
 from topomerge.archive import convert_to_plain
 from topomerge.code_digest import compute_code_digest, compute_data_digest
@@ -138,6 +139,7 @@ class Recipe:
         the
             overlaps are as they come. Their sensors may also be those of `atlases.FLAT_KINDS`.
         drifts: of more than two walks: times the usual drift of a sensor, drawn for each map; empty: the usual one.
+        signs: share of the pairs whose maps hold door signs, read well or badly (`simulation.signs.READERS`).
         vary: name of a change (`degrade.CHANGES`) -> values; every pair is made once for each of all these.
     """
 
@@ -162,6 +164,7 @@ class Recipe:
     maps: bool = False
     walks: int = 2
     drifts: list[float] = field(default_factory=list)
+    signs: float = 0.0
     vary: dict[str, list[float]] = field(default_factory=dict)
 
 
@@ -185,7 +188,7 @@ def check(recipe: Recipe) -> None:
                 raise InputError(f"{key}.{name} must be 0 or more, not {weight}")
         if key != "hard" and sum(weights.values()) <= 0:
             raise InputError(f"{key}: no weight above 0")
-    shares = {key: getattr(recipe, key) for key in ("two_storeys", "stacks", "over_stairs", "scale")}
+    shares = {key: getattr(recipe, key) for key in ("two_storeys", "stacks", "over_stairs", "scale", "signs")}
     shares["hard, in all,"] = sum(recipe.hard.values())
     shares |= {f"overlaps[{i}]": o for i, o in enumerate(recipe.overlaps)} | {"spread": recipe.spread}
     for key, value in shares.items():
@@ -199,6 +202,8 @@ def check(recipe: Recipe) -> None:
         raise InputError(f"drifts are of more than two walks, 0 to {MOST_DRIFT:g} each, not {recipe.drifts}")
     if not 2 <= recipe.walks <= len(SIDES) or (recipe.walks > 2 and (recipe.maps or recipe.vary)):
         raise InputError(f"walks must be 2 to {len(SIDES)}, and 2 where maps are kept or changed, not {recipe.walks}")
+    if recipe.signs and (recipe.vary or recipe.walks != 2):
+        raise InputError("signs are of pairs that are not changed: leave vary out, and set walks to 2")
     if not 0.02 <= recipe.voxel_size <= 1 or recipe.points_per_room < 1:
         raise InputError("voxel_size must be 0.02 to 1 m, and points_per_room 1 or more")
 
@@ -259,6 +264,7 @@ class Item:
         change: what is done to the clouds before they are extracted, and how much (`degrade`).
         more: sensors of further maps of the building, in the same file (`build_several_maps`).
         drifts: of all its maps, times the usual drift; empty: the usual one.
+        signs: how the door signs of both maps are read, of `simulation.signs.READERS`; empty: there are none.
     """
 
     source: str
@@ -281,6 +287,7 @@ class Item:
     change: tuple[str, float] = UNCHANGED
     more: tuple[str, ...] = ()
     drifts: tuple[float, ...] = ()
+    signs: str = ""
 
     @property
     def pair_settings(self) -> PairSettings:
@@ -298,7 +305,7 @@ class Item:
         """
         values = asdict(self)
         # These came later: at their defaults older names hold.
-        later = {"maps": False, "change": UNCHANGED, "more": (), "drifts": ()}
+        later = {"maps": False, "change": UNCHANGED, "more": (), "drifts": (), "signs": ""}
         values = {key: value for key, value in values.items() if key not in later or value != later[key]}
         maker = compute_code_digest(MAKER) if self.maps else compute_data_digest(EXTRACTION)
         inputs = [PAIR_FORMAT, graph.GRAPH_FORMAT, maker, convert_to_plain(values)]
@@ -362,6 +369,8 @@ def _draw(recipe: Recipe, shelves: Mapping[str, _PlanDigests], i: int) -> Item:
     walks = np.random.default_rng([recipe.seed, i, 2])
     further = tuple(_pick(recipe.sensors, walks) for _ in range(recipe.walks - 2)) if not hard and overlap > 0 else ()
     drifts = tuple(walks.choice(recipe.drifts, size=recipe.walks).tolist()) if recipe.drifts and further else ()
+    reading = np.random.default_rng([recipe.seed, i, 51])
+    signs = str(reading.choice(sorted(READERS))) if reading.random() < recipe.signs and hard in ("", "other-storey") else ""
     first, last = splits.get_seed_range(recipe.split)
     names = sorted(digest_of)
     chosen = [names[i] for i in rng.integers(len(names), size=CANDIDATES + 1)] if names else []
@@ -386,6 +395,7 @@ def _draw(recipe: Recipe, shelves: Mapping[str, _PlanDigests], i: int) -> Item:
         points_per_room=recipe.points_per_room,
         more=further,
         drifts=drifts,
+        signs=signs,
         over_stairs=bool(more.random() < recipe.over_stairs and not hard and storeys > 1),
     )
 

@@ -11,10 +11,11 @@ from topomerge.datasets.core.building import Building, Difficulty
 from topomerge.datasets.pairs.parts import compute_dice, find_twin_rooms, sample_two_parts
 from topomerge.datasets.simulation.scanner import scan_building
 from topomerge.datasets.simulation.session import simulate_session
+from topomerge.datasets.simulation.signs import Reader, draw_numbering, place_signs, read_signs
 from topomerge.datasets.simulation.twin_wing import make_twin_wing
 
 from topomerge.errors import InputError
-from topomerge.types import Array, PointCloud, Sim3
+from topomerge.types import Array, Landmarks, PointCloud, Sim3
 
 HARD = ("other-building", "other-storey", "twin-wing")
 PAIR_KINDS = ("overlap", *HARD)
@@ -215,3 +216,25 @@ def draw_frames(count: int, scale: bool, rng: np.random.Generator) -> list[Sim3]
         if all(abs((f.inverse() @ frame).yaw) > LEAST_TURN for f in frames):
             frames.append(frame)
     return frames
+
+
+def simulate_signs(building: Building, made: Pair | PointCloud, reader: Reader, frame: Sim3 | None = None) -> list[Landmarks]:
+    """Read the signs at the doors of the rooms that each map visited, in the frame of its cloud.
+
+    Args:
+        frame: building -> cloud, of a single cloud.
+
+    Raises:
+        InputError: b is of another building, whose doors are not known.
+    """
+    if isinstance(made, PointCloud):
+        visited = [[] if made.labels is None else np.unique(made.labels[made.labels >= 0]).tolist()]
+        frames = [frame or Sim3()]
+    elif made.kind == "other-building":
+        raise InputError("signs: the doors of the other building are not known; leave --signs or --hard out")
+    else:
+        assert made.frames is not None
+        visited, frames = [list(rooms) for rooms in made.visited], list(made.frames)
+    rng = np.random.default_rng([building.seed, 51])
+    signs = place_signs(building, draw_numbering(rng), rng)
+    return [read_signs(signs, rooms, to_map, reader, rng) for rooms, to_map in zip(visited, frames, strict=True)]

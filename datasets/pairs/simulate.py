@@ -14,11 +14,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Polygon
 from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.core.building import Building, Difficulty
-from topomerge.datasets.pairs.pairs import ROOMS_A_MAP, Pair, PairSettings, draw_frames, make_pair
+from topomerge.datasets.pairs.pairs import ROOMS_A_MAP, Pair, PairSettings, draw_frames, make_pair, simulate_signs
 from topomerge.datasets.simulation.scanner import scan_building
 from topomerge.datasets.simulation.sensors import get_sensor
 from topomerge.datasets.simulation.session import simulate_session
-from topomerge.datasets.simulation.signs import Reader, draw_numbering, place_signs, read_signs
+from topomerge.datasets.simulation.signs import READERS
 from topomerge.datasets.simulation.walk import sample_part
 
 from topomerge.errors import InputError
@@ -70,9 +70,6 @@ def simulate_maps(
     return building, cloud, frame
 
 
-READERS = {"good": Reader(reads=0.9, wrong=0.02), "poor": Reader(reads=0.5, wrong=0.2)}  # of door signs
-
-
 def prepare_outputs(
     building: Building, made: Pair | PointCloud, frame: Sim3, folder: Path, signs: str | None = None
 ) -> list[Output]:
@@ -89,27 +86,9 @@ def prepare_outputs(
     files.append((folder / "truth.json", partial(save_truth, building, made, frame)))
     files.append((folder / "plan.png", partial(save_figure, building, made, frame)))
     if signs is not None:
-        read = simulate_signs(building, made, frame, READERS[signs])
+        read = simulate_signs(building, made, READERS[signs], frame)
         files += [(folder / f"{name}.landmarks.csv", partial(save_landmarks, of)) for name, of in zip(clouds, read, strict=True)]
     return files
-
-
-def simulate_signs(building: Building, made: Pair | PointCloud, frame: Sim3, reader: Reader) -> list[Landmarks]:
-    """Read the signs at the doors of the rooms that each map visited, in the frame of its cloud.
-
-    Raises:
-        InputError: b is of another building, whose doors are not known.
-    """
-    if isinstance(made, PointCloud):
-        visited, frames = [[] if made.labels is None else np.unique(made.labels[made.labels >= 0]).tolist()], [frame]
-    elif made.kind == "other-building":
-        raise InputError("signs: the doors of the other building are not known; leave --signs or --hard out")
-    else:
-        assert made.frames is not None
-        visited, frames = [list(rooms) for rooms in made.visited], list(made.frames)
-    rng = np.random.default_rng([building.seed, 51])
-    signs = place_signs(building, draw_numbering(rng), rng)
-    return [read_signs(signs, rooms, to_map, reader, rng) for rooms, to_map in zip(visited, frames, strict=True)]
 
 
 def save_landmarks(landmarks: Landmarks, path: Path) -> None:

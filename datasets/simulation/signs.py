@@ -182,6 +182,9 @@ class Reader:
     misplaced: float = 0.02
 
 
+READERS = {"good": Reader(reads=0.9, wrong=0.02), "poor": Reader(reads=0.5, wrong=0.2)}  # of door signs
+
+
 def read_signs(
     signs: Array, visited: Iterable[int], frame: Sim3, reader: Reader, rng: np.random.Generator, source: str = "simulated"
 ) -> Landmarks:

@@ -209,5 +209,6 @@ def test_signs_may_be_left_out_or_demanded(run: Run, tmp_path: Path, monkeypatch
     status, _, said = run("extract", str(folder), "-o", str(tmp_path / "a.tmap"), "--text", "-q")
     assert status == 1 and "pip install topomerge[text]" in said and not (tmp_path / "a.tmap").exists()
     assert collect_reading_options(str(folder), argparse.Namespace(text=False, up="z")) == {"text": False, "up": "z"}
-    assert "text" in inputs.WORKER_OPTIONS
+    assert collect_reading_options(str(folder), argparse.Namespace(tag_size=0.2)) == {"tag_size": 0.2}
+    assert {"text", "tag_size"} <= set(inputs.WORKER_OPTIONS)
     assert collect_reading_options(str(folder), argparse.Namespace()) == {}

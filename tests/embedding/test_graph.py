@@ -8,9 +8,20 @@ import numpy as np
 import pytest
 
 from tests.scenes_map import building
-from topomerge.embedding.graph import DOOR_FEATURES, EDGE_FEATURES, EDGE_KINDS, ROOM_FEATURES, build_graph, build_graph_arrays
+from topomerge.embedding.graph import (
+    DOOR_FEATURES,
+    EDGE_FEATURES,
+    EDGE_KINDS,
+    LANDMARK_FEATURES,
+    MOST_SIGNS,
+    ROOM_FEATURES,
+    build_graph,
+    build_graph_arrays,
+    compute_landmark_features,
+    hash_text,
+)
 from topomerge.errors import InputError
-from topomerge.types import TopometricMap, VoxelGrid
+from topomerge.types import TopometricMap, VoxelGrid, build_landmarks, join_landmarks
 
 
 @pytest.fixture(scope="module")
@@ -118,3 +129,41 @@ def test_tensors(map: TopometricMap) -> None:
     data = build_graph(map, 32)
     assert data.validate() and data.num_nodes == len(map.rooms) and data.num_edges == 2 * len(map.edges)
     assert data.x.shape[1] == len(ROOM_FEATURES) and data.room_points.shape == (len(map.rooms), 32, 3)
+
+
+def test_landmarks_of_rooms(map: TopometricMap) -> None:
+    """Signs, tags and names are texts, chairs are objects; readings of radio and what has no room say nothing."""
+    parts = [
+        build_landmarks("text", ["2.113", "2.113", "2.114"], "r", room=np.array([0, 1, 2])),
+        build_landmarks("object", ["chair", "Chair "], "r", room=np.array([2, 3])),
+        build_landmarks("radio", ["aa:bb"], "r", room=4),
+        build_landmarks("text", ["2.115"], "r"),
+    ]
+    rows = compute_landmark_features(replace(map, landmarks=join_landmarks(parts)))
+    assert rows.shape == (len(map.rooms), len(LANDMARK_FEATURES)) and rows.dtype == np.float32
+    assert rows[:5, :2].tolist() == [[1, 0], [1, 0], [1, 1], [0, 1], [0, 0]] and not rows[4:].any()
+    assert np.allclose(np.linalg.norm(rows[:2], axis=1), 2**0.5) and np.array_equal(rows[0], rows[1])
+    assert not np.array_equal(rows[0], rows[2]) and np.array_equal(rows[2, -32:], rows[3, -32:])
+    assert "landmarks" not in build_graph_arrays(map, 4)
+
+
+def test_misread_texts_are_alike_and_marks_do_not_count() -> None:
+    def likeness(one: str, other: str) -> float:
+        vectors = np.zeros((2, 128))
+        for vector, text in zip(vectors, (one, other), strict=True):
+            for column, value in hash_text(text):
+                vector[column] += value
+        return float(vectors[0] @ vectors[1] / np.linalg.norm(vectors[0]) / np.linalg.norm(vectors[1]))
+
+    assert likeness("2.113", "2-1I3") == pytest.approx(1) and hash_text(" .- ") == ()
+    assert likeness("2.113", "2.117") > 0.4 > likeness("2.113", "4.057") + 0.2
+
+
+def test_a_room_full_of_signs_is_bounded(map: TopometricMap) -> None:
+    """Hostile: of a hundred thousand signs in one room the surest are looked at; the others change nothing."""
+    texts = [f"{k}" for k in range(100_000)]
+    sure = np.where(np.arange(len(texts)) < MOST_SIGNS, 1.0, 0.5)
+    many = build_landmarks("text", texts, "r", room=0, confidence=sure)
+    few = build_landmarks("text", texts[:MOST_SIGNS], "r", room=0)
+    rows = [compute_landmark_features(replace(map, landmarks=of)) for of in (many, few)]
+    assert np.array_equal(*rows) and np.isfinite(rows[0]).all()

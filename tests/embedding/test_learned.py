@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import pickle
@@ -24,6 +25,7 @@ from topomerge.embedding.weights import EMBEDDER_FILE, find_embedder, read_embed
 from topomerge.errors import InputError
 from topomerge.networks.network import card_of
 from topomerge.registry import NODES
+from topomerge.types import build_landmarks
 
 ROOT = Path(__file__).parent.parent.parent
 EARLIER = Path(__file__).parent / "earlier"
@@ -142,6 +144,27 @@ def build_layer_of_somebody_else(kind: str, settings: Node, channels: int):
             return super().forward(x, edge_index, map, edge_attr=edge_attr)
 
     return Gps(channels, along, heads=settings.heads, norm="layer_norm", dropout=0.0)
+
+
+def test_a_network_that_reads_landmarks_is_exported_and_says_the_same_of_maps_without_to_the_bit(torch, tmp_path):
+    """Of a map without landmarks, rows are those of the network without the part; signs change the rows of a map that has any."""
+    from topomerge.models.embedder import Embedder
+    from topomerge.models.export import export_embedder
+
+    geometry, node = Geometry(["scalars"], width=16), Node("gat", 1, width=8)
+    reads = exported(
+        torch, Network(dataclasses.replace(geometry, parts=["scalars", "landmarks"]), node, size=8), tmp_path / "reads"
+    )
+    plain_network = Embedder(Network(geometry, node, size=8)).eval()
+    plain_network.load_state_dict({n: v for n, v in reads.state_dict().items() if "landmarks" not in n})
+    export_embedder(plain_network, tmp_path / "plain", {"data": "none"})
+    ours, before = load_embedder(tmp_path / "reads"), load_embedder(tmp_path / "plain")
+    map = building(2, 2)
+    signs = build_landmarks("text", ["2.113", "2.114"], "r", room=np.array([0, 3]))
+    marked = dataclasses.replace(map, landmarks=signs)
+    assert np.array_equal(ours(map), before(map)) and np.array_equal(before(marked), before(map))
+    assert np.abs(ours(marked) - ours(map)).max() > 1e-3
+    compare(ours, reads, {"marked": build_graph_arrays(marked)})
 
 
 @pytest.mark.parametrize("kind", ["transformer", "gps"])

@@ -1,6 +1,17 @@
 """The table of look-alikes with signs: what counts as wrong and as right."""
 
-from topomerge.evaluation.landmarks import READINGS, Settings, list_inputs, tabulate
+import numpy as np
+
+from topomerge.evaluation.landmarks import (
+    READ_ALONE,
+    READINGS,
+    RELATIONS,
+    Settings,
+    list_inputs,
+    measure,
+    measure_building,
+    tabulate,
+)
 
 
 def row(kind, again, reading, believed, right, landmarks):
@@ -26,3 +37,19 @@ def test_wrong_merges_and_believed_true_pairs_are_counted():
 def test_inputs_are_the_items_of_the_split():
     few, more = (list_inputs(Settings(pairs=n, again=0)) for n in (1, 2))
     assert set(few) < set(more) and len(more) == 2 * len(few) == 14
+
+
+def test_signs_alone_are_scored_and_tabulated(tmp_path):
+    """One building: places of five relations by three readers; the same bytes again; a wrong ten to one is counted."""
+    settings = Settings(cache=str(tmp_path))
+    settings.data.set, settings.data.limit = "signs", 1
+    assert list_inputs(settings) == ["signs 0"]
+    rows = measure(settings, lambda text: None)
+    scored = rows[0]["scored"]
+    assert len(scored) == 3 * 8 and {relation for _, relation, _ in scored} == {"", *RELATIONS}
+    assert measure_building(0, "test") == {"scored": scored} != measure_building(0, "train")
+    assert np.mean([odds for _, relation, odds in scored if relation]) > np.mean([odds for _, r, odds in scored if not r])
+    assert "nan" not in tabulate(rows, settings)["landmark-odds"]
+    wrong = [[name, relation, -5.0 if relation else 5.0] for name in READ_ALONE for relation in ("",) * 4 + (*RELATIONS,)]
+    table = tabulate([{"scored": wrong}], settings)["landmark-odds"]
+    assert table.count("| 1 | " + " | ".join(["5.007", "1.000"] * 5)) == len(READ_ALONE)

@@ -107,6 +107,19 @@ def test_contradictions_stand_in_merge_json_and_in_a_warning(halves: Halves) -> 
     }
 
 
+def test_markup_on_signs_is_shown_in_the_report_and_never_run(halves: Halves) -> None:
+    """Hostile: signs that contradict each other, and landmarks in the tables, whose texts are markup."""
+    west, east = halves
+    door, evil = common_door(west, east), ("</script><b onload=x>2.113", "<img src=x onerror=y>2.115")
+    west = add_landmarks(west, build_landmarks("text", evil[:1], "<i>source</i>", door[None]))
+    east = add_landmarks(east, build_landmarks("text", evil[1:], "e", in_east(door)))
+    page = render_merge_html(
+        MergeResult("merged", 0.9, "so", transforms={1: truth(0, 2)}, map=fused(west, east), maps=(west, east))
+    )
+    assert "<b onload" not in page and "<img src=x" not in page and "<i>source" not in page
+    assert "&lt;b onload=x&gt;2.113" in page and "&lt;img src=x onerror=y&gt;2.115" in page
+
+
 def test_maps_without_landmarks_are_joined_as_before(halves: Halves) -> None:
     joined = fused(*halves)
     assert isinstance(joined.landmarks, Landmarks) and len(joined.landmarks) == 0

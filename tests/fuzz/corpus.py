@@ -19,7 +19,7 @@ from tests import samples
 from tests.scenes_map import building
 from topomerge.edits.journal import Edit
 from topomerge.errors import InputError
-from topomerge.types import TopometricMap
+from topomerge.types import TopometricMap, clean_landmarks
 
 MOST_TAKEN = 5_000_000  # points that are taken of a file; the rest of a large surface is no danger, as it comes in portions
 
@@ -161,6 +161,16 @@ def read_landmarks(path: Path) -> int:
     return len(load_landmark_source(path))
 
 
+def read_radio(path: Path) -> int:
+    """Read readings of radio beside a walk."""
+    from topomerge.io.radio_csv import read_radio_csv
+    from topomerge.io.trajectory import Trajectory
+
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = 20.0
+    return len(clean_landmarks(read_radio_csv(path, Trajectory(poses, np.array([0.0, 10.0])))))
+
+
 def read_edits(path: Path) -> int:
     """Read a journal of edits, and apply it."""
     from topomerge.edits.apply import apply_edits
@@ -178,6 +188,8 @@ def _building() -> TopometricMap:
 READERS: dict[str, Callable[[Path], int]] = {  # by name or suffix; all others are clouds
     "a.edits.jsonl": read_edits,
     "a.landmarks.csv": read_landmarks,
+    "landmarks.csv": read_landmarks,
+    "a.radio.csv": read_radio,
     "rooms.geojson": read_landmarks,
     "rooms.gml": read_landmarks,
     "plan.xml": read_plans,
@@ -233,6 +245,10 @@ def write_corpus(folder: Path) -> dict[str, Path]:
     save_map(add_bends(marked, {1: Placement(Sim3(0.3), turn)}, ["a.ply", "b.ply"]), found["map.tmap"])
     found["a.landmarks.csv"] = folder / "a.landmarks.csv"
     found["a.landmarks.csv"].write_text(format_landmark_table(some_landmarks()))
+    found["landmarks.csv"] = folder / "landmarks.csv"
+    found["landmarks.csv"].write_text("\ufeffKind;Value;X;Y;Z;Confidence\ntext;2.113;3.2;-1;1.5;0.9\nobject;chair;;;;\n", "utf-8")
+    found["a.radio.csv"] = folder / "a.radio.csv"
+    found["a.radio.csv"].write_text("time,bssid,rssi\n" + "".join(f"{k / 2},aa:bb:0{k % 7},-{40 + k}\n" for k in range(30)))
     found["a.edits.jsonl"] = folder / "a.edits.jsonl"
     append_edits(found["a.edits.jsonl"], list_edits())
     for name, form in (("rooms.geojson", "geojson"), ("rooms.gml", "indoorgml")):

@@ -28,6 +28,7 @@ from topomerge.io.bag_landmarks import (
     render_depth,
 )
 from topomerge.io.depth_images import Camera
+from topomerge.io.piece import ReadOptions
 
 pytest.importorskip("rosbags")
 TAG_TYPES = """std_msgs/Header header
@@ -260,7 +261,7 @@ def test_many_readings_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
     class NoBag:
         path, topics = Path("a.bag"), {}  # type: ignore[var-annotated]
 
-    reader = LandmarkReader(NoBag(), lambda frame, time: np.eye(4), "lidar", None, False)  # type: ignore[arg-type]
+    reader = LandmarkReader(NoBag(), lambda frame, time: np.eye(4), "lidar", None, ReadOptions(text=False))  # type: ignore[arg-type]
     for k in range(10_000):
         reader._add_reading("radio", "a", -50.0, Message("/wifi", k, float(k), None))
     kept = reader._collect_readings("radio")

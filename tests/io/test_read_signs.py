@@ -14,7 +14,15 @@ from tests.io.walks import write_tum
 from topomerge.errors import InputError
 from topomerge.io import pictures, read_points, sightings
 from topomerge.io.depth_images import Camera, Frame
-from topomerge.io.pictures import Picture, PictureReader, estimate_normal, measure_strongest_edges, place_box, shrink_picture
+from topomerge.io.pictures import (
+    Picture,
+    PictureReader,
+    estimate_normal,
+    measure_strongest_edges,
+    place_box,
+    place_square,
+    shrink_picture,
+)
 from topomerge.io.sightings import (
     LONGEST_TEXT,
     Sighting,
@@ -162,6 +170,58 @@ def test_boxes_outside_of_depth_have_no_place() -> None:
         assert place_box(wrong, Picture(image, CAMERA, depth, CAMERA, pose)) is None
     for empty in (np.zeros_like(depth), np.full_like(depth, np.nan), np.full_like(depth, 100.0)):
         assert place_box(box, Picture(image, CAMERA, empty, CAMERA, pose)) is None
+
+
+TAG_SIDE = 0.32  # m, of the black square of the tags that are drawn
+
+
+def test_a_square_of_known_size_by_hand() -> None:
+    """Corners of a square 3 m away, turned by 40 degrees and tilted by 10, in any order along its outline; twice the size is
+    twice as far."""
+    image, depth = take_picture(looking(np.pi / 2, (2, 0.6, 1.5)))
+    turn, tilt = np.radians(40), np.radians(10)
+    x = np.array([np.cos(turn), 0, np.sin(turn)])
+    y = np.array([-np.sin(turn) * np.sin(tilt), np.cos(tilt), np.cos(turn) * np.sin(tilt)])
+    middle = np.array([0.4, -0.2, 3.0])
+    points = middle + 0.1 * np.array([-x - y, x - y, x + y, -x + y])
+    corners = points[:, :2] / points[:, 2:] * FOCAL + CENTRE
+    pose = np.array([[0, 0, 1, 5], [-1, 0, 0, 6], [0, -1, 0, 7], [0, 0, 0, 1]], float)  # looks along x
+    picture = Picture(image, CAMERA, np.zeros_like(depth), CAMERA, pose)
+    for order in (corners, np.roll(corners, 1, axis=0), corners[::-1]):
+        place = place_square(order, picture, 0.2)
+        assert place is not None and np.allclose(place[0], [8.0, 5.6, 7.2], atol=1e-6)
+        facing = np.cross(x, y) if np.cross(x, y)[2] < 0 else -np.cross(x, y)
+        assert place[2] == pytest.approx(np.arctan2(-facing[0], facing[2]), abs=1e-6) and 0.05 <= place[1] < 0.15
+    far = place_square(corners, picture, 0.4)
+    assert far is not None and np.allclose(far[0] - pose[:3, 3], 2 * np.array([3.0, -0.4, 0.2]), atol=1e-6)
+    for wrong in (corners * np.nan, corners[[0, 0, 0, 0]], corners[[0, 1, 0, 1]], 1e-3 * corners):
+        assert place_square(wrong, picture, 0.2) is None
+    assert place_square(corners, picture, 1e6) is None
+
+
+def test_tags_of_known_size_need_no_depth(tmp_path: Path) -> None:
+    """Where the depth has holes at the tags, their size tells the place; a wrong size is told by a wrong distance."""
+    pytest.importorskip("pupil_apriltags", exc_type=ImportError)
+    poses = [looking(angle, (x, 1.2, 1.4)) for angle, x in ((np.pi / 2, 7.3), (np.pi / 2, 8.1), (-np.pi / 2, 6.2))]
+    found = {}
+    for size in (None, TAG_SIDE, 2 * TAG_SIDE):
+        reader = PictureReader(tag_size=size)
+        for k, pose in enumerate(poses):
+            image, depth = take_picture(pose)
+            reader.read_frame(Frame("a", np.zeros_like(depth), CAMERA, pose, done=(k + 1) / 3), np.zeros_like(depth), image)
+        tags = reader.collect()
+        found[size] = tags.select(tags.is_kind("tag"))
+    assert not len(found[None]) and reader.unplaced >= 0
+    assert_hang(found[TAG_SIDE], TAG_SIGNS, 0.05)
+    twice = found[2 * TAG_SIDE]
+    y = dict(zip(twice.get_values(), twice.table["position"][:, 1], strict=True))
+    assert y["tag36h11:1"] == pytest.approx(3.6, abs=0.1) and y["tag36h11:2"] == pytest.approx(-1.2, abs=0.1)
+
+
+@pytest.mark.parametrize("size", [0, -1, float("nan"), float("inf"), "wide"])
+def test_a_size_that_is_none_is_refused(tmp_path: Path, size: object) -> None:
+    with pytest.raises(InputError, match="--tag-size .* can't be used; give a number above 0"):
+        read_points(write_corridor(tmp_path / "walk", walk_poses(2), ()), tag_size=size)
 
 
 def test_normals_face_the_camera() -> None:

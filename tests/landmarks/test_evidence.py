@@ -101,6 +101,19 @@ def test_a_changed_sign_does_not_undo_the_others():
     assert min(changed.values()) > 2.5
 
 
+def test_of_a_room_with_two_doors_the_sign_of_the_same_door_is_compared():
+    """Both doors bear one number and face opposite ways, the readings of either nearer to those of the other one."""
+    doors, others = places(1)[0] + [[0, 0, 0], [0.8, 0, 0]], places(8)[2:]
+    headings = np.array([0.0, np.pi, *[0.0] * 6])
+    first, second = (np.concatenate([doors + shift, others]) for shift in ([[0, 0, 0]] * 2, [[0.5, 0, 0], [-0.5, 0, 0]]))
+    a, b = (with_signs(["2.200", "2.200", *NUMBERS], at, number=headings) for at in (first, second))
+    assert [len(build_sightings(m, ("text",))) for m in (a, b)] == [8, 8]
+    evidence = score_landmarks(a, b, Sim3())
+    assert not [w for w in evidence.witnesses if w.verdict == "contradicts"]
+    alone = score_landmarks(*(with_signs(NUMBERS, others, number=headings[2:]) for _ in range(2)), Sim3())
+    assert evidence.support > alone.support - 0.5
+
+
 def test_swapped_signs_do_not_undo_the_others():
     assert min(lead(score(NUMBERS * 1, [NUMBERS[1], NUMBERS[0], *NUMBERS[2:]])).values()) > 2.0
 

@@ -83,6 +83,20 @@ def test_three_maps_and_the_order_of_rows() -> None:
     assert names == ["1", "sofa"] and summary.maps == (2, 1, 1) and summary.fused == 2
 
 
+def test_a_number_is_one_however_its_characters_were_read() -> None:
+    """O for 0, S for 5, other dots: no contradiction, and what was read more surely stands; 1 for 7 is another number."""
+    a = seen("text", "O.1Z5", at=AT_0, confidence=0.6)
+    for b in (seen("text", "0.125", at=AT_0, confidence=0.8), seen("text", "0-12S", at=AT_0, confidence=0.8)):
+        names, summary, _ = fuse(a, b)
+        assert names == b.get_values().tolist() and summary.fused == 1 and summary.contradicting == 0
+        assert fuse(b, a)[0] == names
+    assert fuse(a, seen("text", "0.725", at=AT_0))[1].contradicting == 1
+    assert (
+        len(fuse(seen("tag", "t5", at=AT_0), seen("tag", "ts", at=AT_0))[0]) == 2
+        and len(fuse(a, seen("object", "0125", at=AT_0))[0]) == 2
+    )
+
+
 def what(summary: LandmarkSummary) -> list[tuple[str, list[str], list[int], int | None]]:
     return [(c["what"], c["values"], c["maps"], c["room"]) for c in summary.contradictions]
 
@@ -108,6 +122,9 @@ def test_two_numbers_of_one_door_or_room_stay_and_are_told() -> None:
         (seen("name", "Küche", room=0), seen("name", "kitchen", room=0)),
         (seen("text", "2.113", at=AT_0), seen("text", "2.115", at=AT_0, confidence=0.3)),  # perhaps misread
         (seen("text", "2.113", at=AT_0), seen("text", "2.115", at=AT_1)),
+        (seen("text", "2.113", at=AT_0), seen("text", "2.11", at=AT_0)),  # an end was not read
+        (seen("text", "2.113", at=AT_0), seen("text", "O.113", at=AT_0, confidence=0.4)),
+        (seen("text", "118", at=AT_0), seen("text", "18", at=AT_0)),
         (seen("text", "2.113", at=shifted(AT_2, -1.4)), seen("text", "2.115", at=shifted(AT_2, 1.4))),  # a corridor has many
         (seen("text", "2.113", "2.115", at=AT_0), seen("text", "2.115", at=AT_0)),  # two doors
         (seen("name", "2.113", room=0), seen("text", "2.113", at=AT_0)),

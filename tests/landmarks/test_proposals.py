@@ -7,7 +7,9 @@ import pytest
 
 from tests.landmarks.test_evidence import HALL, NUMBERS, places, with_signs
 from topomerge.landmarks.evidence import LandmarkScorer
-from topomerge.landmarks.proposals import propose_poses
+from topomerge.landmarks.map_search import build_landmark_index, list_strings
+from topomerge.landmarks.proposals import MOST_PROPOSED, propose_poses
+from topomerge.landmarks.sightings import MOST_SIGHTINGS
 from topomerge.types import Sim3, build_landmarks, move_landmarks
 
 TRUE = Sim3(2.1, (30.0, -7.0, 0.6))
@@ -73,3 +75,17 @@ def test_heights_that_are_not_known_are_those_of_the_floors():
     two = [replace(map, storeys=np.repeat(map.storeys, 2)) for map in (a, b)]
     best = propose_poses(LandmarkScorer(*two), heights=[3.2])[0]
     assert best.translation[2] == 3.2 and best.yaw == pytest.approx(TRUE.yaw)
+
+
+def test_a_million_signs_propose_within_bounds():
+    """Hostile: of both maps the surest and rarest are looked at; poses are few and finite, and so are strings of an index."""
+    rng, count = np.random.default_rng(0), 1_000_000
+    many = build_landmarks("text", [f"{k}.{k % 97}" for k in range(2000)], "hostile")
+    table = np.repeat(many.table[:1], count)
+    table["value"], table["position"] = rng.integers(2000, size=count), rng.uniform(0, 20, (count, 3))
+    hostile = replace(HALL, landmarks=replace(many, table=table))
+    poses = propose_poses(LandmarkScorer(hostile, moved(hostile)))
+    assert len(poses) <= MOST_PROPOSED and all(np.isfinite(pose.matrix).all() for pose in poses)
+    assert len(list_strings(hostile)) <= MOST_SIGHTINGS
+    index = build_landmark_index([hostile, HALL, hostile])
+    assert [k for k, _ in index.rank(hostile, but=0)] == [2] and index.rank(HALL) == []

@@ -103,7 +103,8 @@ def test_the_scale_matters():
 
 @pytest.mark.parametrize("node", NODES, ids=node_name)
 @pytest.mark.parametrize(
-    "parts", [("scalars", "engineered", "shapedna"), ("pointnet", "voxelcnn"), ("pointnet_local",), tuple(CROP_SHAPES)]
+    "parts",
+    [("scalars", "engineered", "shapedna", "landmarks"), ("pointnet", "voxelcnn"), ("pointnet_local",), tuple(CROP_SHAPES)],
 )
 def test_gradients_reach_every_weight(parts, node):
     net = network(*parts, node=node).train()
@@ -305,3 +306,17 @@ def test_settings_that_would_take_all_memory_or_fail_oddly_are_refused(tmp_path,
     (tmp_path / "embedder.json").write_text(json.dumps({**settings, "network": table}))
     with pytest.raises(InputError, match=rf"embedder\.json: .*{message}"):
         read_embedder(tmp_path)
+
+
+def test_rooms_without_landmarks_are_as_before_to_the_bit():
+    """A network with a part for landmarks says of a map that has none what it says without that part; signs change rooms."""
+    node = Node("gat", 2, around=10.0)
+    net, plain, one = network("scalars", "landmarks", node=node), network("scalars", node=node), graph()
+    plain.load_state_dict({name: value for name, value in net.state_dict().items() if "landmarks" not in name})
+    none = {**one, "landmarks": torch.zeros_like(one["landmarks"])}
+    with torch.no_grad():
+        assert all(torch.equal(ours, before) for ours, before in zip(net(none), plain(one), strict=True))
+        without = one["landmarks"][:, :2].sum(dim=1) == 0
+        assert 0 < int(without.sum()) < len(without)
+        assert torch.equal(net.geometry(one)[without], plain.geometry(one)[without])
+        assert ((net.geometry(one) - plain.geometry(one)).abs().amax(dim=1) > 1e-3)[~without].all()

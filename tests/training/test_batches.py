@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from topomerge.models.embedder import Embedder
@@ -147,3 +148,27 @@ def test_what_another_sensor_saw_has_the_same_walls_but_in_patches():
     again = augment_sheet(one, Augment(), torch.Generator().manual_seed(0))
     assert torch.equal(same["sheet"], again["sheet"]) and torch.equal(same["anchor"], again["anchor"])
     assert same["sheet"].shape != other["sheet"].shape or not torch.equal(same["sheet"], other["sheet"])
+
+
+def test_invented_signs_are_one_of_a_room_and_leave_a_pair_with_landmarks_alone():
+    """They depend on the seed only; rooms that are one bear like strings, others do not; the pair itself stays as it is."""
+    from topomerge.training.batches import add_invented_signs
+
+    one = pair(0, 40)
+    bare = replace(one, a={**one.a, "landmarks": 0 * one.a["landmarks"]}, b={**one.b, "landmarks": 0 * one.b["landmarks"]})
+    alike, unlike, read = [], [], []
+    for seed in range(20):
+        signs, same = (add_invented_signs(bare, 1.0, torch.Generator().manual_seed(seed)) for _ in range(2))
+        assert torch.equal(signs.a["landmarks"], same.a["landmarks"]) and not bare.a["landmarks"].any()
+        a, b = (graph["landmarks"][:, 2:] for graph in (signs.a, signs.b))
+        likeness = a @ b.T
+        both = (a.any(dim=1)[:, None] & b.any(dim=1)[None]).float()
+        links = torch.zeros_like(likeness)
+        links[one.matches[:, 0], one.matches[:, 1]] = 1
+        alike.append(float((likeness * links * both).sum() / (links * both).sum()))
+        unlike.append(float((likeness * (1 - links) * both).sum() / ((1 - links) * both).sum()))
+        read.append(float(a.any(dim=1).float().mean()))
+    assert np.mean(alike) > np.mean(unlike) + 0.25 and 0.4 < np.mean(read) < 0.95 and np.ptp(read) > 0.2
+    generator = torch.Generator().manual_seed(0)
+    assert add_invented_signs(one, 1.0, generator) is one and add_invented_signs(bare, 0.0, generator) is bare
+    assert add_invented_signs(replace(bare, matches=bare.matches[:0]), 1.0, generator).a is bare.a

@@ -53,6 +53,7 @@ FIND_COLUMNS = """\
 Listed by fit, best first, then by share. fit: log odds that the new map lies there; other buildings mostly have less than 0.
 share: each room of the new map has one vote, which goes to the rooms that look most like it; those of this map got this share.
 rooms: pairs that look most like each other among the rooms of both maps, even if they look little alike.
+landmarks (where maps share any): rare strings that both hold, radio counted as such; each counts as 3.9 of fit.
 `topomerge merge` tells whether it is the same place."""
 
 
@@ -120,13 +121,15 @@ def _find(args: argparse.Namespace) -> int:
     if args.json:
         write_out(json.dumps([asdict(s) for s in sightings], indent=1, ensure_ascii=False) + "\n")
         return 0
-    rows = [("map", "fit", "share", "rooms (new map = atlas map)")]
+    some = any(s.landmarks for s in sightings)
+    rows = [("map", "fit", "share", *["landmarks"] * some, "rooms (new map = atlas map)")]
     for s in sightings:
         rooms = ", ".join(f"{i} = {j}" for i, j, _ in s.rooms[:ROOMS_SHOWN]) or "none similar"
-        rows.append((s.name, "" if s.fit is None else f"{s.fit:+.1f}", f"{s.share:.2f}", rooms))
-    widths = [max(len(row[c]) for row in rows) for c in range(3)]
+        fit = "" if s.fit is None else f"{s.fit:+.1f}"
+        rows.append((s.name, fit, f"{s.share:.2f}", *[f"{s.landmarks:.1f}"] * some, rooms))
+    widths = [max(len(row[c]) for row in rows) for c in range(3 + some)]
     print_text(
-        "\n".join("  ".join((*(f"{word:<{wide}}" for word, wide in zip(row, widths, strict=False)), row[3])) for row in rows)
+        "\n".join("  ".join((*(f"{word:<{wide}}" for word, wide in zip(row, widths, strict=False)), row[-1])) for row in rows)
     )
     if not args.quiet:
         print_text(f"\n{FIND_COLUMNS}")

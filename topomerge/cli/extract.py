@@ -60,7 +60,7 @@ def run_extract(args: argparse.Namespace) -> int:
         from topomerge.extraction.extract import extract
         from topomerge.io.points import read_chunks
 
-        lengths = ("scale", "resolution", "extrude", "spacing")
+        lengths = ("scale", "resolution", "extrude", "spacing", "tag_size")
         others = ("up", "unit", "drawing", "ceiling", "doors", "poses", "topic", "one_frame", "text", "page")
         reading = collect_given(args, *lengths, *others)
         chunks = read_chunks(args.input, **reading, progress=bars.start_task("read"))

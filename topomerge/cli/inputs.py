@@ -36,7 +36,7 @@ EXTRACT_ADVICE = ("--resolution", "--poses", "--topic", "--scale", "--spacing")
 LEAST_SIZE = 500_000  # bytes of a cloud, from which a process for it is worth its start (docs/benchmarks.md)
 COMPRESSION = {".laz": 6, ".e57": 2}  # of the bytes of a point, against PLY and LAS
 MEMORY_START, MEMORY_GROWTH = 600_000_000, 8  # bytes that extraction takes at most: to start with, and for each byte of the cloud
-WORKER_OPTIONS = ("voxel_size", "up", "unit", "one_frame", "sensor", "text", "verbose")
+WORKER_OPTIONS = ("voxel_size", "up", "unit", "one_frame", "sensor", "text", "tag_size", "verbose")
 EXTRACTION_MODULES = ("topomerge.extraction.extract", "topomerge.io.points")
 GRACE = 2.0  # s that a process has to end by itself
 Starter = Callable[[str], Report | None]  # title of a task -> what moves its bar
@@ -67,7 +67,7 @@ def check_cloud_options(paths: Sequence[str], args: argparse.Namespace) -> None:
 
 def collect_reading_options(path: str, args: argparse.Namespace) -> dict[str, Any]:
     """Collect the `CLOUD_OPTIONS` of reading one input, of which some are for folders only."""
-    return collect_given(args, "up", "unit", "text", *(["one_frame"] if Path(path).is_dir() else []))
+    return collect_given(args, "up", "unit", "text", "tag_size", *(["one_frame"] if Path(path).is_dir() else []))
 
 
 def is_map(path: str) -> bool:

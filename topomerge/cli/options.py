@@ -189,6 +189,12 @@ TEXT = (
         action="store_true",
         help="read signs and tags on pictures, or fail (default: where topomerge[text] is installed)",
     ),
+    build_option(
+        "--tag-size",
+        type=parse_positive,
+        metavar="S",
+        help="side of the black square of the tags on pictures, m: they are placed by it (default: by depth)",
+    ),
 )
 CLOUD_OPTIONS = (
     build_option("--voxel-size", type=parse_positive, metavar="E", help="edge length of the cells of a cloud, m (default 0.1)"),

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import zlib
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.types import Array, TopometricMap, is_mostly_unseen, select_lowest_of_column
+from topomerge.types import Array, TopometricMap, fold_text, is_mostly_unseen, select_lowest_of_column
 
 if TYPE_CHECKING:
     from torch_geometric.data import Data
@@ -77,6 +79,13 @@ THESIS_FEATURES = (
     "verticality",  # of the first principal axis: 0 level, 1 upright
     "roughness",  # m, mean distance to the plane of the 32 nearest cells
 )
+LANDMARK_TEXTS, LANDMARK_CLASSES = 128, 32  # columns that n-grams of characters and classes of objects are hashed into
+LANDMARK_MASKS = ("texts", "objects")  # 1: the room has any; 0: the other columns of the kind say nothing
+LANDMARK_FEATURES = (
+    *LANDMARK_MASKS,
+    *(f"text_{k}" for k in range(LANDMARK_TEXTS)),  # of its signs, tags and names, of length 1
+    *(f"class_{k}" for k in range(LANDMARK_CLASSES)),  # of its objects, of length 1
+)
 SPECTRUM_FEATURES = tuple(f"eigenvalue_{k}" for k in range(1, 33))  # 1/m2, ascending
 TABLES = {  # tensor of the graph -> its columns
     "x": ROOM_FEATURES,
@@ -86,6 +95,7 @@ TABLES = {  # tensor of the graph -> its columns
     "edge_way": WAY_FEATURES,
     "engineered": THESIS_FEATURES,
     "shapedna": SPECTRUM_FEATURES,
+    "landmarks": LANDMARK_FEATURES,
 }
 LENGTH_POWERS = {  # tensor -> column -> power of a length in its unit: how it grows when a map does
     "x": {
@@ -135,7 +145,7 @@ def convert_to_tensors(arrays: Mapping[str, Array]) -> Data:
 
 
 def build_graph_arrays(map: TopometricMap, points_per_room: int = POINTS_PER_ROOM) -> dict[str, Array]:
-    """Return the arrays of the graph, by name (see the top of this file).
+    """Return the arrays of the graph, by name (see the top of this file); `landmarks` of a map that has any.
 
     Raises:
         InputError: `points_per_room` is below 1.
@@ -147,6 +157,7 @@ def build_graph_arrays(map: TopometricMap, points_per_room: int = POINTS_PER_ROO
     doors = np.concatenate([map.open_edges, map.open_edges])
     floors, spread, sides = _measure_floors(map)
     pairs = _find_door_pairs(index[0])
+    signs = {"landmarks": compute_landmark_features(map)} if len(map.landmarks) else {}
     return {
         "x": _compute_room_features(map, index, doors, spread, sides),
         "room_points": _sample_room_points(map, floors, points_per_room),
@@ -157,7 +168,55 @@ def build_graph_arrays(map: TopometricMap, points_per_room: int = POINTS_PER_ROO
         "storey": map.rooms["storey"].astype(np.int64),
         "pos": np.ascontiguousarray(map.rooms["centroid"]),
         "edge_pos": np.ascontiguousarray(doors["centre"]),
+        **signs,
     }
+
+
+MOST_SIGNS = 64  # landmarks of a room and kind that are looked at, the surest first
+GRAMS = (2, 3)  # characters of an n-gram, with a mark at both ends of the string
+
+
+@lru_cache(maxsize=65536)
+def hash_text(text: str) -> tuple[tuple[int, float], ...]:
+    """Hash the n-grams of a text, folded as readers confuse its characters, so that a misread one is still like it.
+
+    Returns:
+        Column among `LANDMARK_TEXTS` and what is added there, of each n-gram; none of a text without letters and digits.
+    """
+    folded = fold_text(text)
+    marked = f"^{folded}$"
+    grams = [marked[k : k + n] for n in GRAMS for k in range(len(marked) - n + 1)] if folded else []
+    codes = [zlib.crc32(gram.encode()) for gram in grams]
+    return tuple(((code >> 1) % LANDMARK_TEXTS, (1 - 2 * (code & 1)) / len(codes) ** 0.5) for code in codes)
+
+
+def hash_landmarks(rooms: int, texts: Iterable[tuple[int, str, float]], objects: Iterable[tuple[int, str, float]]) -> Array:
+    """Hash what stands in rooms: (rooms, len(LANDMARK_FEATURES)) float32, 0 of a room without any.
+
+    Args:
+        texts: room, text and how sure it is of each; objects: room, class and how sure it is.
+    """
+    parts = np.zeros((rooms, LANDMARK_TEXTS)), np.zeros((rooms, LANDMARK_CLASSES))
+    for room, text, sure in texts:
+        for column, value in hash_text(text):
+            parts[0][room, column] += sure * value
+    for room, name, sure in objects:
+        parts[1][room, zlib.crc32(name.strip().casefold().encode()) % LANDMARK_CLASSES] += sure
+    lengths = [np.linalg.norm(part, axis=1, keepdims=True) for part in parts]
+    scaled = [part / np.where(length > 0, length, 1.0) for part, length in zip(parts, lengths, strict=True)]
+    return np.concatenate([*(length > 0 for length in lengths), *scaled], axis=1).astype(np.float32)
+
+
+def compute_landmark_features(map: TopometricMap) -> Array:
+    """Compute what the landmarks of each room say, the surest `MOST_SIGNS` of each kind: as `hash_landmarks`."""
+    table, told = map.landmarks.table, []
+    for kinds in (("text", "tag", "name"), ("object",)):
+        rows = np.flatnonzero(map.landmarks.is_kind(*kinds) & (table["room"] >= 0))
+        rows = rows[np.lexsort((rows, -table["confidence"][rows], table["room"][rows]))]
+        rows = rows[np.arange(len(rows)) - np.searchsorted(table["room"][rows], table["room"][rows]) < MOST_SIGNS]
+        room, value, sure = (table[name][rows].tolist() for name in ("room", "value", "confidence"))
+        told.append([(r, map.landmarks.values[v], c) for r, v, c in zip(room, value, sure, strict=True)])
+    return hash_landmarks(len(map.rooms), *told)
 
 
 def rescale_graph(arrays: Mapping[str, Array], scale: float) -> dict[str, Array]:

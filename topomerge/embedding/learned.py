@@ -22,9 +22,10 @@ from topomerge.embedding.graph import (
     POINTS_PER_ROOM,
     add_proximity_edges,
     build_graph_arrays,
+    count_columns,
     rescale_graph,
 )
-from topomerge.embedding.network import Network, build_embedder_signature, list_tensors
+from topomerge.embedding.network import LANDMARK_PART, Network, build_embedder_signature, list_tensors
 from topomerge.embedding.quarter_turns import (
     Descriptor,
     Rows,
@@ -120,6 +121,8 @@ class LearnedEmbedder:
         if self.network.node.around:
             inputs |= add_proximity_edges(inputs, self.network.node.around)
         inputs |= {n: compute(arrays["room_points"]) for n, compute in POINT_TABLES.items() if n in names and n not in arrays}
+        if LANDMARK_PART in names and LANDMARK_PART not in arrays:
+            inputs[LANDMARK_PART] = np.zeros((len(arrays["x"]), count_columns(LANDMARK_PART)), np.float32)
         if "near_index" in names and "near_index" not in arrays:
             layout = compute_door_layout(*(arrays[n] for n in ("edge_index", "pos", "edge_pos")))
             inputs |= dict(zip(("near_index", "near_attr"), layout, strict=True))
@@ -139,7 +142,7 @@ class LearnedEmbedder:
     @property
     def needs_points(self) -> bool:
         """Does the network read the points of rooms, or what is reckoned from them?"""
-        return bool(set(self.network.geometry.parts) - {"scalars", *CROP_SHAPES})
+        return bool(set(self.network.geometry.parts) - {"scalars", LANDMARK_PART, *CROP_SHAPES})
 
     def build_views(self, map: TopometricMap) -> list[dict[str, Array]]:
         """Build the arrays of a map that `embed_graph` takes, in each direction of its walls, the first one first."""

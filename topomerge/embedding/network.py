@@ -12,7 +12,9 @@ from topomerge.errors import InputError
 from topomerge.networks.network import Signature, Tensor
 from topomerge.registry import NODES, POINTS
 
-TABLE_PARTS = {"scalars": "x", "engineered": "engineered", "shapedna": "shapedna"}  # part -> table of the graph that it reads
+LANDMARK_PART = "landmarks"  # is added to what the other parts say: a room without landmarks stays as it is, to the bit
+# Part -> table of the graph that it reads.
+TABLE_PARTS = {"scalars": "x", "engineered": "engineered", "shapedna": "shapedna", LANDMARK_PART: "landmarks"}
 GRAPH = ("edge_index", "edge_attr")
 LARGEST_WIDTH = 4096  # more is a mistake, or a file that was made to take all memory
 FARTHEST_AROUND = 100.0  # m

@@ -3,8 +3,9 @@
 ``python evaluate.py task=landmarks data=test pairs=12 again=6 write=docs/results/landmarks.md``. So many pairs of each kind of
 places made to be alike (`datasets.pairs.lookalikes`), and so many of the first place visited twice, which belong together. Each
 pair is registered without landmarks, with half of the door signs read with a fifth of their characters wrong, with signs read
-well, and with tags (`READINGS`). Signs are drawn beside the maps: these are those of the other tables. Right: within 0.5 m and
-5 degrees.
+well, and with tags (`READINGS`).
+Signs are drawn beside the maps: these are those of the other tables. Right: within 0.5 m and 5 degrees. ``data=signs``: the
+likelihood of signs alone, without walls, in a minute; ``data=signs_train``: of training buildings, to choose by.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from topomerge.code_digest import compute_code_digest
+from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.core.builder import limit_threads
 from topomerge.datasets.pairs.grid_pairs import GridPair, load_grids
 from topomerge.datasets.pairs.lookalikes import (
@@ -26,13 +29,23 @@ from topomerge.datasets.pairs.lookalikes import (
     draw_lookalike_items,
     read_lookalike_signs,
 )
-from topomerge.datasets.simulation.signs import Reader
+from topomerge.datasets.plans.splits import get_seed_range
+from topomerge.datasets.simulation.signs import (
+    READERS,
+    Reader,
+    change_signs,
+    draw_numbering,
+    draw_other_numbering,
+    place_signs,
+    read_signs,
+)
 from topomerge.evaluation.documents import write_table
 from topomerge.evaluation.tasks import Row, TaskSettings, measure_missing
+from topomerge.landmarks.evidence import score_landmarks
 from topomerge.registration.pipeline import register
 from topomerge.statistics import compute_exact_interval
 from topomerge.training.belief_hypotheses import compute_pose_error, is_hypothesis_right
-from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, Landmarks, LogFn, TopometricMap, VoxelGrid
+from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, Landmarks, LogFn, Sim3, TopometricMap, VoxelGrid
 
 MAKERS = ("topomerge.registration.pipeline", "topomerge.landmarks.evidence", "topomerge.datasets.pairs.lookalikes")
 READINGS = {
@@ -77,12 +90,18 @@ def make_recipe(settings: Settings) -> LookalikeRecipe:
 
 
 def list_inputs(settings: Settings) -> list[str]:
-    """Names of the pairs."""
+    """Names of the pairs, or of the buildings whose signs are scored alone."""
+    if settings.data.set in ALONE:
+        return [f"signs {k}" for k in range(settings.data.limit or BUILDINGS)]
     return [item.name for item in draw_lookalike_items(make_recipe(settings))]
 
 
 def measure(settings: Settings, log_line: LogFn) -> list[Row]:
     """Measure the pairs that are missing."""
+    if settings.data.set in ALONE:
+        path = Path(settings.cache) / "evaluation" / f"{settings.data.set}.jsonl"
+        items = {name: (k, ALONE[settings.data.set]) for k, name in enumerate(list_inputs(settings))}
+        return measure_missing(path, items, measure_building, log_line, settings, compute_code_digest(__name__))
     recipe = make_recipe(settings)
     sharing = _Sharing(settings.cache, settings.jobs)
     files = {path.stem: path for path in build_lookalikes(recipe, sharing, log_line)[0]}
@@ -96,6 +115,62 @@ def measure(settings: Settings, log_line: LogFn) -> list[Row]:
     items = {k: v for k, v in items.items() if settings.data.only in k}
     rows = measure_missing(path, items, measure_pair, log_line, settings)
     return [{**row, **of} for row in rows for of in row["readings"]]
+
+
+ALONE = {"signs": "test", "signs_train": "train"}  # sets of signs alone: split of the buildings
+BUILDINGS = 40
+LAYOUTS = ("office", "hotel", "hospital", "school")
+SEEN_ROOMS, VISITED = 8, 6  # rooms near each other, and how many of them each visitor enters
+READ_ALONE = {**READERS, "fair": Reader(reads=0.7, wrong=0.08)}
+RELATIONS = {
+    "storey": "storey",
+    "wing": "wing",
+    "row": "elsewhere",
+    "building": "building",
+}  # other place -> its alternative
+
+
+def measure_building(number: int, split: str) -> Row:
+    """Score signs of one place read twice, and of places that have its walls and are another storey, wing, row or building."""
+    rng = np.random.default_rng([number, 51, int(split == "test")])
+    first, last = get_seed_range(split)
+    building = make_building(LAYOUTS[number % len(LAYOUTS)], int(rng.integers(first, last + 1)), 1)
+    numbering = draw_numbering(rng)
+    signs = place_signs(building, numbering, np.random.default_rng(1))
+    middles = np.array([room.polygon.mean(axis=0) for room in building.rooms])
+    away = np.linalg.norm(middles - middles[int(rng.integers(len(middles)))], axis=1)
+    visits = [rng.permutation(np.argsort(away)[:SEEN_ROOMS])[:VISITED].tolist() for _ in range(2)]
+    cells = np.unique(np.floor(signs["at"] / 0.3).astype(int), axis=0)
+    grid = VoxelGrid.from_cells(cells - cells.min(axis=0), cells.min(axis=0) * 0.3, 0.3)
+    scored = []
+    for name, reader in READ_ALONE.items():
+        own = read_signs(signs, visits[0], Sim3(), reader, rng)
+        for relation in ("", *RELATIONS):
+            drawn = draw_other_numbering(numbering, relation, rng) if relation else numbering
+            other = place_signs(building, drawn, np.random.default_rng(1)) if relation else signs
+            later = read_signs(change_signs(other, rng), visits[1], Sim3(), reader, rng)
+            maps = [build_bare_map(grid, None, of) for of in (own, later)]
+            odds = score_landmarks(maps[0], maps[1], Sim3()).compute_likelihoods()
+            scored += [[name, relation, odds[a]] for r, a in RELATIONS.items() if relation in ("", r)]
+    return {"scored": scored}
+
+
+def tabulate_alone(rows: Sequence[Row]) -> str:
+    """Tabulate the mean log loss of another place against this one, alike likely before, and how often ten to one is wrong."""
+    lines = []
+    for name in READ_ALONE:
+        scored = [(relation, odds) for row in rows for reader, relation, odds in row["scored"] if reader == name]
+        here = np.array([odds for relation, odds in scored if not relation])
+        cells = [f"{np.logaddexp(0, here).mean():.3f}", f"{(here > SURE_ODDS).mean():.3f}"]
+        for kind in RELATIONS:
+            odds = np.array([o for relation, o in scored if relation == kind])
+            cells += [f"{np.logaddexp(0, -odds).mean():.3f}", f"{(odds < -SURE_ODDS).mean():.3f}"]
+        lines.append([name, len(here) // len(RELATIONS), *cells])
+    heads = [f"{what}{words}" for what in ("this place", *RELATIONS) for words in ("", ": told wrong")]
+    return write_table(["reader", "places", *heads], lines)
+
+
+SURE_ODDS = float(np.log(10))
 
 
 @dataclass
@@ -156,6 +231,8 @@ def is_false(row: Row) -> bool:
 
 def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
     """Tabulate what is wrongly merged and what is believed of true pairs, all and by kind, for each reading."""
+    if settings.data.set in ALONE:
+        return {"landmark-odds": tabulate_alone(rows)}
     out = [_format_line(name, [r for r in rows if r["reading"] == name]) for name in READINGS]
     lines: list[list[object]] = []
     for kind in LOOKALIKES:

@@ -337,7 +337,7 @@ def _read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         yield from iter_pieces(sample.watch(_iter_scans(bag, topic, decode, poses)), poses.warnings)
         frame = _read_first_frame(bag, topic).strip("/")
         carrier = frame if not poses.registered else poses.carrier or ""
-        reader = LandmarkReader(bag, partial(poses.locate, frame), carrier, _read_camera, options.text)
+        reader = LandmarkReader(bag, partial(poses.locate, frame), carrier, _read_camera, options)
         yield from reader.read(sample)
 
 

@@ -14,7 +14,7 @@ from topomerge.errors import InputError
 from topomerge.io.bag_file import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, Bag, Message, Topic, get_time
 from topomerge.io.depth_images import Camera, PosedScan, read_color
 from topomerge.io.pictures import LEAST_TAG_MARGIN, Picture, PictureReader, place_box
-from topomerge.io.piece import Piece
+from topomerge.io.piece import Piece, ReadOptions
 from topomerge.io.sightings import MOST_SIGHTINGS, Sighting, clean_text, compute_heading, fuse_sightings
 from topomerge.io.trajectory import build_pose_matrices
 from topomerge.types import Array, Landmarks, build_landmarks, join_landmarks
@@ -242,14 +242,14 @@ class LandmarkReader:
         locate: gives the pose of a frame.
         carrier: the frame of the sensor whose trajectory is known, that carries radios and barometers.
         camera_of: finds the camera of a topic of images.
-        text: as of `PictureReader`.
+        options: of reading pictures.
     """
 
-    def __init__(self, bag: Bag, locate: Locate, carrier: str, camera_of: CameraOf, text: bool | None) -> None:
+    def __init__(self, bag: Bag, locate: Locate, carrier: str, camera_of: CameraOf, options: ReadOptions) -> None:
         self.bag, self.locate, self.carrier, self.camera_of = bag, locate, carrier, camera_of
         self.frame_cameras: dict[str, Camera | None] = {}
         self.moment = 0
-        self.pictures = PictureReader(text)
+        self.pictures = PictureReader(options.text, options.tag_size)
         self.cameras: dict[str, tuple[Topic, Camera]] = {}
         self.cloud = np.zeros((0, 3))
         self.sightings: list[Sighting] = []

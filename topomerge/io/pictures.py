@@ -21,7 +21,7 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.depth_images import Camera, Frame, iter_pieces, iter_posed_scans
-from topomerge.io.piece import Piece
+from topomerge.io.piece import Piece, ReadOptions
 from topomerge.io.sightings import MOST_SIGHTINGS, Sighting, clean_text, compute_heading, fuse_sightings, is_legible
 from topomerge.types import Array, Landmarks
 
@@ -41,6 +41,7 @@ SURFACE_BAND = 0.1  # of the depth: what is that near to the median belongs to t
 NORMAL_PIXELS, MOST_SIGN_PIXELS = 15, 3000  # of depth, from which on the surface says where a sign faces
 FLATNESS = 0.25  # thickness of that surface by its width
 POSE_SIGMA, PIXEL_SIGMA, DEPTH_SIGMA = 0.05, 0.01, 0.003  # m; of the distance, of its square (1/m): cameras of depth
+CORNER_ERROR, SMALLEST_TAG = 0.5, 8.0  # pixels, of the corners of a tag, and of the side of one that tells a pose
 LEAST_TAG_MARGIN = 30.0  # of AprilTag's decision: below, tags are seen in patterns
 log = logging.getLogger(__name__)
 
@@ -71,13 +72,14 @@ class PictureReader:
 
     Args:
         text: True: the packages must be there; None: read with those that are; False: nothing is read.
+        tag_size: m, the side of the black square of all tags, by which their poses are computed; None: by depth.
 
     Raises:
         InputError: a package is missing that must be there.
     """
 
-    def __init__(self, text: bool | None = None) -> None:
-        self.wanted = text is not False
+    def __init__(self, text: bool | None = None, tag_size: float | None = None) -> None:
+        self.wanted, self.tag_size = text is not False, tag_size
         if text and load_text_reader() is None:
             raise InputError("--text: reading signs on pictures needs rapidocr_onnxruntime: pip install topomerge[text]")
         self.warnings: list[str] = []
@@ -136,7 +138,7 @@ class PictureReader:
         self.read += 1
 
     def _place(self, kind: str, value: str, confidence: float, box: Array, picture: Picture) -> None:
-        place = place_box(box, picture)
+        place = place_square(box, picture, self.tag_size) if kind == "tag" and self.tag_size else place_box(box, picture)
         if place is None:
             self.unplaced += 1
             return
@@ -154,16 +156,16 @@ class PictureReader:
         return fuse_sightings(self.sightings, "pictures")
 
 
-def iter_frame_pieces(path: Path, frames: Iterable[Frame | None], said: list[str], text: bool | None) -> Iterator[Piece]:
+def iter_frame_pieces(path: Path, frames: Iterable[Frame | None], said: list[str], options: ReadOptions) -> Iterator[Piece]:
     """Yield the points of posed frames, and with the last piece the signs and tags on their colours.
 
     Args:
         path: of the recording, for messages.
         frames: as `iter_posed_scans` takes them.
         said: takes warnings.
-        text: as of `PictureReader`.
+        options: of reading pictures.
     """
-    reader = PictureReader(text)
+    reader = PictureReader(options.text, options.tag_size)
 
     def collect() -> Landmarks:
         landmarks = reader.collect()
@@ -215,6 +217,38 @@ def place_box(box: Array, picture: Picture) -> tuple[Array, float, float] | None
     normal = estimate_normal(surface)
     heading = math.nan if normal is None else compute_heading(picture.pose[:3, :3] @ normal)
     sigma = math.hypot(POSE_SIGMA, PIXEL_SIGMA * distance, DEPTH_SIGMA * distance**2)
+    return picture.pose[:3, :3] @ middle + picture.pose[:3, 3], sigma, heading
+
+
+def place_square(corners: Array, picture: Picture, side: float) -> tuple[Array, float, float] | None:
+    """Return where the middle of a square of known size lies, by its corners (4, 2) on a picture, one after the other.
+
+    Source: Z. Zhang, "A flexible new technique for camera calibration", 2000 (pose of a plane by its homography).
+
+    Args:
+        side: of the square, m.
+
+    Returns:
+        As `place_box`; None: it is too small on the picture, or seen from its edge.
+    """
+    rays = (corners - picture.lens.centre) / picture.lens.focal
+    pixels = float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).min())
+    if not np.isfinite(rays).all() or pixels < SMALLEST_TAG:
+        return None
+    square = np.column_stack([side / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), np.ones(4)])
+    nothing = np.zeros((4, 3))
+    rows = [np.hstack([square, nothing, -rays[:, :1] * square]), np.hstack([nothing, square, -rays[:, 1:] * square])]
+    _, spread, axes = np.linalg.svd(np.concatenate(rows))
+    if spread[-1] < 1e-9 * spread[0]:  # corners that lie in a line tell no plane
+        return None
+    plane = axes[-1].reshape(3, 3)
+    plane = plane * (np.sign(plane[2, 2]) / np.sqrt(np.linalg.norm(plane[:, 0]) * np.linalg.norm(plane[:, 1])))
+    middle, normal = plane[:, 2], np.cross(plane[:, 0], plane[:, 1])
+    distance = float(np.linalg.norm(middle))
+    if not 0 < distance <= FARTHEST_SIGN:  # false for nan
+        return None
+    heading = compute_heading(picture.pose[:3, :3] @ (-normal if normal @ middle > 0 else normal))
+    sigma = math.hypot(POSE_SIGMA, distance * CORNER_ERROR / pixels)
     return picture.pose[:3, :3] @ middle + picture.pose[:3, 3], sigma, heading
 
 

@@ -132,6 +132,7 @@ class ReadOptions:
         topic: of a bag, where it has several with points or maps.
         page: of a PDF file, from 1; None: the only one that holds anything. Of a picture with several plans: which; None: all.
         text: read signs and tags on pictures. True: must; None: where the packages for that are installed; False: don't.
+        tag_size: side of the black square of the tags on pictures, m, by which they are placed; None: by depth.
     """
 
     up: str | None = None
@@ -148,6 +149,7 @@ class ReadOptions:
     one_frame: bool = False
     page: int | None = None
     text: bool | None = None
+    tag_size: float | None = None
 
     @property
     def factor(self) -> float:
@@ -156,7 +158,7 @@ class ReadOptions:
 
 
 OPTION_NAMES = tuple(field.name for field in fields(ReadOptions))
-LENGTH_NAMES = ("scale", "resolution", "extrude", "spacing")
+LENGTH_NAMES = ("scale", "resolution", "extrude", "spacing", "tag_size")
 
 
 def read_options(path: Path, values: Mapping[str, Any]) -> ReadOptions:
@@ -182,7 +184,7 @@ def read_options(path: Path, values: Mapping[str, Any]) -> ReadOptions:
         value = getattr(options, name)
         if value is not None and not (isinstance(value, Real) and math.isfinite(value) and float(value) > 0):
             shown = f"{value:g}" if isinstance(value, Real) else repr(value)
-            raise InputError(f"{path}: --{name} {shown} can't be used; give a number above 0")
+            raise InputError(f"{path}: --{name.replace('_', '-')} {shown} can't be used; give a number above 0")
     return options
 
 

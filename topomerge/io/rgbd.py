@@ -40,7 +40,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     camera, said = _read_camera(path)
     depths = _read_image_list(path, "depth.txt")
     colors = _read_image_list(path, "rgb.txt") if (path / "rgb.txt").is_file() else []
-    yield from iter_frame_pieces(path, _iter_frames(path, depths, colors, trajectory, camera), said, options.text)
+    yield from iter_frame_pieces(path, _iter_frames(path, depths, colors, trajectory, camera), said, options)
 
 
 def _read_camera(path: Path) -> tuple[Camera, list[str]]:

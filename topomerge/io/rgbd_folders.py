@@ -45,7 +45,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     place = find_layout(path)
     assert place is not None
     layout, folder = place
-    yield from iter_frame_pieces(folder, layout.frames(folder), [], options.text)
+    yield from iter_frame_pieces(folder, layout.frames(folder), [], options)
 
 
 def find_layout(path: Path) -> tuple[Layout, Path] | None:

@@ -214,7 +214,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         with closing(sqlite3.connect(build_read_address(path), uri=True)) as base:
             base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_BLOB)
             base.execute("PRAGMA trusted_schema = OFF")
-            yield from _iter_pieces(path, base, options.text)
+            yield from _iter_pieces(path, base, options)
     except sqlite3.Error as error:
         raise build_damage_error(path, RTABMAP_KIND, error) from error
 
@@ -239,22 +239,22 @@ def build_read_address(path: Path) -> str:
     return f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
 
 
-def _iter_pieces(path: Path, base: sqlite3.Connection, text: bool | None) -> Iterator[Piece]:
+def _iter_pieces(path: Path, base: sqlite3.Connection, options: ReadOptions) -> Iterator[Piece]:
     version = read_version(path, base)
     said: list[str] = []
     poses = read_poses(path, base, version, said)
     kind = _detect_kind(path, base, version)
     if kind == "depth":
-        yield from iter_frame_pieces(path, _iter_frames(path, base, version, poses), said, text)
+        yield from iter_frame_pieces(path, _iter_frames(path, base, version, poses), said, options)
     else:
         yield from iter_pieces(_iter_scans(path, base, version, poses, kind == "flat", said), said)
-        yield _read_pictures(path, base, version, poses, text)
+        yield _read_pictures(path, base, version, poses, options)
     yield Piece(np.empty((0, 3)), landmarks=_read_landmarks(path, base, poses), done=1.0)
 
 
-def _read_pictures(path: Path, base: sqlite3.Connection, version: tuple[int, ...], poses: Poses, text: bool | None) -> Piece:
+def _read_pictures(path: Path, base: sqlite3.Connection, version: tuple[int, ...], poses: Poses, options: ReadOptions) -> Piece:
     """Signs and tags on the pictures of a recording whose points are those of a laser."""
-    reader = PictureReader(text)
+    reader = PictureReader(options.text, options.tag_size)
     if reader.wanted:
         for frame in _iter_frames(path, base, version, poses, reader.is_due):
             if frame is not None and isinstance(frame.depth, np.ndarray) and not isinstance(frame.color, Path):

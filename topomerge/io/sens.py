@@ -32,7 +32,7 @@ PNG_COLOR, JPEG_COLOR = 1, 2
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Read points of every frame in the frame of the poses."""
-    yield from iter_frame_pieces(path, _iter_frames(path), [], options.text)
+    yield from iter_frame_pieces(path, _iter_frames(path), [], options)
 
 
 def _iter_frames(path: Path) -> Iterator[Frame]:

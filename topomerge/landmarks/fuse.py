@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from topomerge.types import LANDMARK_KINDS, Array, Landmarks, TopometricMap, join_landmarks
+from topomerge.types import LANDMARK_KINDS, Array, Landmarks, TopometricMap, fold_text, join_landmarks
 
 SAME_PLACE = 1.5  # m between two sightings of one landmark, after the maps were joined
 SAME_DOOR = 1.0  # m between two signs of one door
@@ -95,7 +95,8 @@ class _Fusion:
         landmarks: all.
         owner: (n,) the part of each.
         into: (n,) the row that each is fused into; its own where it stands for itself.
-        key: (n,) number of kind and string, without case and blanks; -1 of what is not fused.
+        key: (n,) number of kind and string, without case and blanks, of numbers of rooms also without what readers confuse; -1 of
+            what is not fused.
         word: (n,) number of the string alone; of what may be the number of a room, else -1.
     """
 
@@ -106,11 +107,12 @@ class _Fusion:
         self.owner = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         self.into = np.arange(len(self.table))
         folded = ["".join(value.casefold().split()) for value in table.values]
-        numbered = {value: k for k, value in enumerate(dict.fromkeys(folded))}
-        word = np.array([numbered[value] for value in folded], np.int64)[self.table["value"]]
+        numbers = [NUMBER.fullmatch(value) is not None for value in folded]
+        read = [fold_text(v) if number else v for v, number in zip(folded, numbers, strict=True)]
+        texts = table.is_kind("text", "name")
+        word = np.where(texts, *(_number_strings(of)[self.table["value"]] for of in (read, folded)))
         self.key = np.where(table.is_kind(*FUSED_KINDS), word * len(LANDMARK_KINDS) + self.table["kind"], -1)
-        is_number = np.array([NUMBER.fullmatch(value) is not None for value in folded], bool)[self.table["value"]]
-        self.word = np.where(is_number & table.is_kind("text", "name"), word, -1)
+        self.word = np.where(np.array(numbers, bool)[self.table["value"]] & texts, word, -1)
         self.doors = np.bincount(joined.edges["rooms"].ravel(), minlength=len(joined.rooms))
         self.contradictions: list[dict[str, Any]] = []
         self.contradicting = 0
@@ -154,7 +156,7 @@ class _Fusion:
         return before[i], own[j]
 
     def _fuse(self, old: Array, new: Array) -> None:
-        """Make one of each pair of rows: the position by its uncertainty, the confidence of both, the rest of the surer one."""
+        """Make one of each pair of rows: the position by its uncertainty, the confidence of both, the surer one's string."""
         t, known = self.table, self.known
         sigma = np.where(np.isfinite(t["sigma"]), np.maximum(t["sigma"], LEAST_SIGMA), USUAL_SIGMA)
         weight = np.where(known, sigma**-2.0, 0.0)
@@ -168,6 +170,7 @@ class _Fusion:
         unsaid = np.isnan(t["sigma"][old]) & np.isnan(t["sigma"][new])
         t["sigma"][old] = np.where(both & ~unsaid, total**-0.5, t["sigma"][surer])
         t["position"][old] = mean
+        t["value"][old] = np.where(t["confidence"][new] > t["confidence"][old], t["value"][new], t["value"][old])
         t["confidence"][old] = 1 - (1 - t["confidence"][old]) * (1 - t["confidence"][new])
         for name in ("number", "time"):
             said = t[name][surer]
@@ -203,6 +206,10 @@ class _Fusion:
         self._note("tag", first[far], rows[far])
 
     def _note(self, what: str, one: Array, other: Array) -> None:
+        strings = self.landmarks.values
+        rows = zip(self.table["value"][one].tolist(), self.table["value"][other].tolist(), strict=True)
+        differ = np.array([what == "tag" or not is_cut_off(strings[a], strings[b]) for a, b in rows], bool)
+        one, other = one[differ], other[differ]
         self.contradicting += len(one)
         for a, b in list(zip(one.tolist(), other.tolist(), strict=True))[: MOST_LISTED - len(self.contradictions)]:
             apart = float(np.linalg.norm(self.table["position"][a] - self.table["position"][b]))
@@ -210,6 +217,18 @@ class _Fusion:
             room, maps = int(self.table["room"][b]), [int(self.owner[a]), int(self.owner[b])]
             place = {"room": room if room >= 0 else None, "apart_m": round(apart, 2) if np.isfinite(apart) else None}
             self.contradictions.append({"what": what, "values": values, "maps": maps, **place})
+
+
+def is_cut_off(one: str, other: str) -> bool:
+    """May one of two numbers be the other one, of which a reader lost an end: 0.12 and 0.129?"""
+    short, long = sorted((fold_text(one), fold_text(other)), key=len)
+    return len(long) > 2 and len(long) - len(short) == 1 and (long.startswith(short) or long.endswith(short))
+
+
+def _number_strings(values: Sequence[str]) -> Array:
+    """(n,) number of each string, the same of equal ones."""
+    numbers = {value: k for k, value in enumerate(dict.fromkeys(values))}
+    return np.array([numbers[value] for value in values], np.int64)
 
 
 def _find_nearest(position: Array, group: Array, before: Array, own: Array, reach: float) -> tuple[Array, Array]:

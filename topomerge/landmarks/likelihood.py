@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from topomerge.landmarks.sightings import Sightings
+from topomerge.landmarks.sightings import TURNED_BY, Sightings
 from topomerge.landmarks.text import (
     Shift,
     find_shifts,
@@ -45,7 +45,7 @@ OTHERWISE = 0.01
 SHIFTED = {"elsewhere": 0.4, "storey": 0.7, "half": 0.5, "wing": 0.6, "building": 0.2, "outside": 0.2}  # share of such places
 NEAR = {"elsewhere": 0.5, "storey": 0.8, "half": 0.5, "wing": 0.6, "building": 0.3, "outside": 0.3}  # numbers near the other's
 WORDS_CHANGED = 0.2  # probability that a sign without a number was changed: notices, names of people
-TURNED_BY, TURNED = np.radians(60.0), 0.1  # rad by which two headings of one landmark do not differ; times as likely if they do
+TURNED = 0.1  # times as likely are two readings of one landmark whose headings differ
 PRIOR_SIGNS = 2.0  # signs that weigh as much as what is known of buildings at large
 POSE_SIGMA, DRIFT_SIGMA = 0.3, 0.4  # m
 GATE = 2.5  # standard deviations within which two signs may be one
@@ -141,7 +141,7 @@ def pick_partners(a: Sightings, b: Sightings, met: Associated, rules: Kind, kind
         met = met.select(np.argsort(met.apart, kind="stable")[:MOST_PAIRS])
     middle = READERS[2][0]
     reading = np.array([score_pair(a.keys[i], b.keys[j], middle, kind) for i, j in met.pairs.tolist()])
-    same = reading * (1 - met.apart / 4)
+    same = reading * (1 - met.apart / 4) * np.where(met.turned, TURNED, 1.0)  # of a room with two doors, the one of this door
     keys = [sorted((a.keys[i], b.keys[j])) for i, j in met.pairs.tolist()]
     order = sorted(range(len(keys)), key=lambda k: (-same[k], met.apart[k], keys[k]))
     taken: tuple[set[int], set[int]] = set(), set()

@@ -7,14 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from topomerge.landmarks.text import estimate_share, fold_text, is_number
-from topomerge.types import LANDMARK_KINDS, Array, TopometricMap
+from topomerge.landmarks.text import estimate_share, is_number
+from topomerge.types import LANDMARK_KINDS, Array, TopometricMap, fold_text
 
 MOST_ROWS = 20_000  # of a kind that are looked at: of more, those that were read most surely
 MOST_SIGHTINGS = 1500  # of a kind that testify: of more, the rarest
 USUAL_SIGMA = 0.3  # m, of a position whose reader gives none
 ROOM_SIGMA, STOREY_SIGMA = 0.5, 0.5  # of the side of its room, of the diagonal of its storey, where only these are known
 SAME_SIGN = 1.5  # m within which a string that is read twice is one sign
+TURNED_BY = np.radians(60.0)  # rad by which two headings of one landmark do not differ
 FARTHEST = 1e7  # m: a position beyond is none
 OBJECTS = {"chair": 0.2, "table": 0.1, "door": 0.15, "window": 0.1, "desk": 0.08, "plant": 0.05, "lamp": 0.08, "monitor": 0.06}
 RARE_OBJECT = 0.02  # share of the objects of buildings that are of a class that is not among these
@@ -132,6 +133,8 @@ def _pick_single_readings(sightings: Sightings) -> Array:
         if len(kept) >= MOST_SIGHTINGS // 10:  # a string that stands everywhere says nothing
             continue
         away = np.linalg.norm(sightings.position[kept, :2] - sightings.position[k, :2], axis=1) if kept else np.zeros(0)
-        if not (away < SAME_SIGN).any():
+        with np.errstate(invalid="ignore"):
+            turned = np.abs(np.angle(np.exp(1j * (sightings.heading[kept] - sightings.heading[k])))) > TURNED_BY
+        if not ((away < SAME_SIGN) & ~turned).any():
             kept.append(k)
     return np.array(sorted(k for kept in by_key.values() for k in kept), np.int64)

@@ -12,8 +12,8 @@ import re
 import unicodedata
 from functools import lru_cache
 
-SHAPES = str.maketrans({"o": "0", "q": "0", "d": "0", "i": "1", "l": "1", "j": "1", "z": "2", "s": "5", "b": "8", "g": "9"})
-LONGEST = 32  # characters that are compared
+from topomerge.types import LONGEST_FOLDED, fold_text
+
 ALPHABET = 15.0  # characters that an error may give
 SUBSTITUTED, SHIFTED = 0.7, 0.15  # of the errors: another character; one too many, and as many one too few
 # Characters of two classes that look alike in print, so that readers commonly take them for each other.
@@ -62,17 +62,10 @@ EVERYWHERE = tuple(
 
 
 @lru_cache(maxsize=65536)
-def fold_text(text: str) -> str:
-    """Fold a string to what any reader should give: letters and digits alone, one character a class of shapes."""
-    plain = unicodedata.normalize("NFKD", text[: 4 * LONGEST]).casefold()
-    return "".join(c for c in plain if c.isalnum())[:LONGEST].translate(SHAPES)
-
-
-@lru_cache(maxsize=65536)
 def is_number(text: str) -> bool:
     """Is a string a number of a room or the like, with letters perhaps, or read as one?"""
     folded = fold_text(text)
-    digits = sum(c.isdigit() for c in text[: 4 * LONGEST])
+    digits = sum(c.isdigit() for c in text[: 4 * LONGEST_FOLDED])
     return bool(folded) and len(folded) <= 8 and (folded.isdigit() or 2 * digits >= len(folded))
 
 
@@ -85,7 +78,7 @@ def is_common(text: str) -> bool:
 @lru_cache(maxsize=65536)
 def estimate_share(text: str) -> float:
     """Estimate the share of the signs of buildings at large that bear this string."""
-    plain = " ".join(unicodedata.normalize("NFKC", text[: 4 * LONGEST]).casefold().split()).strip(".,:;!- ")
+    plain = " ".join(unicodedata.normalize("NFKC", text[: 4 * LONGEST_FOLDED]).casefold().split()).strip(".,:;!- ")
     everywhere = max((share for pattern, share in EVERYWHERE if pattern.fullmatch(plain)), default=0.0)
     folded = fold_text(text)
     if is_number(text):

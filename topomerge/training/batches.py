@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,9 @@ from torch import Tensor
 from torch.utils.data import Dataset
 from torch_geometric.data import Batch, Data
 
-from topomerge.embedding.graph import find_column, find_columns_of_power
+from topomerge.datasets.simulation.signs import READERS, draw_numbering, misread
+from topomerge.embedding.graph import find_column, find_columns_of_power, hash_landmarks
+from topomerge.embedding.network import LANDMARK_PART
 from topomerge.embedding.quarter_turns import compute_edge_positions
 from topomerge.embedding.surroundings import CROP_SHAPES, SHEET_PLANES, cut_crops
 from topomerge.kernels.images import interpolate_drifts, warp_sheet
@@ -303,6 +305,9 @@ def build_map_pair(
 ) -> MapPair:
     """A pair as one graph; see `make_batch`. While training, maps whose turn matters stand alike, and b comes once more, turned
     wrongly: none of its rooms there is one of a."""
+    if augment is not None and augment.signs and LANDMARK_PART in names:
+        assert generator is not None
+        pair = add_invented_signs(pair, augment.signs, generator)
     graphs, rows = [], []
     views, oriented = _build_views(pair, names, augment, generator), bool(ORIENTED & set(names))
     for view, true in zip(views, pair.true, strict=True):
@@ -399,6 +404,34 @@ def find_well_seen_rooms(links: Tensor, a: Tensor, b: Tensor) -> list[Tensor]:
     alike = (areas[0][:, None] - areas[1][None]).abs() <= math.log(ALIKE_AREAS)
     good = links & alike & visited[0][:, None] & visited[1][None]
     return [good.any(dim=k) | (~links.any(dim=k) & visited[1 - k]) for k in (1, 0)]
+
+
+MISPLACED = 0.1  # share of the signs that are taken for another room's
+
+
+def add_invented_signs(pair: GraphPair, share: float, generator: torch.Generator) -> GraphPair:
+    """Return a pair with invented door signs of its true rooms, read by a visitor of each map; by chance, and where it has
+    landmarks already or nothing in common, as it is.
+
+    Args:
+        share: of the pairs that get signs.
+    """
+    drawn = bool(torch.rand((), generator=generator) < share) and len(pair.matches) > 0
+    if not drawn or any(bool(graph[LANDMARK_PART].any()) for graph in (pair.a, pair.b)):
+        return pair
+    rng = np.random.default_rng(int(torch.randint(1 << 40, (), generator=generator)))
+    numbering, reader = draw_numbering(rng), READERS[str(rng.choice(sorted(READERS)))]
+    order = rng.permutation(1 + max(int(true.max()) for true in pair.true))
+    graphs = []
+    for graph, true in zip((pair.a, pair.b), pair.true, strict=True):
+        texts = []
+        for room in np.flatnonzero((true.numpy() >= 0) & (rng.random(len(true)) < reader.reads)).tolist():
+            number = numbering.first + int(order[true[room]])
+            text = numbering.style.format(storey=numbering.storey, wing=numbering.wing, number=number)
+            at = int(rng.integers(len(true))) if rng.random() < MISPLACED else room
+            texts.append((at, misread(text, reader.wrong, rng), 1.0))
+        graphs.append({**graph, LANDMARK_PART: torch.from_numpy(hash_landmarks(len(true), texts, ()))})
+    return replace(pair, a=graphs[0], b=graphs[1])
 
 
 def augment_graph(graph: Graph, rooms: int, augment: Augment, generator: torch.Generator) -> tuple[Graph, Tensor]:

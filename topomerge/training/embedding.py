@@ -14,7 +14,7 @@ import torch
 from matplotlib.figure import Figure
 
 from topomerge.checkpoint import load_state
-from topomerge.embedding.network import Network, build_network
+from topomerge.embedding.network import LANDMARK_PART, Network, build_network
 from topomerge.embedding.weights import STATE_FILE, STATE_SETTINGS
 from topomerge.errors import InputError
 from topomerge.matching.assignment import assign_certain, compute_certainty
@@ -24,7 +24,7 @@ from topomerge.models.losses import Objective
 from topomerge.models.weights import read_embedder, read_state, save_state
 from topomerge.networks.network import WEIGHTS_PACKAGE
 from topomerge.registry import SCHEDULES
-from topomerge.training.batches import AugmentedPairs, MapPair
+from topomerge.training.batches import AugmentedPairs, MapPair, add_invented_signs
 from topomerge.training.descent import build_optimizer
 from topomerge.training.device_batches import DevicePairs, supports_device_batches
 from topomerge.training.loop import (
@@ -355,12 +355,15 @@ def _load_data(settings: Training, log_line: LogFn, fabric: Any) -> tuple[list[G
         train, watched = hold_out(train)
     if not train:
         raise InputError(f"{settings.data}: no pairs to train on")
+    if settings.augment.signs and LANDMARK_PART in settings.network.geometry.parts:
+        generator = torch.Generator().manual_seed(settings.seed)
+        watched = [add_invented_signs(pair, settings.augment.signs, generator) for pair in watched]
     return train, watched, replayed
 
 
 def load_read_pairs(settings: Training, manifest: Path, log_line: LogFn, limit: int = 0) -> list[GraphPair]:
     """Load the pairs of a manifest with what the network reads; `limit` as of `load_pairs`."""
-    extras = [part for part in settings.network.geometry.parts if part in EXTRAS]
+    extras = [part for part in settings.network.geometry.parts if part in (*EXTRAS, LANDMARK_PART)]
     extras += ["near"] if settings.network.node.near else []
     extras += ["sheet"] if settings.network.turns > 1 else []
     return load_pairs(manifest, extras, log_line, limit, settings.network.node.around)

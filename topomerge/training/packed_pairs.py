@@ -23,6 +23,7 @@ from topomerge import archive
 from topomerge.datasets.core.building import find_physical_building
 from topomerge.embedding.engineered import compute_door_layout
 from topomerge.embedding.graph import add_proximity_edges, count_columns
+from topomerge.embedding.network import LANDMARK_PART
 from topomerge.errors import InputError
 from topomerge.types import Array
 
@@ -90,7 +91,7 @@ def load_pairs(
 
     Args:
         manifest: or a packed file itself.
-        extras: what is wanted, too: of `EXTRAS`, `near`, the layout of doors, or `sheet`, the storeys from above.
+        extras: what is wanted, too: of `EXTRAS`, `landmarks`, `near`, the layout of doors, or `sheet`, the storeys from above.
         limit: of the first pairs only; 0: all.
         around: m within which rooms are neighbours, too (`embedding.rooms_around`); 0: by doors only.
 
@@ -104,7 +105,7 @@ def load_pairs(
         arrays = archive.read(path, "packed set")
         if "transform" not in arrays:
             raise InputError(f"{path}: was packed by an earlier version; give its manifest, and it is packed again")
-        return _add_layout(_unpack_pairs(arrays, {})[: limit or None], extras, around)
+        return _add_layout(_unpack_pairs(arrays, _get_landmarks(arrays, extras))[: limit or None], extras, around)
     rows = _read_rows(path)
     names = [str(row["file"]) for row in rows]
     digest = hashlib.sha256(json.dumps([PACKED_FORMAT, names]).encode()).hexdigest()[:12]
@@ -119,6 +120,7 @@ def load_pairs(
         )
     arrays = archive.read(packed_file, "packed set")
     tables = {name: _compute_extra(name, arrays, packed_file, log_line, limit) for name in extras if name in EXTRAS}
+    tables |= _get_landmarks(arrays, extras)
     pairs = _add_layout(_unpack_pairs(arrays, tables)[: limit or None], extras, around)
     if "sheet" in extras:
         _add_sheets(pairs, [path.parent / "pairs" / name for name in names], packed_file, log_line)
@@ -162,6 +164,12 @@ def _add_sheets(pairs: Sequence[GraphPair], files: Sequence[Path], packed_file: 
                     graph.update({name: torch.from_numpy(arrays[f"{file.stem}.{side}.{name}"]) for name in SHEET})
 
 
+def _get_landmarks(arrays: Mapping[str, Array], extras: Sequence[str]) -> dict[str, Array]:
+    """What landmarks say of all rooms, where it is wanted; of sets without any, 0."""
+    none = np.zeros((len(arrays["x"]), count_columns(LANDMARK_PART)), np.float32)
+    return {LANDMARK_PART: arrays.get(LANDMARK_PART, none)} if LANDMARK_PART in extras else {}
+
+
 def _add_layout(pairs: list[GraphPair], extras: Sequence[str], around: float) -> list[GraphPair]:
     for graph in (g for pair in pairs for g in (pair.a, pair.b)) if around else ():
         near = add_proximity_edges({n: graph[n].numpy() for n in ("pos", "edge_index", "edge_attr", "edge_pos")}, around)
@@ -194,6 +202,9 @@ def _pack_pairs(pairs_and_rows: list[tuple[dict[str, Array], dict[str, Any]]]) -
     out |= {name: np.concatenate([side[name] for side in sides], axis=1).astype(np.int32) for name in PACKED_INDICES}
     points = np.concatenate([np.round(side["room_points"] * 1000).clip(-32767, 32767).astype(np.int16) for side in sides])
     out["room_points"] = points
+    if any(LANDMARK_PART in side for side in sides):
+        width = count_columns(LANDMARK_PART)
+        out[LANDMARK_PART] = np.concatenate([s.get(LANDMARK_PART, np.zeros((len(s["x"]), width), np.float32)) for s in sides])
     for name, of in (("rooms", "x"), ("edges", "edge_attr"), ("doors", "door_attr")):
         out[name] = np.array([len(side[of]) for side in sides])
     out["true"] = np.concatenate([side["true_room"] for side in sides]).astype(np.int32)

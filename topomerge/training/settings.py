@@ -228,6 +228,7 @@ class Augment:
         slices: share of those that look like slices; rough: of those whose walls have gaps or are thicker.
         tilt: degrees, standard deviation of how far the direction of walls is taken wrong; of some maps four times as much.
         zoom: of a storey's size, likewise, as a logarithm; bend: pixels, of how far places 8 m apart drift.
+        signs: share of pairs without landmarks that get invented door signs, where the network reads landmarks.
     """
 
     rooms: float = 0.15
@@ -243,6 +244,7 @@ class Augment:
     tilt: float = 1.5
     zoom: float = 0.02
     bend: float = 0.5
+    signs: float = 0.0
 
 
 @dataclass
@@ -316,7 +318,7 @@ def check(settings: Training) -> None:
         "augment.rooms": settings.augment.rooms,
         "augment.edges": settings.augment.edges,
     }
-    shares |= {f"augment.{name}": getattr(settings.augment, name) for name in ("walks", "slices", "rough")}
+    shares |= {f"augment.{name}": getattr(settings.augment, name) for name in ("walks", "slices", "rough", "signs")}
     for key, value in shares.items():
         if not 0 <= value < 1:
             raise InputError(f"{key} must be 0 or more and below 1, not {value}")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -171,6 +173,17 @@ def _clean_string(value: str) -> str:
         return value
     printable = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in " ".join(value.split()))
     return printable[:LONGEST_VALUE].strip()
+
+
+SHAPES = str.maketrans({"o": "0", "q": "0", "d": "0", "i": "1", "l": "1", "j": "1", "z": "2", "s": "5", "b": "8", "g": "9"})
+LONGEST_FOLDED = 32  # characters that are compared
+
+
+@lru_cache(maxsize=65536)
+def fold_text(text: str) -> str:
+    """Fold a string to what any reader should give: letters and digits alone, one character a class of shapes."""
+    plain = unicodedata.normalize("NFKD", text[: 4 * LONGEST_FOLDED]).casefold()
+    return "".join(c for c in plain if c.isalnum())[:LONGEST_FOLDED].translate(SHAPES)
 
 
 def find_room_names(landmarks: Landmarks, rooms: int) -> list[str]:

@@ -19,7 +19,7 @@ from topomerge.datasets.core.builder import BuildRow
 from topomerge.datasets.core.building import Opening, Plan
 from topomerge.datasets.pairs import example, items
 from topomerge.datasets.pairs.build import Build, build, main
-from topomerge.datasets.pairs.example import PairSet, load_example
+from topomerge.datasets.pairs.example import PairSet, describe_item, load_example, make_arrays
 from topomerge.datasets.pairs.items import Item, Recipe, check, draw_items, select_plans
 
 from tests.datasets.boxes import room
@@ -319,3 +319,29 @@ def test_a_cluster_that_loses_a_worker(whole: Path, tmp_path: Path) -> None:
         for process in started:
             process.kill()
             process.wait()
+
+
+def test_signs_change_nothing_else_of_a_recipe() -> None:
+    """Items without signs keep their names, by which cached pairs are found; those with signs differ in nothing but them."""
+    signed = replace(SMALL, pairs=40, signs=0.5)
+    before, after = (draw_items(recipe, {}) for recipe in (replace(SMALL, pairs=40), signed))
+    assert [replace(item, signs="") for item in after] == before
+    assert {item.signs for item in after} == {"", "good", "poor"} and 10 < sum(bool(item.signs) for item in after) < 30
+    assert all((one.name == other.name) == (not one.signs) for one, other in zip(after, before, strict=True))
+    assert "signs" not in describe_item(before[0])
+    with pytest.raises(InputError, match="signs are of pairs that are not changed"):
+        check(replace(signed, vary={"noise": [0.1]}))
+
+
+@pytest.mark.longer
+def test_maps_of_a_pair_with_signs_hold_landmarks() -> None:
+    """Rooms that are one bear the same number where both were read; the pair is the same but for these."""
+    item = replace(draw_items(SMALL, {})[0], signs="good")
+    signed, plain = make_arrays(item, [()] * 5), make_arrays(replace(item, signs=""), [()] * 5)
+    assert {*signed} - {*plain} == {"a.landmarks", "b.landmarks"}
+    for name in plain.keys() - {"about"}:
+        np.testing.assert_array_equal(signed[name], plain[name])  # nan is nan
+    read = [signed[f"{side}.landmarks"] for side in "ab"]
+    both = [(i, j) for i, j in plain["matches"].tolist() if read[0][i, 0] and read[1][j, 0]]
+    # A sign beside a door may be given to the room on its other side.
+    assert len(both) > 2 and np.median([read[0][i, 2:] @ read[1][j, 2:] for i, j in both]) > 0.7

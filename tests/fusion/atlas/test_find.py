@@ -21,6 +21,7 @@ from topomerge.fusion.atlas.find import find, rank_sightings, register_sightings
 from topomerge.fusion.atlas.folder import read_atlas
 from topomerge.fusion.atlas.rooms_index import ROOMS_FILE
 from topomerge.fusion.atlas.store import add, remove
+from topomerge.types import build_landmarks
 from topomerge.viz.atlas_report import render_atlas_html
 
 
@@ -86,6 +87,25 @@ def test_the_map_on_which_it_lies_best_comes_first(house: Path, monkeypatch: pyt
     assert register_sightings(read_atlas(house), office_map(0), turned) == (first, second)
     monkeypatch.setattr(finding, "LAID_COARSELY", 1)
     assert register_sightings(read_atlas(house), office_map(0), turned) == (second, turned[1])
+
+
+def test_maps_that_hold_the_same_rare_strings_come_first(house: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sign that both hold counts, also where the looks of rooms left the map out; words of all buildings do not."""
+    signs = build_landmarks("text", ["4.711", "EXIT"], "r", room=0)
+    folder = tmp_path / "signs"
+    marked = replace(stranger(), landmarks=signs)
+    add(folder, [(NAMES[0], office_map(0)), ("stranger", marked)], render_atlas_html)
+    names = [e.name for e in read_atlas(folder).entries]
+    new = replace(office_map(0), landmarks=signs)
+    assert finding.rank_by_landmarks(read_atlas(folder), new) == {names.index("stranger"): 1.0}
+    assert finding.rank_by_landmarks(read_atlas(folder), office_map(0)) == {}
+    exits = replace(new, landmarks=build_landmarks("text", ["EXIT"], "r", room=0))
+    assert finding.rank_by_landmarks(read_atlas(folder), exits) == {} and find(folder, exits) == find(house, office_map(0))
+    told = {s.name: s.landmarks for s in find(folder, new)}
+    assert told == {NAMES[0]: 0.0, "stranger": 1.0}
+    monkeypatch.setattr(finding, "SHORTLIST", 1)
+    monkeypatch.setattr(finding, "STRING_ODDS", 1000.0)
+    assert [s.name for s in find(folder, new, 1)] == ["stranger"] and [s.name for s in find(folder, exits, 1)] == [NAMES[0]]
 
 
 def test_what_the_atlas_loses_is_found_no_more(house: Path) -> None:

@@ -7,7 +7,8 @@ votes that its rooms got: it says where to look first, not whether the place is 
 The first `LAID_COARSELY` are ordered by how well their walls fit: rooms of small maps look like those of many others.
 
 Of an atlas of more than `SHORTLIST` maps only so many are compared that closely: those for which the nearest neighbours of the
-new map's rooms speak, by exact search or an index (`prepare_rooms_index`).
+new map's rooms speak, by exact search or an index (`prepare_rooms_index`), and those that hold rare strings or access points of
+the new map (`landmarks.map_search`). A rare string that both hold counts as much as one that agrees may count in a merge.
 """
 
 from __future__ import annotations
@@ -33,11 +34,15 @@ from topomerge.fusion.atlas.partners import (
     list_owners,
 )
 from topomerge.fusion.atlas.rooms_index import RoomRows, compute_embedder_signature, prepare_rooms_index
+from topomerge.io.maps import load_landmarks, load_map
+from topomerge.landmarks.likelihood import KINDS
+from topomerge.landmarks.map_search import build_landmark_index
 from topomerge.matching.match import embed_rooms
 from topomerge.types import Array, TopometricMap
 
 SHORTLIST = 50  # maps that are compared room by room
 LAID_COARSELY = 10  # maps with the largest shares, that the new one is laid on
+STRING_ODDS = float(np.log(KINDS["text"].most))  # log odds of a map that holds a rare string of the new one
 ELSEWHERE = 0.1  # of a room's vote counts for a room that does not lie where those of most rooms do
 
 
@@ -52,12 +57,14 @@ class Sighting:
             alike one in the other map.
         fit: log odds that the best rigid pose of both maps is right, seen by itself (`coarse.coarse_log_odds`); None where none
             was looked for.
+        landmarks: rare strings that both hold, and what radio counts as, in such strings.
     """
 
     name: str
     share: float
     rooms: tuple[tuple[int, int, float], ...]
     fit: float | None = None
+    landmarks: float = 0.0
 
 
 def find(folder: str | Path, map: TopometricMap, number: int = 5) -> tuple[Sighting, ...]:
@@ -87,8 +94,21 @@ def find(folder: str | Path, map: TopometricMap, number: int = 5) -> tuple[Sight
     maps = list(range(len(stored.entries)))
     if len(maps) > max(SHORTLIST, number):
         maps = select_shortlist(_score_maps(stored, rows, signature, new), max(SHORTLIST, number))
-    sightings = rank_sightings([stored.entries[k].name for k in maps], rows.get_rows(maps), new, max(number, LAID_COARSELY))
+    worth = rank_by_landmarks(stored, map)
+    maps += sorted(worth.keys() - set(maps))
+    names = {stored.entries[k].name: worth.get(k, 0.0) for k in maps}
+    ranked = [replace(s, landmarks=names[s.name]) for s in rank_sightings(list(names), rows.get_rows(maps), new, len(maps))]
+    sightings = sorted(ranked, key=lambda s: -s.landmarks)[: max(number, LAID_COARSELY)]
     return register_sightings(stored, map, sightings)[:number]
+
+
+def rank_by_landmarks(stored: StoredAtlas, map: TopometricMap) -> dict[int, float]:
+    """Rank the maps of an atlas by rare landmarks that both hold: number of a map -> worth (`LandmarkIndex.rank`)."""
+    if not len(map.landmarks):
+        return {}
+    files = [stored.folder / e.file for e in stored.entries]
+    index = build_landmark_index(load_map(file) if len(load_landmarks(file)[0]) else None for file in files)
+    return dict(index.rank(map))
 
 
 def register_sightings(stored: StoredAtlas, map: TopometricMap, sightings: Sequence[Sighting]) -> tuple[Sighting, ...]:
@@ -98,7 +118,8 @@ def register_sightings(stored: StoredAtlas, map: TopometricMap, sightings: Seque
     both = Maps([map, *(files[s.name] for s in first)])
     scale = str(stored.settings.get("scale") or "fixed")
     fitted = [replace(s, fit=compute_coarse_log_odds(both, 0, k, scale)) for k, s in enumerate(first, 1)]
-    return *sorted(fitted, key=lambda s: -(s.fit or 0.0)), *sightings[LAID_COARSELY:]
+    fitted.sort(key=lambda s: -((s.fit or 0.0) + STRING_ODDS * s.landmarks))
+    return *fitted, *sightings[LAID_COARSELY:]
 
 
 def _score_maps(stored: StoredAtlas, rows: RoomRows, signature: str, new: Rows) -> Array:
