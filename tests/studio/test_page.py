@@ -402,6 +402,24 @@ def test_a_tablet_pinches_and_taps(folder: Path) -> None:
         send("touchEnd", 0)
         assert one.page.evaluate("() => studio.canvas.view.scale") > 1.8 * scale
         assert len(list(folder.glob("*.jsonl"))) == 0, "a pinch is no edit"
+        one.press("0")
+        box, x = room["box"], room["x"] + 30
+        one.page.tap("[data-tool=split]")
+        for place in ((x, box[1] + 4), (x + 2, box[3] - 4)):
+            one.page.touchscreen.tap(*one.point(*place))
+        one.wait_version(1)
+        assert lines(folder)[-1]["op"] == "split_room" and len(one.storey["rooms"]) == 8
+        door = one.storey["doors"][0]
+        (x0, y0, x1, y1), moved = door["line"], (30, 0) if abs(door["line"][0] - door["line"][2]) > 1 else (0, 30)
+        start, end = ((x0 + x1) / 2, (y0 + y1) / 2), ((x0 + x1) / 2 + moved[0], (y0 + y1) / 2 + moved[1])
+        one.page.tap("[data-tool=move]")
+        one.page.touchscreen.tap(*one.point(*start))
+        one.page.touchscreen.tap(*one.point(*end))
+        one.wait_version(2)
+        assert lines(folder)[-1]["op"] == "move_door"
+        one.page.tap("[data-act=undo]")
+        one.wait_version(3)
+        assert lines(folder)[-1]["op"] == "undo"
 
 
 def test_ctrl_c_ends_the_server_and_its_job(folder: Path) -> None:
