@@ -13,13 +13,18 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
 ROOT = Path(__file__).parent.parent
 # Blocks of the sealed page are never written again: their commands are those of their commit.
-PAGES = (ROOT / "docs" / "results.md", *(p for p in sorted((ROOT / "docs" / "results").glob("*.md")) if p.stem != "sealed"))
+PAGES = (
+    *(ROOT / "docs" / name for name in ("results.md", "training.md", "evaluation.md")),
+    *(p for p in sorted((ROOT / "docs" / "results").glob("*.md")) if p.stem != "sealed"),
+)
 COMMAND = re.compile(r"(?<![\w-])python (?=-m |evaluate\.py|train\.py)([^`\n;|]*)")
+FLAGS = {"--overfit": "overfit=true", "--resume": "resume=true", "--overwrite": "overwrite=true"}  # as train.py
 PLACEHOLDERS = {"$n": "2 6"}  # of loops of the shell
 INSTALLED = ("datasets", "models", "configs")  # that stand at the top of the repository
 
@@ -52,9 +57,10 @@ def take(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         Exception: it does not take them.
     """
     if words[0] == "train.py":
-        importlib.import_module("topomerge.training.tasks").compose_settings(
-            [w for w in words[1:] if w != "-m"]
-        )  # of a sweep, its start
+        from topomerge.training.tasks import compose_settings
+
+        plain = [FLAGS.get(w, w) for w in words[1:] if w != "-m" and not w.startswith("hydra")]
+        compose_settings([select_first(w) for w in plain] if "-m" in words else plain)  # of a sweep, its first run
         return
     if words[0] == "evaluate.py":
         from topomerge.config import compose
@@ -62,10 +68,15 @@ def take(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         from topomerge.evaluation.tasks import MODULES, read_settings
 
         task = next((w.removeprefix("task=") for w in words if w.startswith("task=")), "")
+        rest = [w for w in words[1:] if not w.startswith("task=")]
         if task in MODULES:
             read_settings(task, words[1:])
-            return
-        compose("evaluate", Evaluation, [w for w in words[1:] if not w.startswith("task=")])
+        elif task:
+            from topomerge.training.tasks import compose_settings
+
+            compose_settings([w for w in words[1:] if not w.startswith(("run=", "folder="))])
+        else:
+            compose("evaluate", Evaluation, [f"run=[{w[4:]}]" if re.match(r"run=[^\[]", w) else w for w in rest])
         return
     assert words[0] == "-m", words
     path = source_of(words[1])
@@ -96,9 +107,15 @@ def take(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     assert calls, f"{words[1]}: does not start with these words"
 
 
-def record(calls: list[object], signature: inspect.Signature, *given: Any, **named: Any) -> None:
-    """Stand in for a function: its arguments must fit."""
+def select_first(word: str) -> str:
+    """The first choice of a word of a sweep."""
+    return word if "[" in word else word.split(",")[0]
+
+
+def record(calls: list[object], signature: inspect.Signature, *given: Any, **named: Any) -> MagicMock:
+    """Stand in for a function: its arguments must fit; what it returns takes everything."""
     calls.append(signature.bind(*given, **named))
+    return MagicMock()
 
 
 def words_of(text: str) -> list[str]:
@@ -116,7 +133,9 @@ def test_commands_of_the_results_are_taken(page: str, text: str, monkeypatch: py
 
 def test_there_are_commands() -> None:
     pages = {page for page, _ in written()}
-    assert {"rooms.md", "merging.md", "peers.md", "learned.md", "ablation.md", "robustness.md"} <= pages | {"results.md"}
+    assert {"rooms.md", "merging.md", "peers.md", "learned.md", "ablation.md", "robustness.md", "training.md"} <= pages | {
+        "results.md"
+    }
     assert len(written()) > 15
 
 

@@ -1,4 +1,5 @@
-"""How a command tells the program that started it how far it is: lines of stderr, one for each step forward."""
+"""How work tells how far it is: steps of the method to whoever listens, and a command to the program that started it, by lines of
+stderr, one for each step forward."""
 
 from __future__ import annotations
 
@@ -6,11 +7,32 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 
 PROGRESS_VARIABLE = "TOPOMERGE_PROGRESS"  # set to "lines" by who wants them
 PROGRESS_MARK = "@progress "  # a line begins with this; JSON follows: task, share, text
 EVERY = 0.1  # s between two lines of a task that does the same thing
+Teller = Callable[[float, str], None]
+_listener: ContextVar[Teller | None] = ContextVar("listener", default=None)
+
+
+@contextmanager
+def report_steps(tell: Teller | None) -> Iterator[None]:
+    """Report the steps that are told within the context (`tell_step`); None: to nobody."""
+    token = _listener.set(tell)
+    try:
+        yield
+    finally:
+        _listener.reset(token)
+
+
+def tell_step(share: float, text: str) -> None:
+    """Tell which step begins, and the share of the work that is done, if anybody listens."""
+    tell = _listener.get()
+    if tell is not None:
+        tell(share, text)
 
 
 def is_progress_asked() -> bool:
@@ -18,7 +40,7 @@ def is_progress_asked() -> bool:
     return os.environ.get(PROGRESS_VARIABLE) == "lines"
 
 
-def build_progress_teller(task: str) -> Callable[[float, str], None]:
+def build_progress_teller(task: str) -> Teller:
     """Build what tells the share of a task that is done, and what is being done."""
     last: tuple[float, str] = (0.0, "")
 

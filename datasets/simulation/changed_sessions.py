@@ -107,11 +107,14 @@ def make_changed_pair(
         scan_building(day, name, _find_reachable(day, visited), rng, spacing) for day, name in zip(days, sensors, strict=True)
     ]
     done = [replace(c, seen=c.seen and _is_seen(c, scans, days)) for c in done]
+    walls = [c.outline for c in done if c.kind.startswith("wall") and c.seen]  # a room is split where its wall was seen
+    done = [replace(c, seen=bool(shapely.intersects(walls, c.outline).any())) if c.kind.startswith("room") else c for c in done]
     clouds = transform_cloud(scans[0], frames[0]), transform_cloud(scans[1], frames[1])
     return ChangedPair(days[0], clouds, frames, tuple(done))
 
 
 _REVERSED = {
+    "room split": "room joined",
     "wall new": "wall gone", "wall gone": "wall new", "door new": "door gone", "door gone": "door new",
     "door bricked up": "door cut", "door opened": "door shut", "door shut": "door opened",
     "furniture new": "furniture gone", "furniture gone": "furniture new",
@@ -156,6 +159,7 @@ def _add_doors(plan: Plan, rng: np.random.Generator) -> Plan:
 def _alter(base: Building, visited: Sequence[int], rng: np.random.Generator) -> tuple[Building, Building, list[TrueChange]]:
     """The building, its things in the way taken out, and the same with a wall more and a doorway less; and what that is."""
     done: list[TrueChange] = []
+    divided: list[TrueChange] = []
     other = base
     for room in rng.permutation(visited).tolist():
         wall = _draw_wall(base, room, rng)
@@ -164,6 +168,7 @@ def _alter(base: Building, visited: Sequence[int], rng: np.random.Generator) -> 
             base = _remove_things(base, outline)
             other = _add_masonry(base, parts, room)
             done += [_describe("wall new", outline), _describe("door new", doorway)]
+            divided = [_describe("room split", shapely.Polygon(base.rooms[room].polygon))]
             break
     walled = shapely.union_all([c.outline for c in done])
     inner = np.flatnonzero((other.doors["rooms"] >= 0).all(axis=1) & np.isin(other.doors["rooms"], visited).all(axis=1))
@@ -181,7 +186,7 @@ def _alter(base: Building, visited: Sequence[int], rng: np.random.Generator) -> 
         other = replace(other, doors=np.delete(other.doors, d), things=_renumber_doors(other.things, d))
         done.append(_describe("door bricked up", outline))
         break
-    return base, other, done
+    return base, other, done + divided
 
 
 Masonry = tuple[tuple[float, ...], tuple[float, ...], float]  # centre, size, yaw

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import topomerge as tm
-from tests.changes.flats import MOVED, TABLE, flat_map
+from tests.changes.flats import CABIN, MOVED, TABLE, flat_map
 from tests.scenes_map import building
 from topomerge.changes.compare import KINDS, Changes, compare_maps
 from topomerge.changes.layers import build_storey_layers, estimate_slack
+from topomerge.edits.journal import build_edit
 from topomerge.errors import InputError
 from topomerge.types import Placement, Sim3, TopometricMap
 
@@ -52,6 +53,32 @@ def test_a_wall_that_was_put_up() -> None:
     assert door.extent == pytest.approx(0.9, abs=0.1) and door.place[:2] == pytest.approx([4.0, 2.5], abs=0.1)
     split = only(found, "room split")
     assert len(split.old) == 1 and len(split.new) == 2
+
+
+def test_a_cabin_in_a_hall_is_a_new_room_and_one_that_was_taken_out_is_gone() -> None:
+    found = compare_maps(flat_map(), flat_map(cabin=True))
+    assert found.count_kinds() == {"wall new": 2, "door new": 1, "room new": 1}
+    room = only(found, "room new")
+    assert room.old == () and len(room.new) == 1 and room.extent**2 == pytest.approx((CABIN - 0.15) ** 2, abs=0.8)
+    assert room.place[:2] == pytest.approx([CABIN / 2, CABIN / 2], abs=0.2) and room.evidence["seen"] > 0.8
+    assert kinds(flat_map(cabin=True), flat_map()) == {"wall gone": 2, "door gone": 1, "room gone": 1}
+    assert kinds(flat_map(half=True), flat_map(cabin=True)) == {}, "its ground was not seen before"
+
+
+def test_of_one_scan_what_was_corrected_is_compared() -> None:
+    map = flat_map()
+    cut = tm.apply_edits(map, [build_edit("split_room", at=[2.0, 2.5, 0.1], line=[[4.0, -0.2], [4.0, 5.2]])]).map
+    cut = tm.apply_edits(cut, [build_edit("delete_door", at=map.edges["centre"][0].tolist())]).map
+    placement, reason, _ = tm.align_maps(map, cut)
+    assert placement is not None and "one scan" in reason
+    found = compare_maps(map, cut, placement)
+    assert found.count_kinds() == {"door new": 1, "door gone": 1, "room split": 1}, "a cut leaves an opening"
+    assert all(c.probability == 1 and c.evidence == {"corrected": 1.0} for c in found.changes)
+    split = only(found, "room split")
+    assert len(split.old) == 1 and len(split.new) == 2
+    assert kinds(cut, map) == {"door new": 1, "door gone": 1, "room joined": 1}
+    with pytest.raises(InputError, match="is the same map"):
+        tm.align_maps(map, replace(map, source="copy.tmap"))
 
 
 @pytest.mark.parametrize("choices", [{"wall": True}, {"box": TABLE}])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.scenes import Scene
-from topomerge.changes.model import ElementRow, compare_with_model, estimate_common_shift
+from topomerge.changes.model import ElementRow, _decide_elsewhere, compare_with_model, estimate_common_shift
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.io.ifc import ModelElement, read_elements
@@ -86,6 +86,44 @@ def test_a_wall_that_is_not_there_is_missing_and_one_that_is_not_modelled_is_new
     assert missing.guid == "at 8" and missing.name == "wall wall at 8" and missing.place[0] == pytest.approx(8, abs=0.05)
     reverse = compare_with_model([e for e in model if e.guid != "at 8"], scan(gone=True), built, Placement(Sim3()))
     assert [c.kind for c in reverse.changes if c.element == "wall"] == ["wall new"]
+
+
+def scan_side(shift: float) -> TopometricMap:
+    """A hall with three walls across it, and of the partition at its end, 12 cm thick, only the side of the hall."""
+    scene = Scene().shell(0, 0, 7.94 + shift, 8)
+    for x in (2, 4, 6):
+        scene.wall((x, 0), (x, 8), doors=(2.0,))
+    points = np.concatenate(scene.parts)
+    points = points[points[:, 0] < 7.96 + shift]
+    return extract(points + np.random.default_rng(1).normal(0, 0.004, points.shape))
+
+
+@pytest.mark.parametrize("shift", [0.10, -0.10, 0.05])
+def test_a_wall_seen_from_one_side_is_not_taken_for_its_other_face(shift: float) -> None:
+    walls = {"left": ((-THICK, 0, 0), (0, 8, 2.7)), "low": ((0, -THICK, 0), (8, 0, 2.7))}
+    walls |= {"high": ((0, 8, 0), (8, 8 + THICK, 2.7)), "thin": ((7.94, 0, 0), (8.06, 8, 2.7))}
+    walls |= {f"at {x}": ((x - THICK / 2, 0, 0), (x + THICK / 2, 8, 2.7)) for x in (2, 4, 6)}
+    elements = [*(box(name, "wall", *corners) for name, corners in walls.items()), box("floor", "slab", (0, 0, -0.2), (8, 8, 0))]
+    rows = judge(elements, scan_side(0.0), scan_side(shift))
+    assert rows["thin"].state == "elsewhere" and rows["thin"].shift == pytest.approx(shift, abs=0.01)
+    assert {guid for guid, row in rows.items() if row.state == "elsewhere"} == {"thin"}
+
+
+def test_what_is_too_narrow_to_be_measured_is_not_called_elsewhere() -> None:
+    """A pier as wide as three cells of the scan, 3 cm off: the cells at its edges are a mixture."""
+    wide, narrow = (_decide_elsewhere(0.03, float(np.hypot(0.005, m))) for m in (0.0, 0.022))
+    assert wide[0] == "elsewhere" and wide[1] > 0.9 and narrow[0] == "seen"
+
+
+def test_a_door_that_stands_elsewhere_says_by_how_much(model: list[ModelElement], built: TopometricMap) -> None:
+    assert judge(model, built, built)["door"].state == "seen"
+    for moved in (0.5, 0.9, -0.8):
+        door = box("door", "door", (3.95, 1.55 - moved, 0), (4.05, 2.45 - moved, 2.05))
+        found = compare_with_model([e if e.guid != "door" else door for e in model], built, built, Placement(Sim3()))
+        (row,) = [r for r in found.elements if r.element.guid == "door"]
+        assert row.state == "elsewhere" and abs(row.shift) == pytest.approx(abs(moved), abs=0.08) and abs(row.normal[1]) > 0.99
+        assert row.shift * row.normal[1] == pytest.approx(moved, abs=0.08)
+        assert [c.guid for c in found.changes if c.kind == "element elsewhere"] == ["door"]
 
 
 def test_a_layer_before_a_wall_does_not_move_it(model: list[ModelElement], built: TopometricMap) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from topomerge.datasets.pairs.edited_truth import build_map_truth
+from topomerge.datasets.pairs.edited_truth import build_edited_truth, build_map_truth
 from topomerge.datasets.pairs.pairs_file import read_pairs_file
 from topomerge.datasets.simulation.floor_truth import evaluate_map
 
@@ -17,12 +17,23 @@ from tests.edits.recipes import corridor_map
 from tests.fusion.atlas.atlas_scenes import office_map
 from topomerge.edits.apply import apply_edits
 from topomerge.edits.draft import find_room_place
-from topomerge.edits.journal import Edit, append_edits, build_edit, find_journal
+from topomerge.edits.journal import Edit, append_edits, build_edit, find_journal, read_journal
 from topomerge.errors import InputError
-from topomerge.evaluation.edits import correct_to_truth
+from topomerge.evaluation.edits import correct_to_truth, save_corrections
 from topomerge.evaluation.rooms import Settings, list_cases, measure
 from topomerge.evaluation.tasks import Data
 from topomerge.io.maps import load_map, save_map
+
+
+def test_what_a_simulated_user_corrected_is_kept_and_teaches(tmp_path: Path) -> None:
+    spoilt = apply_edits(corridor_map(), (build_edit("join_rooms", at=[[2, 2, 0], [2, 5, 0]]),)).map
+    edits, corrected = correct_to_truth(spoilt, build_map_truth(corridor_map())[0])
+    for _ in range(2):  # the journal begins anew
+        save_corrections(spoilt, edits, tmp_path / "maps" / "home.tmap")
+    assert len(read_journal(find_journal(tmp_path / "maps" / "home.tmap")).edits) == len(edits) > 0
+    made = build_edited_truth(tmp_path / "maps", tmp_path / "truth")
+    assert (made.maps, made.edits, made.rooms) == (1, len(edits), len(corrected.rooms))
+    assert load_map(tmp_path / "truth" / "home.tmap").navigable_room.tolist() == corrected.navigable_room.tolist()
 
 
 def test_a_map_is_right_by_its_own_truth():

@@ -259,6 +259,108 @@ def test_files_are_dropped_extracted_and_opened(context: Any, folder: Path, tmp_
     assert len(list(folder.glob("*.tmap"))) == 2
 
 
+STEPS = """() => { window.seen = new Set(); document.addEventListener("studio:job", (event) => {
+  for (const [task, [share, text]] of Object.entries(event.detail.job.steps)) window.seen.add(`${task}: ${text}`);
+}); }"""
+
+
+def save_two(folder: Path) -> None:
+    """Two maps of one office in a folder."""
+    from tests.fusion.atlas.atlas_scenes import office_map
+
+    for k, name in ((0, "west"), (2, "east")):
+        save_map(office_map(k), folder / f"{name}.tmap")
+
+
+def test_a_merge_shows_each_step_and_is_cancelled(tmp_path: Path) -> None:
+    save_two(tmp_path)
+    with run_studio(tmp_path) as (address, _), open_browser() as context:
+        page = context.new_page()
+        page.goto(address)
+        page.wait_for_selector("li[data-path]")
+        page.evaluate(STEPS)
+        choose = lambda: [page.check(f'li[data-path="{name}.tmap"] input') for name in ("west", "east")]  # noqa: E731
+        choose()
+        page.click(".actions >> text=Merge")
+        page.wait_for_selector(".jobs li[data-state=running] .step progress")
+        page.click(".jobs li[data-state=running] >> text=Cancel")
+        page.wait_for_selector(".jobs li[data-state=cancelled]")
+        assert not list(tmp_path.glob("*/merge.json"))
+        choose()
+        page.click(".actions >> text=Merge")
+        page.wait_for_selector(".jobs li[data-state=done]")
+        seen = page.evaluate("[...window.seen]")
+        for step in ("draw plans", "search poses", "refine the pose", "join the maps", "write the files"):
+            assert f"merge: {step}" in seen, step
+        page.click(".jobs li[data-state=done] >> text=Open")
+        assert "Merged" in page.inner_text(".verdict")
+
+
+def test_maps_are_matched_and_moved_by_hand_snapped_and_accepted(tmp_path: Path) -> None:
+    from tests.fusion.atlas.atlas_scenes import office_map, truth
+    from topomerge.fusion.fuse import match_common_rooms
+    from topomerge.matching.poses import pose_difference
+    from topomerge.types import Sim3
+
+    save_two(tmp_path)
+    rooms, _ = match_common_rooms(office_map(0), office_map(2), truth(0, 2))
+    with run_studio(tmp_path) as (address, _), open_browser() as context:
+        page = context.new_page()
+        page.goto(address)
+        page.wait_for_selector("li[data-path]")
+        for name in ("west", "east"):
+            page.check(f'li[data-path="{name}.tmap"] input')
+        page.click(".actions >> text=Match by hand")
+        page.wait_for_function("() => studio.canvases?.every((one) => one.frames > 0)")
+        canvases = page.locator(".half .plan-canvas")
+        assert canvases.count() == 2
+
+        def click(which: int, room: int) -> None:
+            at = page.evaluate(
+                "([k, i]) => { const one = studio.canvases[k], { x, y } = one.data.byRoom.get(i); return one.toScreen([x, y]); }",
+                [which, room],
+            )
+            box = canvases.nth(which).bounding_box()
+            page.mouse.click(box["x"] + at[0], box["y"] + at[1])
+
+        assert page.locator("[data-act=place]").is_disabled()
+        for i, j in rooms[:3].tolist():
+            click(0, i)
+            click(1, j)
+        page.click(".journal li:nth-child(3) button")  # one pair is taken back
+        assert page.locator(".journal li").count() == 2
+        page.click("[data-act=place]")
+        page.wait_for_function("() => studio.overlay && !document.getElementById('view').dataset.busy")
+        pose = lambda: Sim3.from_matrix(np.array(page.evaluate("studio.matrix")))  # noqa: E731
+        shift, turn, _ = pose_difference(pose(), truth(0, 2), np.zeros(3))
+        assert shift < 0.3 and abs(turn) < 0.02 and "Probability" in page.inner_text(".side")
+        share = page.evaluate("() => studio.overlay.canvas.sheets.map((s) => s.share)")
+        page.fill("input[type=range]", "0.9")
+        assert page.evaluate("() => studio.overlay.canvas.sheets.map((s) => s.share)") != share
+
+        box = page.locator(".plan-canvas").bounding_box()
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.mouse.move(x + 25, y + 10, steps=5)
+        page.mouse.up()
+        dragged = pose()
+        assert pose_difference(dragged, truth(0, 2), np.zeros(3))[0] > shift + 0.1
+        page.keyboard.press("ArrowLeft")
+        page.keyboard.press(".")
+        assert pose_difference(pose(), dragged, np.zeros(3))[1] != 0
+        page.keyboard.press(",")
+        page.click("[data-act=snap]")
+        page.wait_for_function("() => studio.words && !document.getElementById('view').dataset.busy")
+        assert pose_difference(pose(), truth(0, 2), np.zeros(3))[0] < 0.3
+        page.click("[data-act=accept]")
+        page.wait_for_selector(".jobs li[data-state=done]")
+        (merged,) = tmp_path.glob("*/merge.json")
+        assert "accepted by hand" in json.loads(merged.read_text())["reason"]
+        ops = [json.loads(line)["op"] for path in tmp_path.rglob("*edits.jsonl") for line in path.read_text().splitlines()]
+        assert sorted(ops) == ["accept_merge", "match_rooms", "match_rooms"]
+
+
 def test_a_thousand_rooms_are_panned(tmp_path: Path) -> None:
     save_map(building(50, 10), tmp_path / "large.tmap")
     with run_studio(tmp_path) as (address, _), open_browser() as context:
@@ -300,6 +402,24 @@ def test_a_tablet_pinches_and_taps(folder: Path) -> None:
         send("touchEnd", 0)
         assert one.page.evaluate("() => studio.canvas.view.scale") > 1.8 * scale
         assert len(list(folder.glob("*.jsonl"))) == 0, "a pinch is no edit"
+        one.press("0")
+        box, x = room["box"], room["x"] + 30
+        one.page.tap("[data-tool=split]")
+        for place in ((x, box[1] + 4), (x + 2, box[3] - 4)):
+            one.page.touchscreen.tap(*one.point(*place))
+        one.wait_version(1)
+        assert lines(folder)[-1]["op"] == "split_room" and len(one.storey["rooms"]) == 8
+        door = one.storey["doors"][0]
+        (x0, y0, x1, y1), moved = door["line"], (30, 0) if abs(door["line"][0] - door["line"][2]) > 1 else (0, 30)
+        start, end = ((x0 + x1) / 2, (y0 + y1) / 2), ((x0 + x1) / 2 + moved[0], (y0 + y1) / 2 + moved[1])
+        one.page.tap("[data-tool=move]")
+        one.page.touchscreen.tap(*one.point(*start))
+        one.page.touchscreen.tap(*one.point(*end))
+        one.wait_version(2)
+        assert lines(folder)[-1]["op"] == "move_door"
+        one.page.tap("[data-act=undo]")
+        one.wait_version(3)
+        assert lines(folder)[-1]["op"] == "undo"
 
 
 def test_ctrl_c_ends_the_server_and_its_job(folder: Path) -> None:

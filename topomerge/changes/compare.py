@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from topomerge.blas import limit_blas_threads
-from topomerge.changes.doors import DoorReader, find_door_changes
+from topomerge.changes.doors import DoorChange, DoorReader, find_door_changes, find_door_corrections
 from topomerge.changes.elements import find_furniture_changes, find_wall_changes
 from topomerge.changes.layers import CHANGE_CELL, PlacedMap, RelativePlacement, StoreyLayers, build_storey_layers
-from topomerge.changes.rooms import find_room_changes
+from topomerge.changes.rooms import RoomChange, find_room_changes, find_room_corrections
 from topomerge.errors import InputError
+from topomerge.fusion.inputs import check_different, is_same_scan
 from topomerge.fusion.pipeline import MergeConfig, place_pair
 from topomerge.types import Array, Placement, Sim3, TopometricMap
 
@@ -96,7 +97,7 @@ class Changes:
 
 
 def align_maps(old: TopometricMap, new: TopometricMap, **choices: Any) -> tuple[PlacedMap | None, str, tuple[str, ...]]:
-    """Align two maps as `merge` does.
+    """Align two maps as `merge` does; two of one scan, corrected differently, lie as they are.
 
     Args:
         old, new: any maps.
@@ -106,8 +107,12 @@ def align_maps(old: TopometricMap, new: TopometricMap, **choices: Any) -> tuple[
         Where the new map lies in the frame of the old one, None where that is not believed; why, in words; and warnings.
 
     Raises:
-        InputError: as `merge`.
+        InputError: as `merge`; both are one map.
     """
+    if is_same_scan(old, new):
+        if all(np.array_equal(getattr(old, name), getattr(new, name)) for name in ("navigable_room", "rooms", "edges")):
+            check_different(old, new)
+        return Placement(Sim3()), "aligned: both are of one scan; what was corrected is compared", ()
     result = place_pair((old, new), MergeConfig(**choices))
     placements = result.placements if result.merged else {}
     if 1 not in placements:
@@ -119,7 +124,8 @@ def align_maps(old: TopometricMap, new: TopometricMap, **choices: Any) -> tuple[
 def compare_maps(
     old: TopometricMap, new: TopometricMap, placement: PlacedMap | None = None, least: float = LEAST_PROBABILITY
 ) -> Changes:
-    """Find what has changed between two maps of one place. Nothing is said of what only one of them saw.
+    """Find what has changed between two maps of one place. Nothing is said of what only one of them saw. Of two maps of one scan
+    what was corrected is compared: rooms and doors.
 
     Args:
         old, new: any maps.
@@ -134,7 +140,8 @@ def compare_maps(
     if not layers:
         raise InputError(f"{new.source or 'the new map'}: shares no storey with {old.source or 'the old one'}; align the maps")
     reader = DoorReader(old, new, placement)
-    found = [change for storey in layers for change in _find_storey_changes(storey, reader)]
+    find = _find_corrections if is_same_scan(old, new) and _is_in_place(placement) else _find_storey_changes
+    found = [change for storey in layers for change in find(storey, reader)]
     selected = [c for c in found if c.probability >= least]
     selected.sort(key=lambda c: (c.storey, KINDS.index(c.kind), -c.probability, *c.place.tolist()))
     compared: dict[int, float] = {}
@@ -149,18 +156,34 @@ def _find_storey_changes(layers: StoreyLayers, reader: DoorReader) -> Iterator[C
     doors = find_door_changes(layers, reader, walls)
     for wall in walls:
         yield _build_change(layers, wall.kind, wall.outline, wall.length, wall.probability, wall.evidence)
-    for door in doors:
-        half = 0.5 * door.width * np.array([-np.sin(door.direction), np.cos(door.direction)])
-        line = np.array([door.centre - half, door.centre + half])
-        change = _build_change(layers, door.kind, line, door.width, door.probability, door.evidence)
-        yield replace(change, old=tuple(k for k in (door.old,) if k >= 0), new=tuple(k for k in (door.new,) if k >= 0))
-    for room in find_room_changes(layers, walls):
-        change = _build_change(layers, room.kind, room.outline, float(np.sqrt(room.area)), room.probability, room.evidence)
-        yield replace(change, old=room.old, new=room.new)
+    yield from (_build_door_change(layers, door) for door in doors)
+    yield from (_build_room_change(layers, room) for room in find_room_changes(layers, walls))
     for thing in find_furniture_changes(layers, walls, reader.list_places(layers)):
         change = _build_change(layers, thing.kind, thing.outline, thing.length, thing.probability, thing.evidence)
         start = None if thing.start is None else np.append(thing.start, layers.floor)
         yield replace(change, from_place=start)
+
+
+def _find_corrections(layers: StoreyLayers, reader: DoorReader) -> Iterator[Change]:
+    """What was corrected in one of two maps of one scan: the walls and the furniture are the same."""
+    yield from (_build_door_change(layers, door) for door in find_door_corrections(layers, reader))
+    yield from (_build_room_change(layers, room) for room in find_room_corrections(layers))
+
+
+def _is_in_place(placement: PlacedMap) -> bool:
+    return bool(np.allclose(placement.pose.matrix, np.eye(4), atol=1e-6))
+
+
+def _build_door_change(layers: StoreyLayers, door: DoorChange) -> Change:
+    half = 0.5 * door.width * np.array([-np.sin(door.direction), np.cos(door.direction)])
+    line = np.array([door.centre - half, door.centre + half])
+    change = _build_change(layers, door.kind, line, door.width, door.probability, door.evidence)
+    return replace(change, old=tuple(k for k in (door.old,) if k >= 0), new=tuple(k for k in (door.new,) if k >= 0))
+
+
+def _build_room_change(layers: StoreyLayers, room: RoomChange) -> Change:
+    change = _build_change(layers, room.kind, room.outline, float(np.sqrt(room.area)), room.probability, room.evidence)
+    return replace(change, old=room.old, new=room.new)
 
 
 def _build_change(

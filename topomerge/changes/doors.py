@@ -125,6 +125,21 @@ def find_door_changes(layers: StoreyLayers, reader: DoorReader, walls: Sequence[
     return found
 
 
+def find_door_corrections(layers: StoreyLayers, reader: DoorReader) -> list[DoorChange]:
+    """Find the doors of two maps of one scan that somebody added, deleted, opened or shut; all of them are certain."""
+    rows = [reader.select(k, layers) for k in (0, 1)]
+    a, b = (reader.edges[k][rows[k]] for k in (0, 1))
+    partner = _pair_doors(a["centre"], b["centre"])
+    told = [("door gone", a[i], int(rows[0][i]), -1) for i in range(len(a)) if i not in partner]
+    told += [("door new", b[j], -1, int(rows[1][j])) for j in range(len(b)) if j not in set(partner.values())]
+    turned = ((a[i], b[j], int(rows[0][i]), int(rows[1][j])) for i, j in partner.items() if a[i]["open"] != b[j]["open"])
+    told += [("door opened" if after["open"] else "door shut", before, i, j) for before, after, i, j in turned]
+    return [
+        DoorChange(kind, d["centre"][:2].copy(), float(d["width"]), float(d["direction"]), 1.0, {"corrected": 1.0}, i, j)
+        for kind, d, i, j in told
+    ]
+
+
 def _pair_doors(old: Array, new: Array) -> dict[int, int]:
     """Doors of the new map by those of the old one that stand where they do, the nearest first, one to one."""
     apart = np.linalg.norm(old[:, None, :2] - new[None, :, :2], axis=2)

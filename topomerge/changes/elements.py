@@ -280,14 +280,7 @@ def _draw_outlines(layers: StoreyLayers, outlines: Sequence[Array]) -> Array:
     """(nx, ny) bool: pixels in polygons (n, 2) m, or beside them."""
     taken = np.zeros(layers.slack.shape, bool)
     for outline in outlines:
-        at = layers.compute_pixels(np.asarray(shapely.Polygon(outline).buffer(0.2, join_style="mitre").exterior.coords))
-        low, high = at.min(axis=0).clip(0), (at.max(axis=0) + 1).clip(0)
-        index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True)), indexing="ij"), axis=-1)
-        index = index.reshape(-1, 2)
-        index = index[(index < taken.shape).all(axis=1)]
-        if len(index):
-            shapes = shapely.Polygon(at)
-            taken[tuple(index[shapely.contains_xy(shapes, *index.T.astype(float))].T)] = True
+        taken |= layers.rasterise(shapely.Polygon(outline).buffer(0.2, join_style="mitre"))
     return taken
 
 

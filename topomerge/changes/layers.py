@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
+import shapely
 from scipy import ndimage
 
 from topomerge.extraction.plans.storey_plan import BODY_HEIGHTS, StoreyPlan
@@ -150,6 +151,18 @@ class StoreyLayers:
         inside = np.asarray(((at >= 0) & (at < raster.shape)).all(axis=1))
         i, j = np.where(inside[:, None], at, 0).T
         out: Array = np.where(inside, raster[i, j], outside)
+        return out
+
+    def rasterise(self, shape: shapely.Polygon) -> Array:
+        """Draw (nx, ny) bool of a polygon in m in the old map's frame."""
+        out = np.zeros(self.slack.shape, bool)
+        corners = self.compute_pixels(np.asarray(shape.exterior.coords))
+        low, high = corners.min(axis=0).clip(0), (corners.max(axis=0) + 1).clip(0)
+        index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True)), indexing="ij"), axis=-1)
+        index = index.reshape(-1, 2)
+        index = index[(index < out.shape).all(axis=1)]
+        if len(index) and len(corners) > 3:
+            out[tuple(index[shapely.contains_xy(shapely.Polygon(corners), *index.T.astype(float))].T)] = True
         return out
 
 

@@ -1,8 +1,9 @@
 """A building model against a scan: which of its elements were seen, seen elsewhere and by how much, or are not there.
 
 Each wall, column and slab is laid into the scan as planes. What the scan shows near a plane is counted by its distance along the
-normal, both faces of a wall together: the shift at which most of the element is found is where it stands. A turn and a shift that
-all elements share are taken out first: that is how the scan lies on the model, and no deviation.
+normal, both faces of a wall together: the shift at which most of the element is found is where it stands. A point counts for the
+face that looks to the open ground before it: of a wall seen from one side, its other face explains nothing. A turn and a shift
+that all elements share are taken out first: that is how the scan lies on the model, and no deviation.
 """
 
 from __future__ import annotations
@@ -13,11 +14,12 @@ from typing import Any
 
 import numpy as np
 import shapely
+from scipy import ndimage
 from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
 from topomerge.changes.compare import Change, Changes, compare_maps
-from topomerge.changes.doors import DoorReader, read_state
+from topomerge.changes.doors import SAME_DOOR, DoorReader, read_state
 from topomerge.changes.layers import PlacedMap, StoreyLayers, build_storey_layers
 from topomerge.io.ifc import ModelElement
 from topomerge.types import EDGE_DTYPE, Array, TopometricMap
@@ -33,7 +35,12 @@ LEAST_SEEN, LEAST_CELLS = 0.2, 12  # share of the cells of an element, and how m
 GONE = 0.5  # share of an element's ground that was seen empty
 TOLERANCE = 0.01  # m: less is how things are built
 LEAST_SIGMA = 0.004  # m
-LEVEL_HEIGHT = 0.15  # m between the floor of a scan and the top of a slab
+OPEN_STEPS, OPEN_APART = np.arange(0.05, 0.51, 0.05), 0.025  # m before a point, where open ground is looked for; how much nearer
+GAP = 5  # pixels: narrower gaps, as between the faces of a wall, are no open ground
+FLOOR_REACH = 0.3  # m about the floor of a storey: what lies there looks upwards, all other level faces down
+DEVIATING = 0.2  # odds that an element stands elsewhere, before anything was measured
+MIXED = 1.0  # cells of the scan, by which the mean of a cell at the edge of a face is off
+DOOR_SIGMA, DOOR_REACH, DOOR_ACROSS = 0.1, 1.2, 0.35  # m: of the middle of a door; along and across its wall, where it may be
 STATES = ("seen", "elsewhere", "missing", "unseen")
 IGNORED = ("wall gone", "door gone", "furniture gone", "door opened", "door shut", "door bricked up", "door new")
 
@@ -97,10 +104,12 @@ def compare_with_model(
     found = compare_maps(model, scan, placement, least)
     layers, reader = build_storey_layers(model, scan, placement), DoorReader(model, scan, placement)
     points = _OwnedPoints(elements, reader.points[1])
-    faces = {k: _measure_planes(e, points.select(k)) for k, e in enumerate(elements) if e.kind in ("wall", "column", "slab")}
+    measured = [k for k, e in enumerate(elements) if e.kind in ("wall", "column", "slab")]
+    faces = {k: _measure_planes(elements[k], points.select(k), layers, scan.grid.edge) for k in measured}
     correct = estimate_common_shift([shift for shifts in faces.values() for shift in shifts])
+    doors = _ModelDoors([e for e in elements if e.kind == "door"], layers, reader)
     rows = [
-        _judge_door(e, layers, reader) if e.kind == "door" else _judge_element(e, faces[k], layers, correct)
+        doors.judge(e) if e.kind == "door" else _judge_element(e, faces[k], layers, correct)
         for k, e in enumerate(elements)
         if e.kind != "other"
     ]
@@ -153,6 +162,7 @@ class PlaneShift:
         shift, spread: m, and the standard deviation of what it was measured by; nan where nothing was seen.
         share, cells: of its faces that were found there, and of how many cells.
         area: m2 of the faces.
+        mixed: m, by which the cells of the scan at its edges may be off: much of what is seen of a narrow face.
     """
 
     normal: Array
@@ -162,9 +172,10 @@ class PlaneShift:
     share: float
     cells: int
     area: float
+    mixed: float = 0.0
 
 
-def _measure_planes(element: ModelElement, points: Array) -> list[PlaneShift]:
+def _measure_planes(element: ModelElement, points: Array, layers: Sequence[StoreyLayers], edge: float) -> list[PlaneShift]:
     """The shift of an element along the normals of its larger faces: one of a wall or a slab, two of a column."""
     corners = element.vertices[element.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -182,16 +193,45 @@ def _measure_planes(element: ModelElement, points: Array) -> list[PlaneShift]:
         best = normals[left][int((alike * area[left]).sum(axis=1).argmax())]
         normal = best * (1 if best[np.abs(best).argmax()] > 0 else -1)
         own = left & (np.abs(normals @ normal) > SAME_NORMAL)
-        out.append(_measure_shift(corners[own], normals[own] @ normal, area[own], normal, near))
+        plane = _measure_shift(corners[own], normals[own] @ normal, area[own], normal, near, _list_faced(near, normal, layers))
+        width = float(np.ptp(corners[own].reshape(-1, 3) @ _build_frame(normal)[:2].T, axis=0).min())
+        out.append(replace(plane, mixed=MIXED * edge * min(2 * edge / max(width, edge), 1.0) ** 2))
         left = left & ~own
     return out
 
 
-def _measure_shift(corners: Array, sides: Array, area: Array, normal: Array, points: Array) -> PlaneShift:
-    """The shift along a normal at which most cells of faces (t, 3, 3) are found; `sides` says which way each face looks."""
+def _build_frame(normal: Array) -> Array:
+    """(3, 3) rows: two axes in a plane, and its normal."""
     axis = np.array([0.0, 0.0, 1.0]) if abs(normal[2]) < 0.5 else np.array([1.0, 0.0, 0.0])
-    first = np.cross(axis, normal)
-    frame = np.stack([first / np.linalg.norm(first), np.cross(normal, first / np.linalg.norm(first)), normal])
+    first = np.cross(axis, normal) / np.linalg.norm(np.cross(axis, normal))
+    return np.stack([first, np.cross(normal, first), normal])
+
+
+def _list_faced(points: Array, normal: Array, layers: Sequence[StoreyLayers]) -> tuple[Array, Array]:
+    """Which points (n, 3) may be of a face that looks against a normal, and of one that looks along it: two (n,) bool."""
+    floors = np.array([storey.floor for storey in layers])
+    if abs(normal[2]) > 0.5:
+        upwards = (np.abs(points[:, 2:] - floors) < FLOOR_REACH).any(axis=1)
+        return (~upwards, upwards) if normal[2] > 0 else (upwards, ~upwards)
+    far = np.full((2, len(points)), np.inf)
+    of = np.searchsorted(floors - FLOOR_REACH, points[:, 2], side="right") - 1
+    for k, storey in enumerate(layers):
+        ground = storey.new.free | (storey.new.standing & ~storey.new.wall)  # before furniture a wall is looked at, too
+        ground = ndimage.binary_opening(ground, np.ones((GAP, GAP), bool))
+        rows = np.flatnonzero(of == k)
+        for which, sign in enumerate((-1.0, 1.0)):
+            at = points[rows, None, :2] + sign * OPEN_STEPS[:, None] * normal[:2]
+            open_ground = storey.sample(ground, at.reshape(-1, 2)).reshape(-1, len(OPEN_STEPS)).astype(bool)
+            far[which, rows] = np.where(open_ground.any(axis=1), OPEN_STEPS[open_ground.argmax(axis=1)], np.inf)
+    return ~(far[0] > far[1] + OPEN_APART), ~(far[1] > far[0] + OPEN_APART)
+
+
+def _measure_shift(
+    corners: Array, sides: Array, area: Array, normal: Array, points: Array, faced: tuple[Array, Array]
+) -> PlaneShift:
+    """The shift along a normal at which most cells of faces (t, 3, 3) are found; `sides` says which way each face looks, and
+    `faced` which points are of faces that look either way."""
+    frame = _build_frame(normal)
     samples = _sample_triangles(corners, area) @ frame.T
     owner = np.repeat(np.sign(sides), _count_samples(area))
     local = points @ frame.T
@@ -208,7 +248,7 @@ def _measure_shift(corners: Array, sides: Array, area: Array, normal: Array, poi
         depth = np.bincount(inverse, samples[rows, 2]) / np.bincount(inverse)
         total += len(keys)
         place = np.searchsorted(keys, at).clip(0, len(keys) - 1)
-        hit = keys[place] == at
+        hit = (keys[place] == at) & faced[int(side > 0)]
         off = local[hit, 2] - depth[place[hit]]
         inside = np.abs(off) <= FARTHEST_SHIFT
         offsets.append((off[inside], place[hit][inside] + 10**7 * int(side > 0)))
@@ -299,6 +339,13 @@ def _correct_shift(plane: PlaneShift, correct: Correction) -> float:
     return plane.shift - float(row @ correct["move"])
 
 
+def _decide_elsewhere(shift: float, sigma: float) -> tuple[str, float]:
+    """Seen or elsewhere, and how probable that is: few elements stand elsewhere, so that a shift has to be clear."""
+    beyond = float(ndtr((abs(shift) - TOLERANCE) / sigma))
+    elsewhere = beyond * DEVIATING / (beyond * DEVIATING + 1 - beyond)
+    return ("elsewhere", elsewhere) if elsewhere > 0.5 else ("seen", 1 - elsewhere)
+
+
 def _judge_element(
     element: ModelElement, planes: Sequence[PlaneShift], layers: Sequence[StoreyLayers], correct: Correction
 ) -> ElementRow:
@@ -308,9 +355,9 @@ def _judge_element(
     if seen:
         shifts = [_correct_shift(p, correct) for p in seen]
         k = int(np.abs(shifts).argmax())
-        sigma = float(np.hypot(correct["scatter"], seen[k].spread / np.sqrt(max(seen[k].share * seen[k].cells / 10, 1.0))))
-        beyond = float(ndtr((abs(shifts[k]) - TOLERANCE) / sigma))
-        state, probability = ("elsewhere", beyond) if beyond > 0.5 else ("seen", 1 - beyond)
+        error = seen[k].spread / np.sqrt(max(seen[k].share * seen[k].cells / 10, 1.0))
+        sigma = float(np.linalg.norm([correct["scatter"], error, seen[k].mixed]))
+        state, probability = _decide_elsewhere(shifts[k], sigma)
         return ElementRow(element, state, shifts[k], sigma, seen[k].normal, seen[k].share, probability)
     share = max((p.share for p in planes), default=0.0)
     empty = _measure_empty_share(element, layers) if element.kind != "slab" else 0.0
@@ -338,30 +385,69 @@ def _measure_empty_share(element: ModelElement, layers: Sequence[StoreyLayers]) 
     return best
 
 
-def _judge_door(element: ModelElement, layers: Sequence[StoreyLayers], reader: DoorReader) -> ElementRow:
-    """What the scan says of a door: a way through or a leaf was seen, or else it is not there."""
+class _ModelDoors:
+    """The doors of a model, and those of the scan, each of which is one of them at most.
+
+    Args:
+        elements: the doors.
+        layers, reader: of the model's map and the scan's.
+    """
+
+    def __init__(self, elements: Sequence[ModelElement], layers: Sequence[StoreyLayers], reader: DoorReader) -> None:
+        self.layers, self.reader = layers, reader
+        self.doors = {e.guid: _build_door(e) for e in elements}
+        found = [k for storey in layers for k in reader.select(1, storey).tolist()]
+        self.found = reader.edges[1][sorted(set(found))]
+        self.partner = self._pair()
+
+    def _pair(self) -> dict[str, tuple[int, float]]:
+        """Row in `found`, and shift along the wall, of the door of the scan that each is, the nearest first."""
+        options = []
+        for guid, door in self.doors.items():
+            apart = self.found["centre"] - door["centre"]
+            across = np.array([np.cos(door["direction"]), np.sin(door["direction"])])
+            along, off = apart[:, :2] @ [-across[1], across[0]], np.abs(apart[:, :2] @ across)
+            near = (np.abs(along) < DOOR_REACH) & (off < DOOR_ACROSS) & (np.abs(apart[:, 2]) < FLOOR_REACH * 2)
+            options += [(abs(float(along[k])), guid, k, float(along[k])) for k in np.flatnonzero(near).tolist()]
+        partner: dict[str, tuple[int, float]] = {}
+        taken: set[int] = set()
+        for _, guid, k, along in sorted(options):
+            if guid not in partner and k not in taken:
+                partner[guid] = k, along
+                taken.add(k)
+        return partner
+
+    def judge(self, element: ModelElement) -> ElementRow:
+        """What the scan says of a door: a way through or a leaf is there, farther along its wall, or not at all."""
+        door = self.doors[element.guid]
+        normal = np.array([np.cos(door["direction"]), np.sin(door["direction"]), 0.0])
+        k, shift = self.partner.get(element.guid, (-1, np.nan))
+        near = [s for s in self.layers if abs(s.floor - float(door["centre"][2])) <= 2 * FLOOR_REACH]
+        own = self.found[k] if k >= 0 and abs(shift) < SAME_DOOR else None
+        states = [read_state(storey, storey.new, door, own, self.reader.points[1]) for storey in near]
+        told = next((state for state in states if state["seen"] >= 0.5), None)
+        if k >= 0 and (told is not None or abs(shift) > SAME_DOOR):
+            state, probability = _decide_elsewhere(shift, DOOR_SIGMA)
+            if state == "elsewhere" or told is None:
+                along = np.array([-normal[1], normal[0], 0.0])
+                return ElementRow(element, state, shift, DOOR_SIGMA, along, 1.0, probability * float(self.found["confidence"][k]))
+        if told is None:
+            return ElementRow(element, "unseen", np.nan, np.nan, normal, 0.0, 1.0)
+        there = told["open"] + told["leaf"]
+        state = "seen" if there >= 0.5 else "missing"
+        return ElementRow(element, state, np.nan, np.nan, normal, told["seen"], told["seen"] * max(there, 1 - there))
+
+
+def _build_door(element: ModelElement) -> Array:
+    """A door of a model as a row of EDGE_DTYPE."""
     corners = np.asarray(_outline_element(element).exterior.coords)[:4] if element.faces.size else np.zeros((4, 2))
     sides = np.diff(corners[:3], axis=0)
     lengths = np.linalg.norm(sides, axis=1)
     along = sides[lengths.argmax()] / max(float(lengths.max()), 1e-9)
-    door = np.zeros(1, EDGE_DTYPE)[0]
-    low = float(element.vertices[:, 2].min())
-    door["centre"], door["width"] = (*corners.mean(axis=0), low), lengths.max()
+    door: Array = np.zeros(1, EDGE_DTYPE)[0]
+    door["centre"], door["width"] = (*corners.mean(axis=0), float(element.vertices[:, 2].min())), lengths.max()
     door["direction"], door["kind"] = np.arctan2(-along[0], along[1]) % np.pi, "door"
-    normal = np.array([np.cos(door["direction"]), np.sin(door["direction"]), 0.0])
-    for storey in layers:
-        if abs(storey.floor - low) > 0.6:
-            continue
-        rows = reader.edges[1][reader.select(1, storey)]
-        near = np.linalg.norm(rows["centre"][:, :2] - door["centre"][:2], axis=1) if len(rows) else np.zeros(0)
-        own = rows[near.argmin()] if len(near) and near.min() < 0.6 else None
-        told = read_state(storey, storey.new, door, own, reader.points[1])
-        there = told["open"] + told["leaf"]
-        if told["seen"] < 0.5:
-            continue
-        state = "seen" if there >= 0.5 else "missing"
-        return ElementRow(element, state, np.nan, np.nan, normal, told["seen"], told["seen"] * max(there, 1 - there))
-    return ElementRow(element, "unseen", np.nan, np.nan, normal, 0.0, 1.0)
+    return door
 
 
 def _build_change(row: ElementRow, layers: Sequence[StoreyLayers]) -> Change:

@@ -1,4 +1,5 @@
-"""Rooms that were split, joined, or grew: only where a wall that is new or gone says so, as maps cut rooms differently."""
+"""Rooms that are new or gone, were split, joined, or grew: only where a wall that is new or gone says so, as maps cut rooms
+differently."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
+from scipy import ndimage
 
 from topomerge.changes.elements import WallChange
 from topomerge.changes.layers import CHANGE_CELL, StoreyLayers
@@ -16,6 +18,8 @@ PART_AREA, PART_SHARE = 1.5, 0.12  # m2, and of a room's area: what is less is n
 WITHIN = 0.6  # of a wall's length that lies within a room
 GROWN_AREA, GROWN_SHARE = 1.0, 0.1  # m2, and of a room's area
 WALL_BESIDE = 0.5  # m from the ground that a room won
+SEEN_SHARE, ITS_OWN = 0.6, 0.5  # shares of a room that the other map saw, and of another room in it that it then was before
+ENCLOSED, BORDER = 0.35, 0.4  # share of a room's border that walls are which are new or gone; m around it, where they stand
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +48,31 @@ def find_room_changes(layers: StoreyLayers, walls: Sequence[WallChange]) -> list
     found = [RoomChange("room split", o, area, p, e, (whole,), parts) for whole, parts, o, area, p, e in split]
     found += [RoomChange("room joined", o, area, p, e, parts, (whole,)) for whole, parts, o, area, p, e in joined]
     told = {r for c in found for r in c.old}, {r for c in found for r in c.new}
+    own = _find_enclosed(layers, new, old, [w for w in walls if w.kind == "wall new"], told[1])
+    found += [RoomChange("room new", outline, area, p, e, (), (room,)) for room, outline, area, p, e in own]
+    own = _find_enclosed(layers, old, new, [w for w in walls if w.kind == "wall gone"], told[0])
+    found += [RoomChange("room gone", outline, area, p, e, (room,), ()) for room, outline, area, p, e in own]
+    told = {r for c in found for r in c.old}, {r for c in found for r in c.new}
     return found + _find_grown(layers, walls, told)
+
+
+def find_room_corrections(layers: StoreyLayers) -> list[RoomChange]:
+    """Find the rooms of two maps of one scan that somebody cut or joined; all of them are certain."""
+    found = []
+    for kind, whole, parts in (
+        ("room split", layers.old.room, layers.new.room),
+        ("room joined", layers.new.room, layers.old.room),
+    ):
+        both = (whole >= 0) & (parts >= 0)
+        shared = np.zeros((int(whole.max()) + 1, int(parts.max()) + 1))
+        np.add.at(shared, (whole[both], parts[both]), CHANGE_CELL**2)
+        own = shared > WITHIN * np.bincount(parts[parts >= 0], minlength=shared.shape[1]) * CHANGE_CELL**2
+        for room in np.flatnonzero(own.sum(axis=1) > 1).tolist():
+            pieces = tuple(np.flatnonzero(own[room]).tolist())
+            mask, area = whole == room, float(np.sort(shared[room, list(pieces)])[-2])
+            sides = ((room,), pieces) if kind == "room split" else (pieces, (room,))
+            found.append(RoomChange(kind, _trace_box(layers, mask), area, 1.0, {"corrected": 1.0}, *sides))
+    return found
 
 
 Split = tuple[int, tuple[int, ...], Array, float, float, dict[str, float]]
@@ -76,6 +104,34 @@ def _find_splits(layers: StoreyLayers, whole: Array, parts: Array, walls: Sequen
         if room not in found or found[room][4] < wall.probability:
             found[room] = room, tuple(number[large].astype(int).tolist()), outline, small, wall.probability, evidence
     return list(found.values())
+
+
+def _find_enclosed(
+    layers: StoreyLayers, own: Array, other: Array, walls: Sequence[WallChange], told: set[int]
+) -> list[tuple[int, Array, float, float, dict[str, float]]]:
+    """Rooms of one map whose ground the other one saw and in which none of its rooms lies, and whose border walls make that only
+    the first one has: room, outline, m2, probability and evidence."""
+    if not walls:
+        return []
+    found, sizes = [], np.bincount(other[other >= 0], minlength=1)
+    close = [(wall.probability, layers.rasterise(shapely.Polygon(wall.outline).buffer(BORDER))) for wall in walls]
+    seen = (layers.new if own is layers.old.room else layers.old).free
+    for room in np.setdiff1d(np.unique(own[own >= 0]), sorted(told)).tolist():
+        mask = own == room
+        area, share = float(mask.sum()) * CHANGE_CELL**2, float((mask & seen).sum() / mask.sum())
+        inside = other[mask & (other >= 0)]
+        shares = np.bincount(inside, minlength=len(sizes)) / np.maximum(sizes, 1)
+        if area < PART_AREA or share < SEEN_SHARE or shares.max() >= ITS_OWN:
+            continue
+        border = mask & ~ndimage.binary_erosion(mask)
+        made = np.max([np.where(border & near, probability, 0.0) for probability, near in close], axis=0)
+        enclosed = float((made > 0).sum() / border.sum())
+        if enclosed < ENCLOSED:
+            continue
+        probability = float(made[made > 0].mean())
+        evidence = {"wall": probability, "m2": area, "seen": share, "enclosed": enclosed}
+        found.append((room, _trace_box(layers, mask), area, probability * share, evidence))
+    return found
 
 
 def _find_sides(layers: StoreyLayers, parts: Array, ends: Array) -> set[int]:

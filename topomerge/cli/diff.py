@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from topomerge.cli.console import (
     Command,
+    ProgressBars,
     build_option,
     check_inputs,
     check_outputs,
@@ -34,6 +35,7 @@ from topomerge.cli.options import (
     collect_given,
     parse_share,
 )
+from topomerge.progress import report_steps, tell_step
 
 if TYPE_CHECKING:
     from topomerge.changes.compare import Changes
@@ -70,7 +72,9 @@ def _compare(args: argparse.Namespace, folder: Path | None, belief: dict[str, An
             write_out(format_json({"status": "not aligned", "reason": reason}))
         print_line(f"topomerge: {reason}", sys.stderr)
         return 2
-    changes = _find_changes(old, new, placement, args)
+    with ProgressBars(enabled=not args.quiet) as bars, report_steps(bars.start_task("compare")):
+        tell_step(0.0, "walls, doors, rooms and furniture")
+        changes = _find_changes(old, new, placement, args)
     files = _list_files(changes, args, folder)
     write_all(files)
     if args.json:
@@ -96,7 +100,8 @@ def _align(
         return Placement(Sim3()), "compared as given: both are of one frame (--aligned)"
     from topomerge.changes.compare import align_maps
 
-    placement, reason, warnings = align_maps(old, new, **belief)
+    with ProgressBars(enabled=not args.quiet) as bars, report_steps(bars.start_task("align")):
+        placement, reason, warnings = align_maps(old, new, **belief)
     warn(warnings)
     return placement, reason
 

@@ -44,6 +44,7 @@ from topomerge.cli.options import (
     name_option_in_errors,
 )
 from topomerge.errors import InputError
+from topomerge.progress import report_steps, tell_step
 
 if TYPE_CHECKING:
     import numpy as np
@@ -161,7 +162,9 @@ def _merge(args: argparse.Namespace, inputs: InputMaps, folder: Path, files: Map
     maps = [replace(one.map, source=path) for one, path in zip(loaded, args.inputs, strict=True)]
     choices = collect_given(args, "force", "rigid")
     poses = _read_decisions(maps, folder, args) or args.poses
-    result = topomerge.merge(maps, scale=args.scale_of_b, embedder=args.descriptor, poses=poses, **choices, **belief)
+    with ProgressBars(enabled=not args.quiet) as bars, report_steps(bars.start_task("merge")):
+        result = topomerge.merge(maps, scale=args.scale_of_b, embedder=args.descriptor, poses=poses, **choices, **belief)
+        tell_step(1.0, "write the files")
     seconds = {"read": sum(one.read_seconds for one in loaded), "extract": sum(one.extract_seconds for one in loaded)}
     result = replace(result, seconds={**result.seconds, **seconds})
     warn(result.warnings)

@@ -42,6 +42,7 @@ TRUTH_KINDS = {"door cut": "door new"}
 GROUPS = {
     "walls new": ("wall new",), "walls gone": ("wall gone",), "doors opened": ("door opened",), "doors shut": ("door shut",),
     "doors new or gone": ("door new", "door gone"), "doors bricked up": ("door bricked up",),
+    "rooms split or joined": ("room split", "room joined"),
     "furniture new": ("furniture new",), "furniture gone": ("furniture gone",),
 }  # fmt: skip
 MODELS = {"dev": (), "": ("duplex", "Office_A_20110811")}

@@ -13,7 +13,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -31,13 +31,14 @@ from topomerge.datasets.simulation.floor_truth import (
 )
 from topomerge.edits.apply import apply_edits
 from topomerge.edits.draft import find_room_place
-from topomerge.edits.journal import Edit
+from topomerge.edits.journal import Edit, append_edits, find_journal
 from topomerge.evaluation.cases import select_cases
 from topomerge.evaluation.documents import write_mean, write_table
 from topomerge.evaluation.rooms import VOXEL
 from topomerge.evaluation.scans import Case, load_scan
 from topomerge.evaluation.tasks import Data, Row, TaskSettings, find_optional_data, measure_missing
 from topomerge.extraction.extract import extract
+from topomerge.io.maps import save_map
 from topomerge.metrics import match_places
 from topomerge.types import Array, LogFn, TopometricMap
 
@@ -56,9 +57,15 @@ HEADS = ("map", "rooms", "IoU before", "after", "doors P/R before", "after", "ed
 
 @dataclass
 class Settings(TaskSettings):
-    """Settings of the task."""
+    """Settings of the task.
+
+    Args:
+        keep: folder for each extracted map with its journal, as `topomerge dataset from-edits` takes them; empty: none. Cases
+            that were measured before are corrected again.
+    """
 
     data: Data = field(default_factory=lambda: Data(limit=10))
+    keep: str = ""
 
 
 def list_cases(settings: Settings) -> list[Case]:
@@ -75,19 +82,23 @@ def list_inputs(settings: Settings) -> list[str]:
 def measure(settings: Settings, log_line: LogFn) -> list[Row]:
     """Correct every case."""
     scans, data = Path(settings.cache) / "scans", find_optional_data()
-    items = {f"{case.name} {case.key}": (case, scans, data) for case in list_cases(settings)}
+    keep = Path(settings.keep) if settings.keep else None
+    items = {f"{case.name} {case.key}": (case, scans, data, keep) for case in list_cases(settings)}
+    settings = replace(settings, remake=settings.remake or keep is not None)
     path = Path(settings.cache) / "evaluation" / "edits.jsonl"
     return measure_missing(path, items, measure_case, log_line, settings, compute_code_digest(*MAKERS, __name__))
 
 
-def measure_case(case: Case, scans: Path, data: Path | None) -> Row:
-    """Extract a case and correct its map."""
+def measure_case(case: Case, scans: Path, data: Path | None, keep: Path | None = None) -> Row:
+    """Extract a case and correct its map; keep map and journal in a folder, where one is given."""
     with limit_threads():
         scan = load_scan(case, scans, data)
         assert scan.truth is not None
         map = extract(scan.cloud, voxel_size=VOXEL)
         began = time.process_time()
         edits, corrected = correct_to_truth(map, scan.truth)
+        if keep is not None:
+            save_corrections(map, edits, keep / f"{Path(case.building).stem}.tmap")
         row: Row = {"case": case.name, "place": case.place, "kind": case.building, "seconds": time.process_time() - began}
         for name, one in (("before", map), ("after", corrected)):
             scores = evaluate_map(one, scan.truth)
@@ -97,6 +108,15 @@ def measure_case(case: Case, scans: Path, data: Path | None) -> Row:
         counts = Counter(edit.op for edit in edits)
         row |= {"edits": len(edits), "edits_a_room": len(edits) / max(scores.true_rooms, 1), "ops": dict(counts)}
     return row
+
+
+def save_corrections(map: TopometricMap, edits: Sequence[Edit], path: Path) -> None:
+    """Write an extracted map, and what was corrected as its journal, which begins anew."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    find_journal(path).unlink(missing_ok=True)
+    save_map(map, path)
+    if edits:
+        append_edits(find_journal(path), edits)
 
 
 def correct_to_truth(map: TopometricMap, truth: FloorTruth) -> tuple[list[Edit], TopometricMap]:

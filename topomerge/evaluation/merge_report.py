@@ -158,8 +158,8 @@ def tabulate_groups(rows: Sequence[Row], key: Callable[[Row], str], groups: Sequ
 
 def tabulate_merges(rows: Sequence[Row]) -> dict[str, str]:
     """Tabulate what there are rows of, each under the name of its block."""
-    boxes = [r for r in rows if r["set"] == "boxes"]
-    rows = [r for r in rows if r.get("kind") and r["set"] != "boxes" and not is_broken(r)]
+    boxes, own = ([r for r in rows if r["set"] == name and r["kind"]] for name in ("boxes", "folder"))
+    rows = [r for r in rows if r.get("kind") and r["set"] not in ("boxes", "folder") and not is_broken(r)]
     simulated = [r for r in rows if r["set"] in ("test", "train")]
     drawn = [r for r in rows if r["set"].endswith("_drawings")]
     measured = [r for r in rows if r["set"] in ("real", "development", "storeys")]
@@ -180,7 +180,27 @@ def tabulate_merges(rows: Sequence[Row]) -> dict[str, str]:
         blocks["real-merges"] = tabulate_real(measured)
     if boxes:
         blocks["boxes"] = tabulate_boxes(boxes)
+    if own:
+        blocks["own-merges"] = tabulate_own(own)
     return blocks
+
+
+def tabulate_own(rows: Sequence[Row]) -> str:
+    """Tabulate one's own pairs: how many are placed right, believed and wrongly merged, and each pair."""
+    shared, apart = ([r for r in rows if (r["kind"] == "overlap") is which] for which in (True, False))
+    right = [r for r in shared if r["right"]]
+    wrong = [sum(r["believed"] and not r["right"] for r in of) for of in (shared, apart)]
+    said = (
+        f"{len(shared)} pairs of one place: {len(right)} placed right, {sum(r['believed'] for r in right)} of these believed, "
+        f"{wrong[0]} merged wrongly. {len(apart)} pairs of two places: {wrong[1]} merged wrongly."
+    )
+    lines = []
+    for r in sorted(rows, key=lambda r: (r["kind"] != "overlap", r["pair"])):
+        off = ["–", "–"] if r["err"] is None else [f"{r['err'][0]:.2f}", f"{r['err'][2]:.1f}"]
+        verdict = "two places" if r["kind"] != "overlap" else "right" if r["right"] else "wrong"
+        said_so = f"{r['probability']:.2f}{' believed' if r['believed'] else ''}"
+        lines.append([r["pair"], f"{r['common']:.0f}", verdict, said_so, *off, f"{r['seconds']:.1f}"])
+    return f"{said}\n\n{write_table(('pair', 'm² in common', 'pose', 'probability', 'off m', 'off °', 's'), lines)}"
 
 
 def tabulate_boxes(rows: Sequence[Row]) -> str:

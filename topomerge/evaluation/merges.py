@@ -4,7 +4,8 @@
 Sets: ``test`` and ``test_drawings`` (simulated pairs, and maps with floor plans), ``strangers`` and ``drawn_strangers`` (maps of
 two places), ``real`` and ``real_strangers`` (TOPOMERGE_DATA), ``lookalikes``, ``boxes`` (worlds of boxes, made by another
 simulator); to develop on ``train``, ``train_drawings``, ``development`` (a real floor) and ``storeys``. ``data.limit`` is so many
-pairs of each, of strangers three times as many.
+pairs of each, of strangers three times as many. ``data=folder path=DIR``: one's own pairs, all that its `pairs.yaml` lists, and
+as many of two places.
 
 Right: within 0.5 m and 5 degrees (fine: 0.1 m, 1 degree) in the middle of what both maps saw; of slices and drawings horizontally
 and on the right storey. Rows are kept when the code changes (a run takes hours), and that is told. Seconds are of the processor.
@@ -19,14 +20,18 @@ from functools import lru_cache
 from itertools import combinations
 from math import ceil
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 
 from topomerge.datasets.core.builder import limit_threads
 from topomerge.datasets.core.building import find_physical_building
-from topomerge.datasets.pairs.evaluation_pair import convert_to_sim3
+from topomerge.datasets.pairs.evaluation_pair import compute_anchor, convert_to_sim3
 from topomerge.datasets.pairs.grid_pairs import GridPair, load_grids
+from topomerge.datasets.pairs.own_pairs import OWN_DATA, OWN_FOLDER, check_own_path, extract_captures
+from topomerge.datasets.pairs.own_truth import find_overlap
+from topomerge.datasets.pairs.pairs_file import PairTruth, are_on_two_storeys, read_pairs_file
 from topomerge.datasets.simulation.box_worlds import BOX_KINDS, is_right, load_pair
 from topomerge.errors import InputError
 from topomerge.evaluation.merge_report import compute_headline, tabulate_merges
@@ -43,6 +48,7 @@ from topomerge.evaluation.tasks import (
     make_pair_files,
     measure_missing,
 )
+from topomerge.io.maps import load_map
 from topomerge.metrics import is_on_storey
 from topomerge.registration.pipeline import Registration, register
 from topomerge.registration.prepared import Prepared, prepare
@@ -56,6 +62,7 @@ LOOKALIKE = ("lookalike", "furniture", "tellable", "amount", "repeats", "buildin
 STOREYS = ("campus", "rmf", "mall", "utexas")  # sources whose plans of one building are storeys of it
 STRIDE = 7  # pairs are laid out in blocks of so many pairs, so that few maps are in memory at once
 STRANGERS_EACH = 3  # pairs of strangers for each pair that a limit allows: they need no more maps
+OWN_SCALED = 0.03  # of a true scale, from which on that of the maps is free
 STRANGERS, BOX_SEEDS = 757, 8  # pairs of strangers, and of each kind of worlds of boxes, if no limit is given
 Items = dict[str, tuple[Any, ...]]
 __all__ = ["MAKERS", "Settings", "compute_headline", "list_inputs", "measure", "tabulate"]
@@ -63,7 +70,13 @@ __all__ = ["MAKERS", "Settings", "compute_headline", "list_inputs", "measure", "
 
 @dataclass
 class Settings(TaskSettings):
-    """Settings of the task."""
+    """Settings of the task.
+
+    Args:
+        path: of ``data=folder``: a folder of captures with a `pairs.yaml`.
+    """
+
+    path: str = ""
 
 
 def list_sets(settings: TaskSettings) -> list[str]:
@@ -73,6 +86,7 @@ def list_sets(settings: TaskSettings) -> list[str]:
         InputError: there is no such set.
     """
     names = (settings.data.set or "development").split(",")
+    check_own_path(OWN_DATA if OWN_DATA in names else names[0], getattr(settings, "path", ""))
     if unknown := set(names) - set(SETS):
         raise InputError(f"data.set={','.join(sorted(unknown))}: {', '.join(SETS)} are possible")
     return names
@@ -80,7 +94,7 @@ def list_sets(settings: TaskSettings) -> list[str]:
 
 def list_inputs(settings: TaskSettings) -> list[str]:
     """Names of the sets: a split and a recipe say all about a pair."""
-    return [f"{name} {settings.data.limit}" for name in list_sets(settings)]
+    return [f"{name} {settings.data.limit} {getattr(settings, 'path', '')}".strip() for name in list_sets(settings)]
 
 
 def measure(settings: TaskSettings, log_line: LogFn) -> list[Row]:
@@ -161,6 +175,61 @@ def compare_pose(pose: Sim3 | None, pair: GridPair) -> Row:
     judged = {"right": is_hypothesis_right(off, sensors), "fine": is_hypothesis_right(off, sensors, FINE)}
     scale = None if pose is None or pair.truth is None else pose.scale / pair.truth.scale
     return {"err": off, "scale": scale, **judged, "wrong_storey": off is not None and not is_on_storey(off[1])}
+
+
+# One's own pairs
+
+
+def find_own(name: str, settings: TaskSettings, log_line: LogFn) -> Items:
+    """Find the listed pairs of a folder, and as many pairs of two buildings or storeys; captures are extracted where they are
+    missing.
+
+    Raises:
+        InputError: the first thing that is wrong with the folder.
+    """
+    listing = read_pairs_file(getattr(settings, "path", ""))
+    captures, faults = extract_captures(listing, settings.cache, settings.jobs, log_line)
+    if faults:
+        raise InputError(f"{listing.path}: {next(iter(faults.values()))}")
+    listed = {frozenset((pair.a, pair.b)) for pair in listing.pairs}
+    apart = [
+        PairTruth(a.name, b.name, different=True, listed=False)
+        for a, b in combinations(listing.captures.values(), 2)
+        if (a.building != b.building or are_on_two_storeys(a, b)) and frozenset((a.name, b.name)) not in listed
+    ]
+    number = min(sum(not pair.different for pair in listing.pairs), len(apart))
+    drawn = [apart[k] for k in sorted(np.random.default_rng(0).permutation(len(apart))[:number].tolist())]
+    folder, items = Path(settings.cache).resolve() / OWN_FOLDER / "captures", Items()
+    for pair in [*listing.pairs, *drawn]:
+        files = folder / f"{captures[pair.a].name}.tmap", folder / f"{captures[pair.b].name}.tmap"
+        about = {"pair": f"{pair.a} {pair.b}", "sensors": [listing.captures[k].sensor for k in (pair.a, pair.b)]}
+        buildings = [listing.captures[k].building for k in (pair.a, pair.b)]
+        about |= {"building": buildings[0], "physical": buildings[0], "physical_other": buildings[1]}
+        items[f"{files[0].stem} {files[1].stem} {pair.matrix} {pair.rooms}"] = (files, pair, about, str(listing.path))
+    return dict(list(items.items())[: settings.data.limit or None])
+
+
+def measure_own(files: tuple[Path, Path], truth: PairTruth, about: Row, listing: str) -> Row:
+    """Register two captures and compare with what their owner says.
+
+    Raises:
+        InputError: rooms that do not exist, or maps without anything in common under their truth.
+    """
+    a, b = (load_map(file) for file in files)
+    try:
+        overlap = find_overlap(truth, (a, b))
+    except InputError as error:
+        if truth.listed:
+            raise InputError(f"{listing}: {error}") from error
+        return {**about, "kind": ""}  # of one frame, but nothing was seen by both
+    scale = 1.0 if overlap.transform is None else overlap.transform.scale
+    row, registration = time_registration(a, b, abs(scale - 1) > OWN_SCALED)
+    kind = "other-building" if truth.different else "overlap"
+    pair = SimpleNamespace(truth=overlap.transform, about={"kind": kind, "sensors": about["sensors"]})
+    pair.anchor = compute_anchor(pair, (a, b))
+    pose = registration.transform
+    judged = compare_pose(pose, cast(GridPair, pair))
+    return {**row, **about, "kind": kind, "common": overlap.common, "answered": pose is not None, **judged}
 
 
 # Pairs that must not merge
@@ -304,4 +373,5 @@ SETS: dict[str, tuple[Callable[[str, TaskSettings, LogFn], Items], Callable[...,
     "real_strangers": (find_real_strangers, measure_real_strangers),
     **dict.fromkeys(("lookalikes", "train_lookalikes"), (find_lookalikes, measure_lookalike)),
     "boxes": (find_boxes, measure_boxes),
+    OWN_DATA: (find_own, measure_own),
 }

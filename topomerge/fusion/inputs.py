@@ -128,10 +128,15 @@ def check_cells(cells: int, name: str) -> None:
         raise InputError(f"{name}: has no occupied cells, nothing can be merged; extract it from another scan")
 
 
+def is_same_scan(a: TopometricMap, b: TopometricMap) -> bool:
+    """Tell whether two maps are of one scan: their cells are the same, whatever was corrected in them."""
+    same = len(a.grid) == len(b.grid) and np.array_equal(a.grid.cells, b.grid.cells)
+    return a is b or bool(same and np.allclose(a.grid.origin, b.grid.origin) and a.grid.edge == b.grid.edge)
+
+
 def check_different(a: TopometricMap, b: TopometricMap) -> None:
     """Raise InputError where two maps are one."""
-    same = len(a.grid) == len(b.grid) and np.array_equal(a.grid.cells, b.grid.cells)
-    if a is b or (same and np.allclose(a.grid.origin, b.grid.origin) and a.grid.edge == b.grid.edge):
+    if is_same_scan(a, b):
         name = b.source or "the second map"
         raise InputError(f"{name}: is the same map as {a.source or 'the first'}; give two different maps")
 

@@ -37,6 +37,7 @@ from topomerge.landmarks.settle import Observation, find_observations
 from topomerge.matching.consistency import compute_match_probability
 from topomerge.matching.match import Matching, match
 from topomerge.matching.poses import PoseHypothesis
+from topomerge.progress import tell_step
 from topomerge.registration.bend.bend import NEITHER_BENDS
 from topomerge.registration.pipeline import FallbackProposals, Registration, register
 from topomerge.registration.posterior import POSTERIOR, WORDS, check_same, compute_evidence_limit, describe_posterior
@@ -342,6 +343,7 @@ def _join(result: MergeResult) -> MergeResult:
     """Fuse the maps that have a place, and match their rooms."""
     if not result.transforms:
         return result
+    tell_step(0.9, "join the maps")
     poses = {0: Sim3(), **result.transforms}
     joined = fuse(result.maps, list(poses.items()), result.bends)
     matches: list[RoomMatch] = []

@@ -18,6 +18,7 @@ from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.landmarks.evidence import LandmarkEvidence, LandmarkScorer
 from topomerge.landmarks.proposals import propose_poses
 from topomerge.matching.poses import PoseHypothesis, refine, select_distinct_hypotheses, wrap_yaw
+from topomerge.progress import tell_step
 from topomerge.registration.bend.bend import Bend, bend
 from topomerge.registration.evidence.places import Places, score_places
 from topomerge.registration.judge import Judge, compute_winner_features
@@ -217,6 +218,7 @@ def register(
     if scale not in ("fixed", "free"):
         raise InputError(f"scale must be fixed or free, not {scale!r}")
     clock = Stopwatch()
+    tell_step(0.0, "draw plans")
     a, b = (m if isinstance(m, Prepared) else prepare(m, f) for m, f in zip((a, b), free, strict=True))
     clock.lap("plans")
     if b.order < a.order:  # so that nothing depends on which comes first
@@ -231,6 +233,7 @@ def register(
         pair.add(first)
     chance = pair.score_candidates(same)
     if fallback is not None and chance < fallback.below:
+        tell_step(0.6, "match rooms")
         pair.add(fallback.make())
         pair.score_candidates(same)
     if pair.verdict is None:
@@ -266,6 +269,7 @@ class _Pair:
 
     def search(self, poses: Sequence[Sim3]) -> None:
         """Add hypotheses of the correlation, and of given poses T_ab."""
+        tell_step(0.1, "search poses")
         self._rank((search_scaled if self.scaled else search)(self.a.storeys, self.b.storeys, poses))
 
     def add(self, poses: Sequence[Sim3]) -> None:
@@ -283,6 +287,7 @@ class _Pair:
         """Look closely at the best hypotheses there are; the probability of the best one."""
         if not self.ranked:
             return 0.0
+        tell_step(0.4, "bend the maps under the best poses and judge them")
         self.looked = build_candidates(self.a, self.b, self.ranked, self.scaled, self.bent, self.scorer)
         seen, told = [c.features for c in self.looked], [c.landmarks for c in self.looked]
         self.verdict = compute_verdict(seen, self.looked[0].compute_all_features(), same, told)
@@ -291,6 +296,7 @@ class _Pair:
 
     def build_registration(self, said: Verdict, rigid: bool) -> Registration:
         """Return the best hypothesis, finely registered, with what was said of it."""
+        tell_step(0.8, "refine the pose")
         bent, rmse = _refine_candidate(self.a, self.b, self.looked[0], self.scaled, rigid)
         self.clock.lap("refine")
         believed = _build_registration(self.ranked, self.looked, said)

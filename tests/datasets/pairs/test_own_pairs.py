@@ -29,12 +29,12 @@ from topomerge.evaluation.evaluate import evaluate
 from topomerge.evaluation.retrieval import Settings as RetrievalSettings
 from topomerge.evaluation.retrieval import measure as measure_retrieval
 from topomerge.evaluation.settings import Evaluation
-from topomerge.evaluation.tasks import Data
+from topomerge.evaluation.tasks import Data, run_task
 from topomerge.io.maps import save_map
 from topomerge.training import room_matcher
 from topomerge.training.packed_pairs import load_pairs
 from topomerge.training.tasks import compose_settings, find_weights, train
-from topomerge.types import TopometricMap, TrueRoom
+from topomerge.types import Sim3, TopometricMap, TrueRoom
 
 SHIFT = (7.0, -3.0, 1.5)
 HOUSES = (3, 4, 5)
@@ -398,6 +398,31 @@ def test_retrieval_takes_them(houses: Path, cache: Path) -> None:
     assert "Queries: 1 maps of 1 physical buildings" in measure_retrieval(settings, quiet)[0]["text"]
     with pytest.raises(InputError, match="data=folder needs path="):
         measure_retrieval(replace(settings, path=""), quiet)
+
+
+def test_merges_of_them_are_counted(maps_folder: Path, tmp_path: Path) -> None:
+    _, pose = turned(uneven(), SHIFT)
+    pair = {"a": "one", "b": "two", "transform": pose.matrix.tolist()}
+    captures = [*captures_of("one", "two", building="home"), *captures_of("other", building="office")]
+    write_yaml(maps_folder, captures=captures, pairs=[pair])
+    words = ["data=folder", f"path={maps_folder}", f"cache={tmp_path / 'cache'}", f"folder={tmp_path / 'eval'}"]
+    outcome = run_task("merges", words, quiet)
+    same, apart = sorted(outcome.rows, key=lambda row: row["kind"] != "overlap")
+    assert same["pair"] == "one two" and same["right"] and same["err"][0] < 0.2 and same["common"] > 50
+    assert apart["kind"] == "other-building" and apart["err"] is None and not apart["right"]
+    believed, wrong = int(same["believed"]), int(apart["believed"])
+    head = f"1 pairs of one place: 1 placed right, {believed} of these believed, 0 merged wrongly. "
+    assert outcome.summary.startswith(f"{head}1 pairs of two places: {wrong} merged wrongly.")
+    assert "| one two |" in outcome.summary
+    far = Sim3(0.0, (500.0, 0.0, 0.0)).matrix.tolist()
+    for truth, said in (({"transform": far}, "share no floor"), ({"rooms": [[0, 99]]}, "two has no room 99")):
+        write_yaml(maps_folder, captures=captures, pairs=[{"a": "one", "b": "two", **truth}])
+        with pytest.raises(InputError, match=said):
+            run_task("merges", words, quiet)
+    with pytest.raises(InputError, match="data=folder needs path="):
+        run_task("merges", ["data=folder"], quiet)
+    with pytest.raises(InputError, match="is of data=folder, not of data=test"):
+        run_task("merges", ["data=test", f"path={maps_folder}"], quiet)
 
 
 def test_the_matcher_of_rooms_takes_them(houses: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -37,6 +37,7 @@ from topomerge.fusion.inputs import (
 )
 from topomerge.fusion.pose_graph import Assembler, Assembly, compute_residual
 from topomerge.matching.poses import PoseHypothesis
+from topomerge.progress import report_steps, tell_step
 from topomerge.registration.bend.bend import NEITHER_BENDS
 from topomerge.registration.posterior import check_same
 from topomerge.registration.verify import load_model
@@ -253,7 +254,10 @@ class _Explorer:
         pair = (self.maps.keys[i], self.maps.keys[j])
         if pair not in self.registrations:
             tried = [self.proposed[pair]] if pair in self.proposed else []
-            self.registrations[pair] = find_hypotheses(self.maps, i, j, self.scale, self.same, tried)
+            done = len(self.tried)
+            tell_step(0.85 * min(done / (2 * len(self.maps)), 1.0), f"register pair {done + 1}")
+            with report_steps(None):  # its own steps are shares of one pair
+                self.registrations[pair] = find_hypotheses(self.maps, i, j, self.scale, self.same, tried)
         return self.registrations[pair]
 
 
