@@ -206,7 +206,7 @@ def extract(
         source=scan.source if name is None else name,
         parameters={**chosen, "preset": preset if isinstance(preset, str) else "custom"},
         seconds=watch.end(),
-        warnings=(*scan.warnings, *doubts, *_list_warnings(map)),
+        warnings=(*scan.warnings, *doubts, *list_warnings(map)),
     )
     return add_landmarks(map, scan.landmarks)
 
@@ -279,7 +279,7 @@ def cut_rooms(
     return floor, relabel_walls(found.walls, find_rooms_of_segments(cut, select_rooms_with_floor(floor)))
 
 
-def _list_warnings(map: TopometricMap) -> list[str]:
+def list_warnings(map: TopometricMap) -> list[str]:
     """What the user should know about the map as a whole."""
     doubts = []
     if map.grid.edge > COARSE_CELL:
