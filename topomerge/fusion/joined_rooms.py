@@ -30,6 +30,7 @@ from topomerge.types import Array, TopometricMap, VoxelGrid
 
 SAME_SHARE = 0.5  # of the floor of the smaller of two rooms, in the larger one: they are one
 DOUBT_SHARE, DOUBT_AREA = 0.1, 1.0  # of it, and m2: of less, walls lie a little off; of more, nobody knows whose it is
+PIECE_AREA = 2.0  # m2 of a room that counts as one beside another, or beyond it
 LEAST_CONTACT = 0.4  # m of border: shorter ones are no passage
 AROUND = 1.0  # m of what is beside floor that is cut anew
 JOINED_PARAMETERS = DefaultParameters()
@@ -169,9 +170,10 @@ def find_common_floor(claims: Array) -> tuple[Array, Array]:
 
 
 def unite_rooms(claims: Array, entered: Array, part_of: Array, column: float) -> tuple[Array, Array]:
-    """Say which rooms of the parts are one.
+    """Say which rooms of the parts are one: those that share most of the floor of the smaller one.
 
-    Two rooms that somebody was in in the same map stay two; where such a map and another one contradict each other, it is doubtful.
+    It is doubtful where a part has two rooms of what another one has as one, where rooms overlap in part, and where a room that was
+    only looked into reaches beyond one that somebody was in. Two rooms that somebody was in in the same map stay two.
 
     Args:
         claims: (parts, columns) room of each, numbered through all parts, -1 none.
@@ -183,28 +185,28 @@ def unite_rooms(claims: Array, entered: Array, part_of: Array, column: float) ->
         (n,) group of each room, and (groups,) bool: doubtful?
     """
     area = np.bincount(claims[claims >= 0], minlength=len(entered)) * column
-    pairs, common = find_common_floor(claims)
-    smaller = area[pairs].min(axis=1)
-    share = common * column / np.maximum(smaller, 1e-9)
+    pairs, columns = find_common_floor(claims)
+    common = columns * column
+    share = common / np.maximum(area[pairs].min(axis=1), 1e-9)
     same = share >= SAME_SHARE
-    doubtful = {int(r) for r in pairs[~same & (share >= DOUBT_SHARE) & (common * column >= DOUBT_AREA)].ravel()}
-    sure = entered[pairs].all(axis=1)
+    partly = ~same & (share >= DOUBT_SHARE) & (common >= DOUBT_AREA)
+    beyond = (area[pairs] - common[:, None] >= PIECE_AREA) & ~entered[pairs] & entered[pairs[:, ::-1]]
+    doubtful = {int(r) for r in pairs[partly | (same & beyond.any(axis=1))].ravel()}
     group = np.arange(len(entered))
     seen_in = [{int(part_of[r])} if entered[r] else set() for r in range(len(entered))]
-    for k in np.lexsort((-common, ~sure)):
-        if not same[k]:
-            continue
+    for k in np.lexsort((-common, ~entered[pairs].all(axis=1))):
         a, b = (int(group[r]) for r in pairs[k])
-        if a == b:
+        if a == b or not same[k]:
             continue
         if seen_in[a] & seen_in[b]:
-            if sure[k]:
-                doubtful |= {int(r) for r in pairs[k]}
+            doubtful |= {int(r) for r in pairs[k]} if entered[pairs[k]].all() else set()
             continue
         group[group == b] = a
         seen_in[a] |= seen_in[b]
     names, group = np.unique(group, return_inverse=True)
-    doubt = np.zeros(len(names), bool)
+    pieces = np.zeros((len(names), int(part_of.max(initial=-1)) + 1), np.int64)
+    np.add.at(pieces, (group, part_of), area >= PIECE_AREA)
+    doubt = (pieces > 1).any(axis=1)
     doubt[group[sorted(doubtful)]] = True
     return group, doubt
 
