@@ -27,7 +27,7 @@ from topomerge.extraction.scan import COARSEST_CELL, FINEST_CELL, Scan
 from topomerge.extraction.slices import is_raised
 from topomerge.extraction.topology import build_topometric_map
 from topomerge.fusion.joined_rooms import JOINED_PARAMETERS, LaidFloor, join_rooms, select_laid_floor
-from topomerge.fusion.resampling import decode_cells, encode_cells, find_wall_copies, resample_cells, transform_means
+from topomerge.fusion.resampling import decode_cells, encode_cells, find_wall_copies, resample_cells, transform_means, unite_codes
 from topomerge.fusion.transfer import (
     PlacedPart,
     add_carried_odds,
@@ -84,7 +84,9 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
     cells = _JoinedCells(maps[poses[0][0]].grid.origin, _choose_edge(parts))
     order = sorted(range(len(poses)), key=lambda n: parts[n].assumed)  # what was assumed comes last
     placements = [Placement.of(pose, (bends or {}).get(k), maps[k].grid.edge) for k, pose in poses]
-    windows, laid, marks, floors = [], [], {}, []
+    windows, marks = [], {}
+    laid: list[PlacedPart] = []
+    floors: list[tuple[TopometricMap, Laid]] = []
     for n in order:
         map = maps[poses[n][0]]
         first_room = sum(len(part.table) for part in laid)
@@ -132,8 +134,8 @@ def _choose_edge(parts: Sequence[_Part]) -> float:
 
 class _JoinedCells:
     """What is joined so far: cells by their Morton codes, ascending, which maps saw them, the room of a map that they are of
-    (numbered through all maps, -1 none), and where in them their points lie on average (0..1), as how many points say; codes of the
-    free cells, which are twice as long.
+    (numbered through all maps, -1 none), and where in them their points lie on average (0..1), as how many points say; codes of
+    the free cells, which are twice as long.
 
     Args:
         origin: (3,) m, corner of cell (0, 0, 0).
@@ -158,7 +160,7 @@ class _JoinedCells:
         means, points = transform_means(map.grid, placement, rows, cells, self.origin, self.edge)
         if assumed and len(cells):
             added = self._is_occupied(cells) | ~(self._is_surveyed(cells) | self._is_seen_through(cells))
-            cells, provenance, room, means, points = (v[added] for v in (cells, provenance, room, means, points))
+            cells, provenance, room, means, points = cells[added], provenance[added], room[added], means[added], points[added]
         free_cells = None if map.free is None else resample_cells(map.free, placement, self.origin, 2 * self.edge)[0]
         if free_cells is not None and len(self.free_codes) and len(cells):
             occupied = decode_cells(self.codes)
@@ -167,15 +169,17 @@ class _JoinedCells:
             points = np.where(copy_of >= 0, 0.0, points)  # they lie beside the wall
         self._add(cells, provenance, room, means, points)
         if free_cells is not None:
-            self.free_codes = np.union1d(self.free_codes, encode_cells(free_cells))
+            self.free_codes = unite_codes(self.free_codes, encode_cells(free_cells))
 
     def lay_floor(self, map: TopometricMap, placement: Placement) -> Laid:
         """Return the cells (k, 3) of the lattice that the navigable cells of a map fill, and the row (k,) of one that does."""
         return resample_cells(map.navigable, placement, self.origin, self.edge)
 
     def _add(self, cells: Array, provenance: Array, room: Array, means: Array, points: Array) -> None:
-        before = len(self.codes)
-        self.codes, row = np.unique(np.concatenate([self.codes, encode_cells(cells)]), return_inverse=True)
+        before, new = len(self.codes), encode_cells(cells)
+        codes = unite_codes(self.codes, new)
+        row = np.searchsorted(codes, np.concatenate([self.codes, new]))
+        self.codes = codes
         joined = np.zeros(len(self.codes), np.uint32)
         np.bitwise_or.at(joined, row, np.concatenate([self.provenance, provenance]))
         self.provenance = joined
@@ -230,7 +234,7 @@ def _build_joined(
     """
     cells = decode_cells(joined.codes)
     base = 2 * (cells.min(axis=0) // 2)  # even: free cells are twice as long
-    tables = {"provenance": joined.provenance, "room": joined.room}
+    tables: dict[str, Array] = {"provenance": joined.provenance, "room": joined.room}
     grid = VoxelGrid.from_cells(cells - base, joined.origin + base * joined.edge, joined.edge, properties=tables)
     provenance, label = grid.properties["provenance"], grid.properties["room"]
     grid = replace(grid, properties={})

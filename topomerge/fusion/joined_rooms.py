@@ -1,8 +1,8 @@
 """Rooms of a joined map from those of its parts (method 4; docs/adr/0038).
 
-Rooms of the parts that share their floor are one. What the parts agree on is carried over by the placement. Floor on which they do not
-agree is cut anew, with all that is beside it: where a part has two rooms that another one has as one, where rooms overlap in part, and
-where rooms meet of which no part saw both.
+Rooms of the parts that share their floor are one. What the parts agree on is carried over by the placement. Floor on which they
+do not agree is cut anew: where a part has two rooms that another one has as one, where rooms overlap in part, and where rooms
+meet of which no part saw both.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class CutFloor:
 
     Args:
         cells: (k, 3) of the joined grid.
-        standing, storey, room, area: (k,) of each cell; FLOOR_PROPERTIES.
+        tables: FLOOR_PROPERTIES, (k,) of each cell.
         room_of_area: (A,).
         label: (n,) room of each occupied cell of the joined grid, -1 none.
         completeness: (R,) of the rooms.
@@ -84,10 +84,7 @@ class CutFloor:
     """
 
     cells: Array
-    standing: Array
-    storey: Array
-    room: Array
-    area: Array
+    tables: dict[str, Array]
     room_of_area: Array
     label: Array
     completeness: Array
@@ -172,8 +169,8 @@ def find_common_floor(claims: Array) -> tuple[Array, Array]:
 def unite_rooms(claims: Array, entered: Array, part_of: Array, column: float) -> tuple[Array, Array]:
     """Say which rooms of the parts are one: those that share most of the floor of the smaller one.
 
-    It is doubtful where a part has two rooms of what another one has as one, where rooms overlap in part, and where a room that was
-    only looked into reaches beyond one that somebody was in. Two rooms that somebody was in in the same map stay two.
+    It is doubtful where a part has two rooms of what another one has as one, where rooms overlap in part, and where a room that
+    was only looked into reaches beyond one that somebody was in. Two rooms that somebody was in in the same map stay two.
 
     Args:
         claims: (parts, columns) room of each, numbered through all parts, -1 none.
@@ -206,7 +203,7 @@ def unite_rooms(claims: Array, entered: Array, part_of: Array, column: float) ->
     names, group = np.unique(group, return_inverse=True)
     pieces = np.zeros((len(names), int(part_of.max(initial=-1)) + 1), np.int64)
     np.add.at(pieces, (group, part_of), area >= PIECE_AREA)
-    doubt = (pieces > 1).any(axis=1)
+    doubt = np.asarray((pieces > 1).any(axis=1))
     doubt[group[sorted(doubtful)]] = True
     return group, doubt
 
@@ -257,7 +254,7 @@ def join_rooms(
     if doubt.any():
         cut = _add_fresh_rooms(cut, columns, owner, parts)
     share = np.bincount(claims[claims >= 0], minlength=len(group)) / np.maximum(total, 1)[group]
-    return JoinedFloor(_build_floor(cut, columns), member, share, area_member, len(completeness))
+    return JoinedFloor(_build_floor(cut, columns, len(completeness)), member, share, area_member, len(completeness))
 
 
 def _find_unknown_borders(columns: _Columns, owner: Array, group: Array, part_of: Array) -> Array:
@@ -284,16 +281,17 @@ def _carry_over(columns: _Columns, floors: Sequence[LaidFloor], member: Array, o
     one = _unite_areas(columns.claim(floors, areas), room_of_area)
     kept, area_member = np.unique(np.where(room_of_area >= 0, one, -1), return_inverse=True)
     area_member -= int((kept < 0).any())
-    tables = []
+    cells, tables = [], []
     for floor, rows, area in zip(floors, columns.rows, areas, strict=True):
         room = member[floor.room]
         keep = (room >= 0) & (room == owner[columns.column[rows]])
-        each = floor.cells, floor.standing, columns.storey[rows], room, np.append(area_member, -1)[area]
-        tables.append([column[keep] for column in each])
+        cells.append(floor.cells[keep])
+        each = floor.standing, columns.storey[rows], room, np.append(area_member, -1)[area]
+        tables.append([values[keep] for values in each])
     rooms = np.zeros(int(area_member.max(initial=-1)) + 1, np.int64)
     rooms[area_member[area_member >= 0]] = room_of_area[area_member >= 0]
-    none = np.zeros(0)
-    return CutFloor(*(np.concatenate(part) for part in zip(*tables, strict=True)), rooms, none, none), area_member
+    joined = dict(zip(FLOOR_PROPERTIES, map(np.concatenate, zip(*tables, strict=True)), strict=True))
+    return CutFloor(np.concatenate(cells), joined, rooms, np.zeros(0), np.zeros(0)), area_member
 
 
 def _add_fresh_rooms(cut: CutFloor, columns: _Columns, owner: Array, parts: Sequence[PartRooms]) -> CutFloor:
@@ -308,22 +306,21 @@ def _add_fresh_rooms(cut: CutFloor, columns: _Columns, owner: Array, parts: Sequ
     scan = Scan(grid.select_cells(rows))
     walked = navigable.select_cells(standing if standing.any() else redone)
     floor, _ = cut_rooms(scan, walked, JOINED_PARAMETERS, Stopwatch(), parts)
-    if not len(floor.cells):
+    if not len(floor.cells) or floor.completeness is None:
         return cut
     storey = np.abs(columns.storeys["floor"] - floor.storeys["floor"][:, None]).argmin(axis=1)[floor.storey]
     column = columns.find(columns.number(storey, floor.cells.cells))
     taken = (column >= 0) & (owner[column] >= 0)
-    count = len(floor.completeness)
+    count, first = len(floor.completeness), len(cut.completeness)
     lost = np.bincount(floor.room, taken, count) > MOST_CARRIED * np.bincount(floor.room, minlength=count)
     keep = ~taken & ~lost[floor.room]
-    first, first_area = len(cut.completeness), len(cut.room_of_area)
     label = cut.label.copy()
     new = np.append(np.where(lost, -1, np.arange(count) + first), -1)[floor.label]
     label[rows] = np.where(label[rows] >= 0, label[rows], new)
-    added = floor.cells.cells, floor.cells.properties["standing"], storey, floor.room + first, floor.area + first_area
-    old = cut.cells, cut.standing, cut.storey, cut.room, cut.area
+    added = floor.cells.properties["standing"], storey, floor.room + first, floor.area + len(cut.room_of_area)
     return CutFloor(
-        *(np.concatenate([a, b[keep]]) for a, b in zip(old, added, strict=True)),
+        np.concatenate([cut.cells, floor.cells.cells[keep]]),
+        {name: np.concatenate([cut.tables[name], v[keep]]) for name, v in zip(FLOOR_PROPERTIES, added, strict=True)},
         np.concatenate([cut.room_of_area, floor.room_of_area + first]),
         label,
         np.concatenate([cut.completeness, floor.completeness]),
@@ -331,11 +328,10 @@ def _add_fresh_rooms(cut: CutFloor, columns: _Columns, owner: Array, parts: Sequ
     )
 
 
-def _build_floor(cut: CutFloor, columns: _Columns) -> Floor:
-    """The floor as one grid."""
-    tables = dict(zip(FLOOR_PROPERTIES, (cut.standing, cut.storey, cut.room, cut.area), strict=True))
-    floor, storeys, of_cell = join_floor(columns.grid, columns.storeys, cut.cells, tables)
-    first = len(cut.completeness) - (len(cut.fresh.completeness) if cut.fresh else 0)
+def _build_floor(cut: CutFloor, columns: _Columns, carried: int) -> Floor:
+    """The floor as one grid; of its rooms the first ones are carried over."""
+    floor, storeys, of_cell = join_floor(columns.grid, columns.storeys, cut.cells, cut.tables)
+    doors = cut.fresh.door_probability if cut.fresh else {}
     return Floor(
         floor,
         storeys,
@@ -344,7 +340,7 @@ def _build_floor(cut: CutFloor, columns: _Columns) -> Floor:
         of_cell["area"],
         cut.room_of_area.astype(np.int32),
         cut.label.astype(np.int32),
-        door_probability={(a + first, b + first): p for (a, b), p in (cut.fresh.door_probability.items() if cut.fresh else ())},
+        door_probability={(a + carried, b + carried): p for (a, b), p in doors.items()},
         completeness=cut.completeness,
         classified_storeys=cut.fresh.classified_storeys if cut.fresh else (),
     )

@@ -27,8 +27,8 @@ LEAST_COVER = 0.3  # of a joined room's floor, from which on a part knows who wa
 
 
 class PlacedPart(NamedTuple):
-    """What of a part is needed once it is joined: its rooms, ROOM_DTYPE of them, and its doors and openings as they lie in the joined
-    map, EDGE_DTYPE with the part's rooms; likewise its narrowings, with the part's areas."""
+    """What of a part is needed once it is joined: its rooms, ROOM_DTYPE of them, and its doors and openings as they lie in the
+    joined map, EDGE_DTYPE with the part's rooms; likewise its narrowings, with the part's areas."""
 
     rooms: PartRooms
     table: Array
