@@ -244,7 +244,10 @@ class _Hulls:
         order = np.argsort(room, kind="stable")
         numbers, first = np.unique(room[order], return_index=True)
         self.columns = dict(zip(numbers.tolist(), np.split(at[order].astype(float), first[1:]), strict=True))
-        self.hulls = {n: shapely.convex_hull(shapely.MultiPoint(columns)) for n, columns in self.columns.items()}
+        rings = {
+            n: np.concatenate([columns, columns[:1]]) for n, columns in self.columns.items()
+        }  # a line of two points at least
+        self.hulls = {n: shapely.convex_hull(shapely.linestrings(ring)) for n, ring in rings.items()}
 
     def measure_share_between(self, room: int) -> float:
         """Of a room's columns, those within the convex hull of all other rooms."""

@@ -153,7 +153,7 @@ class _Columns:
             other = self.find(self.numbers + step)
             both = np.stack([owner, np.where(other >= 0, owner[other], -1)], axis=1)
             pairs.append(np.sort(both[(both >= 0).all(axis=1) & (both[:, 0] != both[:, 1])], axis=1))
-        return np.unique(np.concatenate(pairs), axis=0, return_counts=True)
+        return _count_pairs(np.concatenate(pairs))
 
 
 def find_common_floor(claims: Array) -> tuple[Array, Array]:
@@ -163,7 +163,14 @@ def find_common_floor(claims: Array) -> tuple[Array, Array]:
         claims: (parts, columns) room of each, numbered through all parts, -1 none.
     """
     pairs = [claims[[n, m]][:, (claims[n] >= 0) & (claims[m] >= 0)].T for n, m in combinations(range(len(claims)), 2)]
-    return np.unique(np.concatenate([np.zeros((0, 2), np.int64), *pairs]), axis=0, return_counts=True)
+    return _count_pairs(np.concatenate([np.zeros((0, 2), np.int64), *pairs]))
+
+
+def _count_pairs(pairs: Array) -> tuple[Array, Array]:
+    """(k, 2) those of pairs (n, 2) of numbers that there are, ascending, and how often."""
+    most = int(pairs.max(initial=0)) + 1
+    keys, counts = np.unique(pairs[:, 0] * most + pairs[:, 1], return_counts=True)
+    return np.column_stack([keys // most, keys % most]), counts
 
 
 def unite_rooms(claims: Array, entered: Array, part_of: Array, column: float) -> tuple[Array, Array]:

@@ -230,11 +230,11 @@ def vote_rooms(part_room: Array, joined_room: Array, count: int) -> Array:
         part_room: (k,) room of each place of a part's floor.
         joined_room: (k,) room of the joined map there, -1 none.
     """
-    inside = joined_room >= 0
-    pairs, votes = np.unique(np.column_stack([part_room[inside], joined_room[inside]]), axis=0, return_counts=True)
-    best = pairs[np.lexsort((-pairs[:, 1], votes))]  # the most votes, then the first room, comes last
+    inside, most = joined_room >= 0, int(joined_room.max(initial=0)) + 1
+    pairs, votes = np.unique(part_room[inside].astype(np.int64) * most + joined_room[inside], return_counts=True)
+    best = pairs[np.lexsort((-pairs, votes))]  # the most votes, then the first room, comes last
     out = np.full(count, -1, np.int64)
-    out[best[:, 0]] = best[:, 1]
+    out[best // most] = best % most
     return out
 
 
