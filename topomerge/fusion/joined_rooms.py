@@ -340,13 +340,13 @@ def _build_floor(cut: CutFloor, columns: _Columns, carried: int) -> Floor:
     floor, storeys, of_cell = join_floor(columns.grid, columns.storeys, cut.cells, cut.tables)
     doors = cut.fresh.door_probability if cut.fresh else {}
     return Floor(
-        floor,
-        storeys,
-        of_cell["storey"],
-        of_cell["room"],
-        of_cell["area"],
-        cut.room_of_area.astype(np.int32),
-        cut.label.astype(np.int32),
+        cells=floor,
+        storeys=storeys,
+        storey=of_cell["storey"],
+        room=of_cell["room"],
+        area=of_cell["area"],
+        room_of_area=cut.room_of_area.astype(np.int32),
+        label=cut.label.astype(np.int32),
         door_probability={(a + carried, b + carried): p for (a, b), p in doors.items()},
         completeness=cut.completeness,
         classified_storeys=cut.fresh.classified_storeys if cut.fresh else (),
