@@ -165,7 +165,12 @@ def test_the_map_with_more_points_says_where_a_wall_is():
     joined = _JoinedCells(np.zeros(3), 0.1)
     for one in (few, many):
         laid, rows = resample_cells(one, Sim3(), np.zeros(3), 0.1)
-        joined._add(laid, np.ones(10, np.uint32), *transform_means(one, Placement(Sim3()), rows, laid, np.zeros(3), 0.1))
+        joined._add(
+            laid,
+            np.ones(10, np.uint32),
+            np.zeros(10, np.int64),
+            *transform_means(one, Placement(Sim3()), rows, laid, np.zeros(3), 0.1),
+        )
     assert np.allclose(joined.convert_means()[:, 1], 0.1 * 52.5 / 256, atol=4e-4) and len(joined.codes) == 10
 
 

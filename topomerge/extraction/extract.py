@@ -160,7 +160,6 @@ def extract(
     preset: str | Parameters = "default",
     name: str | None = None,
     progress: Progress | None = None,
-    parts: Sequence[PartRooms] = (),
     **overrides: Any,
 ) -> TopometricMap:
     """Extract rooms, doors and storeys (seeds 2).
@@ -171,7 +170,6 @@ def extract(
         preset: ``"default"``, ``"thesis"``, or the parameters of one of them (`PRESETS`).
         name: where the map comes from; the cloud's own source by default.
         progress: called now and then with the share done and a text.
-        parts: rooms of the maps that these cells were joined of, which have a say in where rooms part (`fusion.fuse`).
         overrides: single parameters of the preset.
 
     Raises:
@@ -188,7 +186,7 @@ def extract(
         map = build_topometric_map(scan.grid, floor, p.standing_height)  # 2.7
         map = replace(map, rooms=add_outline_odds(map.rooms))
     else:
-        floor, walls = cut_rooms(scan, navigable, p, watch, parts)
+        floor, walls = cut_rooms(scan, navigable, p, watch)
         watch.begin("topology", 0.85)
         map = build_topometric_map(scan.grid, floor, p.standing_height)  # 2.7
         watch.begin("odds of rooms, doors on walls", 0.87)
@@ -206,7 +204,7 @@ def extract(
         source=scan.source if name is None else name,
         parameters={**chosen, "preset": preset if isinstance(preset, str) else "custom"},
         seconds=watch.end(),
-        warnings=(*scan.warnings, *doubts, *_list_warnings(map)),
+        warnings=(*scan.warnings, *doubts, *list_warnings(map)),
     )
     return add_landmarks(map, scan.landmarks)
 
@@ -264,6 +262,9 @@ def cut_rooms(
 ) -> tuple[Floor, StoreyWalls | None]:
     """Cut the storeys of a scan into rooms, once, by all evidence (docs/adr/0024).
 
+    Args:
+        parts: rooms of the maps that these cells were joined of, which have a say in where rooms part (`fusion.joined_rooms`).
+
     Returns:
         The floors of all storeys; their walls with the rooms of the map beside them, None of a scan that shows none at heights.
     """
@@ -279,7 +280,7 @@ def cut_rooms(
     return floor, relabel_walls(found.walls, find_rooms_of_segments(cut, select_rooms_with_floor(floor)))
 
 
-def _list_warnings(map: TopometricMap) -> list[str]:
+def list_warnings(map: TopometricMap) -> list[str]:
     """What the user should know about the map as a whole."""
     doubts = []
     if map.grid.edge > COARSE_CELL:

@@ -91,11 +91,12 @@ class _StoreyFloor:
     edge: float
 
 
-def compute_room_features(map: TopometricMap, names: Sequence[str] = ROOM_FEATURES) -> Array:
+def compute_room_features(map: TopometricMap, names: Sequence[str] = ROOM_FEATURES, asked: Array | None = None) -> Array:
     """Return (R, F) features of a map that need no poses.
 
     Args:
         names: of `ROOM_FEATURES` and `GRID_FEATURES`.
+        asked: (R,) bool, of which rooms all features are asked for; None: of all.
     """
     rooms = map.rooms
     table = {name: np.zeros(len(rooms)) for name in (*ROOM_FEATURES, *GRID_FEATURES)}
@@ -105,6 +106,8 @@ def compute_room_features(map: TopometricMap, names: Sequence[str] = ROOM_FEATUR
         for room, window in _iter_windows(storey):
             own = storey.room[window] == room
             covered[:, room] = storey.ceiling[window][own].sum(), own.sum()
+            if asked is not None and not asked[room]:
+                continue
             table["floor_seen"][room] = storey.standing[window][own].mean()
             table["floor_step"][room] = abs(np.median(storey.height[window][own]))
             table["between"][room] = hulls.measure_share_between(room)
@@ -241,7 +244,8 @@ class _Hulls:
         order = np.argsort(room, kind="stable")
         numbers, first = np.unique(room[order], return_index=True)
         self.columns = dict(zip(numbers.tolist(), np.split(at[order].astype(float), first[1:]), strict=True))
-        self.hulls = {n: shapely.convex_hull(shapely.multipoints(shapely.points(columns))) for n, columns in self.columns.items()}
+        rings = {n: np.concatenate([columns, columns[:1]]) for n, columns in self.columns.items()}  # of two points at least
+        self.hulls = {n: shapely.convex_hull(shapely.linestrings(ring)) for n, ring in rings.items()}
 
     def measure_share_between(self, room: int) -> float:
         """Of a room's columns, those within the convex hull of all other rooms."""
@@ -283,26 +287,30 @@ GRIDS = Family("grids", GRID_FEATURES, dict.fromkeys(ROOM_ODDS, _GRID_LENGTH))
 FAMILIES = {"scans": SCANS, "open": OPEN_SCANS, "grids": GRIDS}
 
 
-def add_room_probabilities(map: TopometricMap, rays: tuple[Array, Array] | None = None, raised: bool = False) -> TopometricMap:
+def add_room_probabilities(
+    map: TopometricMap, rays: tuple[Array, Array] | None = None, raised: bool = False, asked: Array | None = None
+) -> TopometricMap:
     """Return the map with the probabilities of its rooms; those that were probably not entered are `glimpsed`.
 
     Args:
         rays: (k, 3) places of the sensor and (k, 3) of what it saw, m; None where they are unknown.
         raised: is it a robot's grid or a drawing?
+        asked: (R,) bool, of which rooms; those of the others are known. None: of all.
 
     Raises:
         InputError: the weights that ship are damaged.
     """
     rooms = map.rooms.copy()
     weights = load_room_weights()
-    x = compute_room_features(map, GRID_FEATURES if raised else ROOM_FEATURES)
+    asked = np.ones(len(rooms), bool) if asked is None else asked
+    x = compute_room_features(map, GRID_FEATURES if raised else ROOM_FEATURES, asked)
     for family in (GRIDS,) if raised else (SCANS, OPEN_SCANS):
         for name in family.lengths:
             if name in ROOM_ODDS:
-                rooms[name] = compute_probability(weights, family, name, x)
+                rooms[name] = np.where(asked, compute_probability(weights, family, name, x), rooms[name])
     poses = None if raised else compute_pose_features(map, rays)
     if poses is not None:
-        rooms["entered"] = compute_probability(weights, SCANS, ENTERED_BY_POSES, x, poses)
+        rooms["entered"] = np.where(asked, compute_probability(weights, SCANS, ENTERED_BY_POSES, x, poses), rooms["entered"])
     rooms["glimpsed"] = rooms["entered"] < 0.5
     return replace(map, rooms=rooms)
 

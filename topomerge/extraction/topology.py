@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import edt
@@ -27,7 +28,10 @@ DOOR_SEARCH = 1.5  # m: how far from the border of two rooms their door may lie
 HALF_NEIGHBOURS = np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1)])
 
 
-def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceiling: Array, within: Array | None = None) -> Array:
+Asked = Callable[[Array, Array], Array]  # two rooms (k,) each -> (k,) bool: are edges between them asked for?
+
+
+def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceiling: Array, asked: Asked | None = None) -> Array:
     """Return edges between rooms that have adjacent navigable cells (seeds 2.7), one for each place where they meet.
 
     Args:
@@ -35,7 +39,7 @@ def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceilin
         room: (m,) room (or area) of each of its cells, -1 none.
         storey_of_room: (R,) storey of each room.
         floor_to_ceiling: (m,) m of empty space above each cell, 0 where nothing was seen.
-        within: (R,) what each room is part of: only edges between parts of one are asked for; None: all.
+        asked: between which rooms edges are asked for; None: between all.
 
     Returns:
         (E,) EDGE_DTYPE, sorted by rooms and place.
@@ -48,8 +52,8 @@ def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceilin
         row = np.flatnonzero((other >= 0) & (room >= 0))
         neighbour = other[row]
         meet = (room[neighbour] >= 0) & (room[neighbour] != room[row])
-        if within is not None:
-            meet &= within[room[neighbour]] == within[room[row]]
+        if asked is not None:
+            meet &= asked(room[row], room[neighbour])
         first.append(row[meet])
         second.append(neighbour[meet])
     a, b = np.concatenate(first), np.concatenate(second)
@@ -274,7 +278,7 @@ def _across(free: Array, clearance: Array, saddle: Array, low: Array) -> tuple[A
 # Rooms and edges with their measures: the topometric map (seeds 2.7).
 
 
-def build_topometric_map(grid: VoxelGrid, floor: Floor, body_height: float) -> TopometricMap:
+def build_topometric_map(grid: VoxelGrid, floor: Floor, body_height: float, known: int = 0) -> TopometricMap:
     """Build the graph of rooms over the voxel grid (seeds 2.7).
 
     A room without a floor has no place in the graph: its cells lose their label.
@@ -283,20 +287,25 @@ def build_topometric_map(grid: VoxelGrid, floor: Floor, body_height: float) -> T
         grid: occupied cells.
         floor: of all storeys, cut into rooms.
         body_height: m, whatever is lower than this above the floor is no ceiling.
+        known: of so many rooms, the first ones, doors and narrowings are known (`fusion.joined_rooms`); only their stairs are
+            looked for.
     """
     old_number = select_rooms_with_floor(floor)
-    number = np.full(int(max(floor.label.max(initial=-1), floor.room.max(initial=-1))) + 2, -1, np.int32)
+    number = np.full(max(int(a.max(initial=-1)) for a in (floor.label, floor.room, floor.room_of_area)) + 2, -1, np.int32)
     number[old_number] = np.arange(len(old_number))
     room, label = number[floor.label], number[floor.room]
     above = measure_floor_to_ceiling(grid, floor.cells, body_height)
     rooms = _measure_rooms(grid, room, floor, label, above, old_number)
-    edges = find_edges(floor, label, rooms["storey"], above)
+    fresh, storey = old_number >= known, rooms["storey"]
+    asked = None if not known else (lambda a, b: (fresh[a] & fresh[b]) | (storey[a] != storey[b]))
+    edges = find_edges(floor, label, storey, above, asked)
     for edge in edges:
         a, b = old_number[edge["rooms"]].tolist()
         edge["confidence"] = floor.door_probability.get((min(a, b), max(a, b)), 1.0)
     area = np.where(number[floor.room_of_area][floor.area] >= 0, floor.area, -1) if len(floor.room_of_area) else floor.area
     areas, area = _build_areas(floor, label, area)
-    narrows = find_edges(floor, area, rooms["storey"][areas["room"]], above, areas["room"])
+    owner = areas["room"]
+    narrows = find_edges(floor, area, storey[owner], above, lambda a, b: (owner[a] == owner[b]) & fresh[owner[a]])
     return TopometricMap(grid, room, floor.cells, label, rooms, edges, floor.storeys, areas, area, narrows)
 
 

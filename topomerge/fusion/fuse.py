@@ -1,5 +1,5 @@
-"""Maps and where they lie -> one map: cells are fused one map after the other, rooms and doors extracted once, at the end (seeds
-3.3; method 4).
+"""Maps and where they lie -> one map: cells are fused one map after the other, rooms and doors carried over at the end
+(seeds 3.3; method 4).
 
 Maps are bent in their own frames, then posed; their cells are resampled on the lattice of the first one (`resampling`).
 
@@ -10,25 +10,31 @@ would become a wall that fills it. They still say that they saw the cells of oth
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Protocol
 
 import numpy as np
 from scipy import ndimage
 
 from topomerge.errors import InputError
-from topomerge.extraction.attributes import find_rooms_at
+from topomerge.extraction.attributes import find_rooms_at, select_distinct_doors
 from topomerge.extraction.cleaning import add_means
-from topomerge.extraction.convolution import build_moore, convolve
-from topomerge.extraction.extract import extract
-from topomerge.extraction.parameters import PRESETS
-from topomerge.extraction.plans.part_rooms import PartRooms
-from topomerge.extraction.scan import COARSEST_CELL, FINEST_CELL
-from topomerge.fusion.resampling import decode_cells, encode_cells, find_wall_copies, resample_cells, transform_means
+from topomerge.extraction.elevations.wall_doors import add_wall_doors
+from topomerge.extraction.extract import extract, list_warnings
+from topomerge.extraction.navigable import find_free_space
+from topomerge.extraction.room_odds import add_room_probabilities
+from topomerge.extraction.scan import COARSEST_CELL, FINEST_CELL, Scan
+from topomerge.extraction.slices import is_raised
+from topomerge.extraction.topology import build_topometric_map
+from topomerge.fusion.joined_rooms import JOINED_PARAMETERS, LaidFloor, join_rooms, select_laid_floor
+from topomerge.fusion.resampling import decode_cells, encode_cells, find_wall_copies, resample_cells, transform_means, unite_codes
 from topomerge.fusion.transfer import (
+    PlacedPart,
+    add_carried_odds,
     add_joined_landmarks,
     add_joined_windows,
     add_part_doors,
+    add_part_narrows,
     add_part_odds,
     transform_floor,
     transform_part,
@@ -45,6 +51,7 @@ from topomerge.types import JOINED, LEVELLED, Array, Deformation, Placement, Sim
 ALIKE_EDGES = 0.8  # ratio of edge lengths: cells of another map that are not smaller than that keep those of the first
 PROVENANCE_BITS = 32  # maps that one bit set tells apart
 ASSUMED_MARGIN = 0.3  # m around what other maps saw: there an extruded wall is one of theirs that is a little off
+Laid = tuple[Array, Array]  # cells of the joined map that those of a map fill, and which do
 
 
 class MapSequence(Protocol):
@@ -77,17 +84,21 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
     cells = _JoinedCells(maps[poses[0][0]].grid.origin, _choose_edge(parts))
     order = sorted(range(len(poses)), key=lambda n: parts[n].assumed)  # what was assumed comes last
     placements = [Placement.of(pose, (bends or {}).get(k), maps[k].grid.edge) for k, pose in poses]
-    windows, laid, marks = [], [], {}
+    windows, marks = [], {}
+    laid: list[PlacedPart] = []
+    floors: list[tuple[TopometricMap, Laid]] = []
     for n in order:
         map = maps[poses[n][0]]
-        cells.add_map(map, placements[n], int(first_bits[n]), parts[n].assumed and n != order[0])
+        first_room = sum(len(part.table) for part in laid)
+        cells.add_map(map, placements[n], int(first_bits[n]), first_room, parts[n].assumed and n != order[0])
+        floors.append((map, cells.lay_floor(map, placements[n])))
         windows.append(transform_windows(map, placements[n]))
         laid.append(transform_part(map, placements[n]))
         if len(map.landmarks):
             marks[n] = transform_part_landmarks(map, placements[n], laid[-1].rooms)
     name = JOINED.join(maps[k].source or "map" for k, _ in poses)
     rooms = [part.rooms for part in laid]
-    joined = _extract_joined(cells, min(part.neighbours for part in parts), name, rooms)
+    joined = _build_joined(cells, floors, laid, name)
     joined = add_joined_windows(add_part_doors(add_part_odds(joined, rooms), laid), windows)
     if marks:
         joined = add_joined_landmarks(joined, marks, [maps[k].title for k, _ in poses])
@@ -99,10 +110,9 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
 
 @dataclass(frozen=True)
 class _Part:
-    """What is asked of a map before it is fused: usual number of neighbours of a cell, number of provenance bits, edge length in
-    the joined frame, m, and whether its heights were assumed."""
+    """What is asked of a map before it is fused: number of provenance bits, edge length in the joined frame, m, and whether its
+    heights were assumed."""
 
-    neighbours: float
     bits: int
     edge: float
     assumed: bool
@@ -110,7 +120,7 @@ class _Part:
     @classmethod
     def from_map(cls, map: TopometricMap, pose: Sim3) -> _Part:
         bits = 1 if map.provenance is None else max(int(np.bitwise_or.reduce(map.provenance, initial=0)).bit_length(), 1)
-        return cls(_estimate_neighbours(map.grid), bits, pose.scale * map.grid.edge, is_extruded(map.grid))
+        return cls(bits, pose.scale * map.grid.edge, is_extruded(map.grid))
 
 
 def _choose_edge(parts: Sequence[_Part]) -> float:
@@ -123,8 +133,9 @@ def _choose_edge(parts: Sequence[_Part]) -> float:
 
 
 class _JoinedCells:
-    """What is joined so far: cells by their Morton codes, ascending, which maps saw them, and where in them their points lie on
-    average (0..1), as how many points say; codes of the free cells, which are twice as long.
+    """What is joined so far: cells by their Morton codes, ascending, which maps saw them, the room of a map that they are of
+    (numbered through all maps, -1 none), and where in them their points lie on average (0..1), as how many points say; codes of
+    the free cells, which are twice as long.
 
     Args:
         origin: (3,) m, corner of cell (0, 0, 0).
@@ -135,33 +146,48 @@ class _JoinedCells:
         self.origin, self.edge = origin, edge
         self.codes = self.free_codes = np.zeros(0, np.uint64)
         self.provenance = np.zeros(0, np.uint32)
+        self.room = np.zeros(0, np.int64)
         self.means: Array = np.zeros((0, 3))
         self.points: Array = np.zeros(0)
 
-    def add_map(self, map: TopometricMap, placement: Placement, first_bit: int, assumed: bool) -> None:
+    def add_map(self, map: TopometricMap, placement: Placement, first_bit: int, first_room: int, assumed: bool) -> None:
         """Add a map; of one whose heights were assumed only what no other saw."""
         provenance = np.ones(len(map.grid), np.uint32) if map.provenance is None else map.provenance.astype(np.uint32)
         cells, rows = resample_cells(map.grid, placement, self.origin, self.edge)
         provenance = provenance[rows] << np.uint32(first_bit)
+        room = map.room[rows].astype(np.int64)
+        room = np.where(room >= 0, room + first_room, -1)
         means, points = transform_means(map.grid, placement, rows, cells, self.origin, self.edge)
         if assumed and len(cells):
             added = self._is_occupied(cells) | ~(self._is_surveyed(cells) | self._is_seen_through(cells))
-            cells, provenance, means, points = cells[added], provenance[added], means[added], points[added]
+            cells, provenance, room, means, points = cells[added], provenance[added], room[added], means[added], points[added]
         free_cells = None if map.free is None else resample_cells(map.free, placement, self.origin, 2 * self.edge)[0]
         if free_cells is not None and len(self.free_codes) and len(cells):
             occupied = decode_cells(self.codes)
             copy_of = find_wall_copies((occupied, decode_cells(self.free_codes)), (cells, free_cells), self.edge)
             cells = np.where(copy_of[:, None] >= 0, occupied[copy_of], cells)
             points = np.where(copy_of >= 0, 0.0, points)  # they lie beside the wall
-        self._add(cells, provenance, means, points)
+        self._add(cells, provenance, room, means, points)
         if free_cells is not None:
-            self.free_codes = np.union1d(self.free_codes, encode_cells(free_cells))
+            self.free_codes = unite_codes(self.free_codes, encode_cells(free_cells))
 
-    def _add(self, cells: Array, provenance: Array, means: Array, points: Array) -> None:
-        self.codes, row = np.unique(np.concatenate([self.codes, encode_cells(cells)]), return_inverse=True)
+    def lay_floor(self, map: TopometricMap, placement: Placement) -> Laid:
+        """Return the cells (k, 3) of the lattice that the navigable cells of a map fill, and the row (k,) of one that does."""
+        return resample_cells(map.navigable, placement, self.origin, self.edge)
+
+    def _add(self, cells: Array, provenance: Array, room: Array, means: Array, points: Array) -> None:
+        before, new = len(self.codes), encode_cells(cells)
+        codes = unite_codes(self.codes, new)
+        row = np.searchsorted(codes, np.concatenate([self.codes, new]))
+        self.codes = codes
         joined = np.zeros(len(self.codes), np.uint32)
         np.bitwise_or.at(joined, row, np.concatenate([self.provenance, provenance]))
         self.provenance = joined
+        labels = np.full(len(self.codes), -1)
+        labels[row[before:]] = room
+        kept = self.room >= 0
+        labels[row[:before][kept]] = self.room[kept]
+        self.room = labels
         means, points = np.concatenate([self.means, means]), np.concatenate([self.points, points])
         self.points = np.bincount(row, points, len(joined))
         total = np.column_stack([np.bincount(row, points * means[:, k], len(joined)) for k in range(3)])
@@ -197,39 +223,83 @@ class _JoinedCells:
         return surveyed
 
 
-def _extract_joined(joined: _JoinedCells, neighbours: float, name: str, rooms: Sequence[PartRooms]) -> TopometricMap:
-    """Rooms and doors of what was joined.
+def _build_joined(
+    joined: _JoinedCells, laid: Sequence[tuple[TopometricMap, Laid]], parts: Sequence[PlacedPart], name: str
+) -> TopometricMap:
+    """Rooms and narrowings of what was joined, and doors where rooms were cut anew.
 
     Args:
-        neighbours: usual number of neighbours of a cell in the sparsest map. Where several maps saw a place cells are dense, and
-            floors that only the sparsest one saw must not count as noise beside them.
-        rooms: of the maps, as they lie in the joined one.
+        laid: the maps, with the cells that their floor fills.
+        parts: the same maps as they lie in the joined one.
     """
     cells = decode_cells(joined.codes)
     base = 2 * (cells.min(axis=0) // 2)  # even: free cells are twice as long
-    grid = VoxelGrid.from_cells(cells - base, joined.origin + base * joined.edge, joined.edge)
-    provenance = np.zeros(len(grid), np.uint32)
-    provenance[grid.find_rows(cells - base)] = joined.provenance
-    free = None
-    if len(joined.free_codes):
-        free_cells = decode_cells(joined.free_codes) - base // 2
-        free_cells = free_cells[((free_cells >= 0) & (free_cells < -(-np.array(grid.shape) // 2))).all(axis=1)]
-        x, y, z = (-(-s // 2) for s in grid.shape)
-        free = VoxelGrid.from_cells(free_cells, grid.origin, 2 * grid.edge, (x, y, z))
-        free = free.select_cells(~grid.coarsen(2).contains(free.cells))
-    noise = PRESETS["default"].noise * min(neighbours / max(_estimate_neighbours(grid), 1.0), 1.0)
-    map = extract(grid, name=name, carve=free is None, noise=noise, parts=rooms)
-    # Floors that the extraction assumes under slices are cells that no map saw.
-    rows = grid.find_rows(grid.locate(map.grid.compute_centroids()))
-    seen_by = np.where(rows >= 0, provenance[rows], 0).astype(np.uint32)
+    tables: dict[str, Array] = {"provenance": joined.provenance, "room": joined.room}
+    grid = VoxelGrid.from_cells(cells - base, joined.origin + base * joined.edge, joined.edge, properties=tables)
+    provenance, label = grid.properties["provenance"], grid.properties["room"]
+    grid = replace(grid, properties={})
+    floors = [select_laid_floor(map, lattice - base, rows, grid) for map, (lattice, rows) in laid]
+    if any(len(floor.cells) for floor in floors):
+        map = _carry_rooms(grid, label, floors, parts)
+        map = replace(map, source=name)
+    else:
+        map = extract(grid, name=name, carve=False)
+        # Floors that the extraction assumes under slices are cells that no map saw.
+        rows = grid.find_rows(grid.locate(map.grid.compute_centroids()))
+        provenance = np.where(rows >= 0, provenance[rows], 0).astype(np.uint32)
+    free = _build_free_space(joined, grid, base)
+    if free is None:
+        free = find_free_space(Scan(grid), map.navigable, JOINED_PARAMETERS.range)
     # Not before: doors that are read off the means of two maps are worse than those of the plan and of the maps (docs/adr/0014).
     middles = map.grid if not joined.points.any() else add_means(map.grid, joined.convert_means(), joined.points)
-    return replace(map, grid=middles, provenance=seen_by, free=map.free if free is None else free)
+    return replace(map, grid=middles, provenance=provenance, free=free)
 
 
-def _estimate_neighbours(grid: VoxelGrid) -> float:
-    """Median number of occupied neighbours of a cell."""
-    return float(np.median(convolve(grid, build_moore()))) if len(grid) else 0.0
+def _build_free_space(joined: _JoinedCells, grid: VoxelGrid, base: Array) -> VoxelGrid | None:
+    """What a part saw empty and none occupied; None where no part knows any.
+
+    Args:
+        base: (3,) cell of the lattice at the corner of the grid.
+    """
+    if not len(joined.free_codes):
+        return None
+    free_cells = decode_cells(joined.free_codes) - base // 2
+    free_cells = free_cells[((free_cells >= 0) & (free_cells < -(-np.array(grid.shape) // 2))).all(axis=1)]
+    x, y, z = (-(-s // 2) for s in grid.shape)
+    free = VoxelGrid.from_cells(free_cells, grid.origin, 2 * grid.edge, (x, y, z))
+    return free.select_cells(~grid.coarsen(2).contains(free.cells))
+
+
+def _carry_rooms(grid: VoxelGrid, label: Array, floors: Sequence[LaidFloor], parts: Sequence[PlacedPart]) -> TopometricMap:
+    """The joined map with the rooms of its parts, and those that were cut anew; doors only of these.
+
+    Args:
+        label: (n,) room of a part of each cell, numbered through all parts, -1 none.
+    """
+    tables, p = [part.table for part in parts], JOINED_PARAMETERS
+    found = join_rooms(grid, label, floors, tables, [part.rooms for part in parts])
+    map = build_topometric_map(grid, found.floor, p.standing_height, found.carried)
+    number = _number_anew(found.floor.room, map.navigable_room)
+    member = np.where(found.member >= 0, number[found.member], -1)
+    map, known = add_carried_odds(map, tables, member, found.share)
+    map = add_room_probabilities(map, raised=is_raised(grid), asked=~known)
+    map = select_distinct_doors(add_wall_doors(map, found.floor.classified_storeys, None))
+    assert map.navigable_area is not None
+    area = np.append(_number_anew(found.floor.area, map.navigable_area), -1)[found.area_member]
+    narrows = np.concatenate([part.narrows for part in parts])
+    first = np.repeat(np.cumsum([0, *(len(floor.room_of_area) for floor in floors)])[:-1], [len(part.narrows) for part in parts])
+    narrows["rooms"] = area[narrows["rooms"] + first[:, None]]
+    map = add_part_narrows(map, narrows)
+    parameters = {**asdict(p), "voxel_size": grid.edge, "preset": "default"}
+    return replace(map, parameters=parameters, warnings=tuple(list_warnings(map)))
+
+
+def _number_anew(old: Array, new: Array) -> Array:
+    """(n + 1,) new number of each old one, -1 where there is none."""
+    out = np.full(int(old.max(initial=-1)) + 2, -1)
+    out[old] = new
+    out[-1] = -1
+    return out
 
 
 def match_common_rooms(

@@ -13,7 +13,7 @@ import numpy as np
 from topomerge.extraction.cleaning import compute_cell_means
 from topomerge.kernels import registration as kernel
 from topomerge.kernels import run_in_slices, voxels
-from topomerge.kernels.voxels import build, find_filled_cells
+from topomerge.kernels.voxels import build, find_filled_cells, find_unique_rows
 from topomerge.types import Array, Placement, Sim3, VoxelGrid
 from topomerge.types.placement import BETWEEN_STOREYS, Deformation
 
@@ -48,7 +48,7 @@ def resample_cells(grid: VoxelGrid, placement: Placement | Sim3, origin: Array, 
         for n in range(0, len(grid), RESAMPLED_AT_ONCE)
     ]
     cells, rows = (np.concatenate(p) for p in zip(*parts, strict=True))
-    _, first = np.unique(encode_cells(cells), return_index=True)
+    first = find_unique_rows(encode_cells(cells))
     return cells[first], rows[first]
 
 
@@ -126,6 +126,13 @@ def transform_means(
 def encode_cells(cells: Array) -> Array:
     """Return (n,) uint64, one code for each cell within a million of the origin."""
     return voxels.encode((cells + CODE_OFFSET).astype(np.int32))
+
+
+def unite_codes(*codes: Array) -> Array:
+    """Return all codes, ascending, each once."""
+    every = np.concatenate(codes)
+    united: Array = every[find_unique_rows(every)]
+    return united
 
 
 def decode_cells(codes: Array) -> Array:

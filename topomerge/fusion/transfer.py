@@ -14,7 +14,7 @@ from topomerge.extraction.elevations.windows import iter_same_windows, select_wi
 from topomerge.extraction.landmarks import assign_landmarks
 from topomerge.extraction.plans.part_rooms import PartRooms
 from topomerge.landmarks.fuse import fuse_landmarks
-from topomerge.types import EDGE_DTYPE, WINDOW_DTYPE, Array, Landmarks, Placement, TopometricMap, transform_landmarks
+from topomerge.types import EDGE_DTYPE, ROOM_ODDS, WINDOW_DTYPE, Array, Landmarks, Placement, TopometricMap, transform_landmarks
 from topomerge.types.grid import wrap_to_turn
 
 DOOR_SIDE = 1.0  # m around a door in which floor says which rooms it joins
@@ -22,27 +22,71 @@ LEAST_FLOOR = 5  # cells of it, from which a map saw that side of a door
 ONE_DOOR = 1.2  # m: doors of two maps that are this close are one
 SEEN_BY_A_PART = ("centre", "lower", "upper", "direction", "width", "height", "kind", "open", "half")  # of a door
 LANDMARK_PARAMETER = "landmarks"  # of a joined map: what became of those of its maps (`LandmarkSummary`)
+NEARLY_WHOLE = 0.8  # of a joined room's floor: a part that saw as much knows what it is
 LEAST_COVER = 0.3  # of a joined room's floor, from which on a part knows who was in it
 
 
 class PlacedPart(NamedTuple):
-    """What of a part is needed once it is joined: its rooms, and its doors and openings as they lie in the joined map, EDGE_DTYPE
-    with the part's rooms."""
+    """What of a part is needed once it is joined: its rooms, ROOM_DTYPE of them, and its doors and openings as they lie in the
+    joined map, EDGE_DTYPE with the part's rooms; likewise its narrowings, with the part's areas."""
 
     rooms: PartRooms
+    table: Array
     doors: Array
+    narrows: Array
 
 
 def transform_part(part: TopometricMap, placement: Placement) -> PlacedPart:
     """Return a part as it lies in the joined map."""
-    doors = part.edges[np.isin(part.edges["kind"], LEVEL_KINDS)].copy()
-    for name in ("centre", "lower", "upper"):
-        doors[name] = placement.transform_points(doors[name])
-    doors["direction"] = (doors["direction"] + placement.pose.yaw) % np.pi
-    for name in ("width", "height"):
-        doors[name] *= placement.pose.scale
+    doors = part.edges[np.isin(part.edges["kind"], LEVEL_KINDS)]
     area = (placement.pose.scale * part.navigable.edge) ** 2
-    return PlacedPart(PartRooms(*transform_floor(part, placement), part.rooms["entered"], area), doors)
+    rooms = PartRooms(*transform_floor(part, placement), part.rooms["entered"], area)
+    return PlacedPart(rooms, part.rooms, _transform_edges(doors, placement), _transform_edges(part.narrows, placement))
+
+
+def _transform_edges(edges: Array, placement: Placement) -> Array:
+    """EDGE_DTYPE as they lie in the joined map."""
+    moved = edges.copy()
+    for name in ("centre", "lower", "upper") if len(edges) else ():
+        moved[name] = placement.transform_points(moved[name])
+    moved["direction"] = (moved["direction"] + placement.pose.yaw) % np.pi
+    for name in ("width", "height"):
+        moved[name] *= placement.pose.scale
+    return moved
+
+
+def add_part_narrows(joined: TopometricMap, narrows: Array) -> TopometricMap:
+    """The joined map with those narrowings of its parts that it lacks.
+
+    Args:
+        narrows: EDGE_DTYPE as they lie in it, with its areas, -1 where there is none.
+    """
+    owner, table = np.append(joined.areas["room"], -1), joined.narrows
+    narrows = narrows.copy()
+    narrows["rooms"] = np.sort(narrows["rooms"], axis=1)
+    low, high = narrows["rooms"].T
+    within = (low >= 0) & (low != high) & (owner[low] == owner[high])
+    for narrow in narrows[within]:
+        if not _is_among_edges(table, narrow):
+            table = np.append(table, narrow)
+    return replace(joined, narrows=table[np.lexsort((*table["centre"].T[::-1], *table["rooms"].T[::-1]))])
+
+
+def add_carried_odds(joined: TopometricMap, tables: Sequence[Array], member: Array, share: Array) -> tuple[TopometricMap, Array]:
+    """The joined map with the odds of those rooms that a part saw nearly whole, and (R,) bool, which these are.
+
+    Args:
+        tables: ROOM_DTYPE of the parts.
+        member: (n,) room of the joined map of each of their rooms, -1 none.
+        share: (n,) of its floor that they cover.
+    """
+    known = np.flatnonzero((member >= 0) & (share >= NEARLY_WHOLE))
+    known = known[np.argsort(share[known], kind="stable")]  # the one that covers most is written last
+    rooms, is_known = joined.rooms.copy(), np.zeros(len(joined.rooms), bool)
+    for name in (*ROOM_ODDS, "glimpsed"):
+        rooms[name][member[known]] = np.concatenate(tables)[name][known]
+    is_known[member[known]] = True
+    return replace(joined, rooms=rooms), is_known
 
 
 def add_part_doors(joined: TopometricMap, parts: Iterable[PlacedPart]) -> TopometricMap:
@@ -186,11 +230,11 @@ def vote_rooms(part_room: Array, joined_room: Array, count: int) -> Array:
         part_room: (k,) room of each place of a part's floor.
         joined_room: (k,) room of the joined map there, -1 none.
     """
-    inside = joined_room >= 0
-    pairs, votes = np.unique(np.column_stack([part_room[inside], joined_room[inside]]), axis=0, return_counts=True)
-    best = pairs[np.lexsort((-pairs[:, 1], votes))]  # the most votes, then the first room, comes last
+    inside, most = joined_room >= 0, int(joined_room.max(initial=0)) + 1
+    pairs, votes = np.unique(part_room[inside].astype(np.int64) * most + joined_room[inside], return_counts=True)
+    best = pairs[np.lexsort((-pairs, votes))]  # the most votes, then the first room, comes last
     out = np.full(count, -1, np.int64)
-    out[best[:, 0]] = best[:, 1]
+    out[best // most] = best % most
     return out
 
 

@@ -130,7 +130,7 @@ def _render_joined_map(result: AtlasResult, n: int, map: TopometricMap, in_space
         "div", render_plan_view(map, sheet, plans), render_scroller(render_rooms_table(map, prefix)), class_="beside"
     )
     parts = join([view, *render_landmarks(map, prefix)])
-    sections = [render_section(f"{_format_names(result, result.components[n])}: rooms extracted again", parts, f"joined-{n}")]
+    sections = [render_section(f"{_format_names(result, result.components[n])}: rooms", parts, f"joined-{n}")]
     if not in_space:
         return sections, {}
     return [*sections, _render_space(map)], {"scene-data": _build_scene(map, sheet.turn)}

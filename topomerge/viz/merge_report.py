@@ -220,7 +220,7 @@ def render_merge_html(result: MergeResult) -> str:
             "div", render_plan_view(result.map, sheet, plans), render_scroller(render_rooms_table(result.map)), class_="beside"
         )
         parts = join([view, *render_landmarks(result.map)])
-        sections.append(render_section("The joined map, rooms extracted again", parts, "joined"))
+        sections.append(render_section("The joined map", parts, "joined"))
         sections.append(_render_space(result))
         data = {"scene-data": _build_scene(result, sheet.turn), "mates": _collect_partners(result)}
     if registration is not None:

@@ -9,7 +9,7 @@ import pytest
 
 from tests import scenes
 from tests.extraction.segments import find_rooms_of_segments
-from topomerge.extraction.extract import extract
+from topomerge.extraction.extract import cut_rooms, extract
 from topomerge.extraction.navigable import compute_navigable_volume
 from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.plans.part_rooms import (
@@ -25,6 +25,7 @@ from topomerge.extraction.plans.plan import build_storey_plan
 from topomerge.extraction.plans.plan_network import compute_column_probabilities
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.segment import score_by_plan
+from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.extraction.storeys import find_storeys, measure_floor_to_ceiling
 from topomerge.extraction.voxels import voxelise
 
@@ -114,12 +115,16 @@ def test_log_odds_stay_with_their_passage_while_rooms_merge(cut):
 def test_rooms_that_a_map_parts_stay_apart(grid):
     """A map parts the larger room by a line that nothing shows: not where no narrowing is. It has both rooms as one: its single
     word does not outweigh a clear door, four of one mind do."""
-    alone = extract(grid)
-    floor = alone.navigable.compute_centroids()
+    scan, navigable = compute_navigable_volume(Scan(grid), PRESETS["default"])
+    floor = extract(grid).navigable.compute_centroids()
+
+    def count_rooms(*parts: PartRooms) -> int:
+        return len(cut_rooms(scan, navigable, PRESETS["default"], Stopwatch(), parts)[0].completeness)
+
     whole = PartRooms(floor, np.zeros(len(floor), np.int64), np.ones(1), 0.01)
     line = PartRooms(floor, (floor[:, 0] > 2.0).astype(np.int64), np.ones(2), 0.01)
-    assert len(alone.rooms) == len(extract(grid, parts=[line]).rooms) == 2
-    assert len(extract(grid, parts=4 * [whole]).rooms) == 1
+    assert count_rooms() == count_rooms(line) == 2
+    assert count_rooms(whole, whole, whole, whole) == 1
 
 
 def test_regions_end_where_rooms_of_a_part_meet(cut):

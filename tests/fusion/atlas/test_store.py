@@ -95,7 +95,7 @@ def test_registrations_are_made_once(folder, monkeypatch):
         raise AssertionError("registered again")
 
     monkeypatch.setattr("topomerge.fusion.atlas.solve.find_hypotheses", fail)
-    monkeypatch.setattr("topomerge.fusion.fuse.extract", fail)
+    monkeypatch.setattr("topomerge.fusion.fuse.join_rooms", fail)
     remove(folder, ["stranger"], tm.render_atlas_html)  # the joined map of the others stays what it was
     assert listing_of(folder)["status"] == "merged" and tm.load_map(folder / "map_0.tmap").source == "west + east"
 
