@@ -40,13 +40,13 @@ def export_network(module: nn.Module, signature: Signature, sample: Sequence[Ten
         raise InputError(f"{path}: weights are no finite numbers; training diverged, take another run")
     for name in ("torch.onnx", "onnxscript", "onnx_ir"):  # Hydra shows what any library tells
         logging.getLogger(name).setLevel(logging.ERROR)
-    with warnings.catch_warnings(), replace_on_success(path) as beside:
+    with warnings.catch_warnings(), replace_on_success(path) as temporary:
         warnings.simplefilter("ignore")
         if isinstance(module, Branches):
             model = _joined([_traced(branch, signature, sample, 1) for branch in module.branches], next(iter(signature.inputs)))
         else:
             model = _traced(module, signature, sample)
-        beside.write_bytes(model.SerializeToString(deterministic=True))
+        temporary.write_bytes(model.SerializeToString(deterministic=True))
 
 
 def check_exporter() -> None:
@@ -202,7 +202,7 @@ def run_with_torch(module: nn.Module, signature: Signature) -> Run:
 
 
 def read_weights(path: str | Path) -> dict[str, Tensor]:
-    """The weights of an exported network by their names in the module: what a training goes on with."""
+    """Return the weights of an exported network by their names in the module: what a training goes on with."""
     import onnx
 
     model = onnx.load(str(path), load_external_data=False)
@@ -232,7 +232,7 @@ class Ordered(nn.Module):
         self.network = network
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, Tensor]:
-        """Rows and dustbins."""
+        """Return rows and dustbins."""
         outputs: tuple[Tensor, Tensor] = self.network(dict(zip(self.network.tensors, tensors, strict=True)))
         return outputs
 

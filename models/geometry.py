@@ -212,13 +212,13 @@ class DoorsEncoder(nn.Module):
 
     def forward(self, crops: Tensor) -> Tensor:
         count, doors = crops.shape[:2]
-        there = crops.flatten(2).amax(dim=2) > 0
+        present = crops.flatten(2).amax(dim=2) > 0
         if self.training:  # only those that are there: two of three are not
-            those = self.each(crops[there]).relu()
-            rows = those.new_zeros((count * doors, self.out.in_features // 2)).masked_scatter(there.flatten()[:, None], those)
+            those = self.each(crops[present]).relu()
+            rows = those.new_zeros((count * doors, self.out.in_features // 2)).masked_scatter(present.flatten()[:, None], those)
         else:  # one shape for all maps, as other runtimes need it
-            rows = self.each(crops.flatten(0, 1)).relu() * there.flatten()[:, None]
+            rows = self.each(crops.flatten(0, 1)).relu() * present.flatten()[:, None]
         rows = rows.unflatten(0, (count, doors))
-        mean = rows.sum(dim=1) / there.sum(dim=1, keepdim=True).clamp(min=1)
+        mean = rows.sum(dim=1) / present.sum(dim=1, keepdim=True).clamp(min=1)
         out: Tensor = self.out(torch.cat([mean, rows.amax(dim=1)], dim=1))
         return out

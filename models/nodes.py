@@ -99,8 +99,8 @@ class DoorConv(MessagePassing):
         return out
 
     def message(self, edges_i: Tensor, edges_j: Tensor, pairs: Tensor, distance: Tensor) -> Tensor:  # (M, channels)
-        bumps = (-(((distance[:, None] - self.knots) / DOOR_KNOT_STEP) ** 2)).exp()
-        out: Tensor = self.pair(torch.cat([edges_i, edges_j, pairs, bumps], dim=1))
+        rbf = (-(((distance[:, None] - self.knots) / DOOR_KNOT_STEP) ** 2)).exp()
+        out: Tensor = self.pair(torch.cat([edges_i, edges_j, pairs, rbf], dim=1))
         return out
 
 
@@ -206,12 +206,12 @@ def compute_rbf(distance: Tensor) -> Tensor:
 
 
 def build_sage(settings: Node, channels: int) -> nn.Module:
-    """A layer of means over the neighbours."""
+    """Return a layer of means over the neighbours."""
     return EdgeSAGEConv(channels, settings.width) if settings.edges else SAGEConv(channels, channels)
 
 
 def build_gat(settings: Node, channels: int) -> nn.Module:
-    """A layer of attention over the neighbours."""
+    """Return a layer of attention over the neighbours."""
     edge_dim = settings.width if settings.edges else None
     if settings.edge_values:
         return EdgeValueConv(channels, edge_dim, settings.heads)
@@ -263,10 +263,10 @@ class NodeEncoder(nn.Module):
         map: Tensor | None = None,
     ) -> Tensor:
         edges = self._encode_edges(edge_attr, pair_index, pair_attr, way)
-        ways = edge_index.flip(0)  # edges lead from a room to its neighbours; messages come back
+        directions = edge_index.flip(0)  # edges lead from a room to its neighbours; messages come back
         states = [rooms]
         for layer, norm in zip(self.layers, self.norms, strict=True):
-            inputs = (states[-1], ways) if edges is None else (states[-1], ways, edges)
+            inputs = (states[-1], directions) if edges is None else (states[-1], directions, edges)
             update = layer(*inputs, map=map) if getattr(layer, "reads_map", False) else layer(*inputs)
             update = self.drop(torch.relu(norm(update)))
             states.append(states[-1] + update if self.settings.skip else update)

@@ -162,8 +162,8 @@ class RoomMatcher(nn.Module):
         if k:
             after: list[Tensor] = self.layers[k - 1](states, [ways(m.places, m.heights) for m in maps], votes)
         else:
-            facts = [((m.facts - self.usual) / self.spread).clamp(-UNUSUAL, UNUSUAL) for m in maps]
-            after = [self.rows(m.rows) + self.facts(f) for m, f in zip(maps, facts, strict=True)]
+            properties = [((m.facts - self.usual) / self.spread).clamp(-UNUSUAL, UNUSUAL) for m in maps]
+            after = [self.rows(m.rows) + self.facts(f) for m, f in zip(maps, properties, strict=True)]
         return after, self._compute_partners(k, after, nn.functional.linear(maps[0].rows, maps[1].rows), votes)
 
     def _compute_partners(self, k: int, states: Sequence[Tensor], cosine: Tensor, votes: Tensor) -> Partners:

@@ -42,7 +42,7 @@ LARGEST_FILE = 1 << 28  # bytes
 
 
 def wrap_network(network: Embedder, about: Mapping[str, Any] | None = None) -> LearnedEmbedder:
-    """A network that torch runs as a callable map -> (R, D): one that was just trained."""
+    """Return a network that torch runs as a callable map -> (R, D): one that was just trained."""
     from topomerge.embedding.learned import LearnedEmbedder  # here: it reads maps, which a machine that only trains does not
 
     run = run_with_torch(Ordered(network), build_embedder_signature(network.network))
@@ -66,10 +66,10 @@ def save_state(network: Embedder, folder: str | Path, about: Mapping[str, Any] |
     weights = save({name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()})
     known = {"format": STATE_FORMAT, "sha256": hashlib.sha256(weights).hexdigest()}
     settings = {**known, **describe_embedder(network.network, about)}
-    with replace_on_success(folder / STATE_FILE) as beside:
-        beside.write_bytes(weights)
-    with replace_on_success(folder / STATE_SETTINGS) as beside:
-        beside.write_text(json.dumps(settings, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    with replace_on_success(folder / STATE_FILE) as temporary:
+        temporary.write_bytes(weights)
+    with replace_on_success(folder / STATE_SETTINGS) as temporary:
+        temporary.write_text(json.dumps(settings, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def read_embedder(path: str | Path | None = None) -> tuple[Embedder, dict[str, Any]]:
@@ -93,7 +93,7 @@ def read_embedder(path: str | Path | None = None) -> tuple[Embedder, dict[str, A
 
 
 def read_state(folder: Path) -> tuple[Embedder, dict[str, Any]]:
-    """The network of the state of a training, and on what it was trained.
+    """Return the network of the state of a training, and on what it was trained.
 
     Raises:
         InputError: no such files, or damaged, of another format or class.

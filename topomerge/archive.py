@@ -75,15 +75,15 @@ def replace_on_success(path: str | Path) -> Iterator[Path]:
     except OSError as error:
         reason = error.strerror or str(error)
         raise InputError(f"{path}: can't be written ({reason}); give a folder that exists and is yours") from error
-    beside = folder / path.name
+    temporary = folder / path.name
     try:
-        beside.touch()
-        yield beside
+        temporary.touch()
+        yield temporary
         umask = os.umask(0)
         os.umask(umask)
-        beside.chmod(0o666 & ~umask)
+        temporary.chmod(0o666 & ~umask)
         try:
-            beside.replace(path)
+            temporary.replace(path)
         except OSError as error:
             raise InputError(f"{path}: can't be written ({error.strerror or error})") from error
     finally:
@@ -137,7 +137,7 @@ def write(arrays: Mapping[str, Array], path: str | Path, effort: int = 6) -> Non
     Raises:
         InputError: the path can't be written.
     """
-    with replace_on_success(path) as beside, zipfile.ZipFile(beside, "w") as archive:
+    with replace_on_success(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name, array in arrays.items():
             entry = zipfile.ZipInfo(f"{name}.npy", DATE)
             entry.compress_type = zipfile.ZIP_DEFLATED

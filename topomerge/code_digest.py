@@ -150,8 +150,8 @@ def _parse_source(text: str) -> _Source:
     """Of a file's text: the same file of another copy of the package is not read a second time."""
     reading = _SourceReader()
     reading.read(ast.parse(text))
-    words = hashlib.sha256("\n".join(reading.words).encode())
-    return _Source(words.hexdigest(), frozenset(reading.names), frozenset(reading.texts))
+    description = hashlib.sha256("\n".join(reading.words).encode())
+    return _Source(description.hexdigest(), frozenset(reading.names), frozenset(reading.texts))
 
 
 class _SourceReader:
@@ -230,7 +230,7 @@ def _read_homes(package: Path) -> dict[str, str]:
 
 
 def read_commit(package: Path = HERE) -> tuple[str, bool]:
-    """The commit of the checkout that a package runs from, and do its sources differ from it? Empty outside a checkout."""
+    """Return the commit of the checkout that a package runs from, and do its sources differ from it? Empty outside a checkout."""
 
     def git(*words: str) -> str:
         try:
@@ -244,7 +244,7 @@ def read_commit(package: Path = HERE) -> tuple[str, bool]:
 
 
 def find_other_clone(script: Path) -> str:
-    """One line where a script of a clone would run another clone's code, since they share an environment; else empty.
+    """Return one line where a script of a clone would run another clone's code, since they share an environment; else empty.
 
     Args:
         script: of the top folder of a checkout.

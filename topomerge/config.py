@@ -134,7 +134,7 @@ def name_by_sweep(words: Sequence[str]) -> list[str]:
 
 
 def read_command() -> str:
-    """The command line that runs, in quotes where a shell needs them; of a sweep that of its one run."""
+    """Return the command line that runs, in quotes where a shell needs them; of a sweep that of its one run."""
     hydra = sys.modules.get("hydra.core.hydra_config")
     if hydra is not None and hydra.HydraConfig.initialized():
         return shlex.join(["python", "train.py", *hydra.HydraConfig.get().overrides.task])

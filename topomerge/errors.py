@@ -20,10 +20,10 @@ def is_memory_short(error: BaseException | None) -> bool:
     seen: set[int] = set()
     while error is not None and id(error) not in seen:
         seen.add(id(error))
-        said = str(error).lower()
+        message = str(error).lower()
         if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
             return True
-        if not isinstance(error, InputError) and any(words in said for words in MEMORY_WORDS):
+        if not isinstance(error, InputError) and any(phrase in message for phrase in MEMORY_WORDS):
             return True
         error = error.__cause__ or error.__context__
     return False

@@ -48,8 +48,8 @@ class Registry(Mapping[str, Any]):
 
         def keep(entry: T) -> T:
             before = self._registered.get(name)
-            again = before is not None and _locate(before) == _locate(entry)  # its module was imported once more
-            if name in self and not again:
+            same = before is not None and _locate(before) == _locate(entry)  # its module was imported once more
+            if name in self and not same:
                 raise InputError(f"{self.key}: {name!r} is registered twice; give yours another name")
             self._registered[name] = entry
             return entry

@@ -114,14 +114,14 @@ def build_set(
     refusals = {n: reason for n, folder in folders.items() if n not in rows and (reason := read_refusal(folder, n))}
     missing = {task[0].name: task for task in tasks if task[0].name not in rows and task[0].name not in refusals}
     log_line(f"{len(rows)} of {len(folders)} {unit} are in the cache, {len(refusals)} are known to be refused")
-    made = run_tasks(list(missing.values()), sharing, BuildProgress(len(missing), log_line, every, unit), work)
-    rows |= {row.name: read_about(folders[row.name] / f"{row.name}.npz") for row in made if not row.reason}
-    with replace_on_success(manifest) as beside:
+    results = run_tasks(list(missing.values()), sharing, BuildProgress(len(missing), log_line, every, unit), work)
+    rows |= {row.name: read_about(folders[row.name] / f"{row.name}.npz") for row in results if not row.reason}
+    with replace_on_success(manifest) as temporary:
         lines = [json.dumps(rows[name], sort_keys=True, ensure_ascii=False) for name in sorted(rows)]
-        beside.write_text("".join(line + "\n" for line in lines), encoding="utf-8")
-    refused = Counter(_generalize_reason(reason) for reason in (*refusals.values(), *(row.reason for row in made)) if reason)
-    seconds = sum(row.seconds for row in made if not row.reason)
-    return BuildReport(manifest, len(rows), sum(not row.reason for row in made), seconds, dict(refused.most_common()))
+        temporary.write_text("".join(line + "\n" for line in lines), encoding="utf-8")
+    refused = Counter(_generalize_reason(reason) for reason in (*refusals.values(), *(row.reason for row in results)) if reason)
+    seconds = sum(row.seconds for row in results if not row.reason)
+    return BuildReport(manifest, len(rows), sum(not row.reason for row in results), seconds, dict(refused.most_common()))
 
 
 def make_item(name: str, folder: str, make: Callable[[], Mapping[str, Array]], longest: float) -> BuildRow:
@@ -142,8 +142,8 @@ def make_item(name: str, folder: str, make: Callable[[], Mapping[str, Array]], l
         reason = " ".join(str(error).split())[:200]
         reason = reason if isinstance(error, InputError) else f"{type(error).__name__}: {reason}"
         if isinstance(error, InputError) and not isinstance(error, TooLongError):
-            with replace_on_success(Path(folder) / f"{name}.refused") as beside:  # the same inputs would be refused again
-                beside.write_text(reason + "\n", encoding="utf-8")
+            with replace_on_success(Path(folder) / f"{name}.refused") as temporary:  # the same inputs would be refused again
+                temporary.write_text(reason + "\n", encoding="utf-8")
     return BuildRow(name, reason, time.perf_counter() - began)
 
 
@@ -239,7 +239,7 @@ class BuildProgress:
 
 
 def run_tasks(tasks: list[Task], sharing: BuildSettings, note: Callable[[BuildRow], None], work: Work) -> list[BuildRow]:
-    """Rows of all tasks. A task that kills its worker is found by running those that were under way one by one."""
+    """Return rows of all tasks. A task that kills its worker is found by running those that were under way one by one."""
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
     rows: dict[str, BuildRow] = {}
@@ -333,7 +333,7 @@ def derive(
     name: str, step: Step, sources: Sequence[Sequence[Path]], sharing: BuildSettings, options: Mapping[str, Any] | None = None,
     log_line: LogFn = lambda text: None,
 ) -> tuple[list[Path], BuildReport]:  # fmt: skip
-    """Files of a step, made where they are missing, in the order of their sources; those that were refused are left out.
+    """Return files of a step, made where they are missing, in the order of their sources; those that were refused are left out.
 
     Args:
         name: of the manifest and of the folder.

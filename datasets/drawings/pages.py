@@ -102,7 +102,7 @@ def spoil_light(pixels: Array, rng: np.random.Generator) -> Array:
     return out.clip(0, 255).astype(np.uint8)
 
 
-def sample_drawing(shapes: Sequence[DrawingShapes], rng: np.random.Generator, side: int = 256, spoilt: bool = True) -> Drawing:
+def sample_drawing(shapes: Sequence[DrawingShapes], rng: np.random.Generator, side: int = 256, corrupted: bool = True) -> Drawing:
     """Draw a window of one of the plans in a hand at random: what the network of drawings learns from."""
     one = shapes[int(rng.integers(len(shapes)))]
     one = mirror_shapes(one) if rng.random() < 0.5 else one
@@ -115,4 +115,4 @@ def sample_drawing(shapes: Sequence[DrawingShapes], rng: np.random.Generator, si
     centre = rng.uniform(low - 1.0, high + 1.0) if rng.random() < 0.6 else (low + high) / 2
     corner = centre - window / 2
     drawing = draw_plan(one, choose_hand(rng), rng, (side, side), scale, corner)
-    return spoil_page(drawing, rng) if spoilt else drawing
+    return spoil_page(drawing, rng) if corrupted else drawing

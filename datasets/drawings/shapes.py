@@ -138,8 +138,8 @@ def build_drawing_shapes(recipe: DrawingRecipe, cache: str | Path, log_line: Log
             raise InputError(f"data.split={recipe.split}: no plan to draw; give data.folder or more data.procedural")
         path.parent.mkdir(parents=True, exist_ok=True)
         listing = json.dumps([_convert_to_listing(one) for one in shapes]).encode()
-        with replace_on_success(path) as beside:
-            beside.write_bytes(gzip.compress(listing, mtime=0))
+        with replace_on_success(path) as temporary:
+            temporary.write_bytes(gzip.compress(listing, mtime=0))
     with gzip.open(path, "rt", encoding="utf-8") as stream:
         return [_parse_shapes(entry) for entry in json.load(stream)]
 

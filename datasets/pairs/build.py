@@ -53,8 +53,8 @@ def build(settings: Build, log_line: Callable[[str], None] = lambda text: None, 
     order = sorted(items.values(), key=lambda item: -item.rooms)  # the longest first: all workers end at about the same time
     tasks = [(item, list(select_plans(item, plans)), str(folder)) for item in order]
     report = build_set(folder.parent / f"{settings.data.name}.jsonl", tasks, make_file, settings, log_line, every)
-    with replace_on_success(folder.parent / f"{settings.data.name}.recipe.json") as beside:
-        beside.write_text(json.dumps(convert_to_plain(asdict(settings.data)), indent=1) + "\n", encoding="utf-8")
+    with replace_on_success(folder.parent / f"{settings.data.name}.recipe.json") as temporary:
+        temporary.write_text(json.dumps(convert_to_plain(asdict(settings.data)), indent=1) + "\n", encoding="utf-8")
     return report
 
 

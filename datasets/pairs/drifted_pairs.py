@@ -186,12 +186,12 @@ def iter_drifted_pairs(
     items, plans = draw_drifted_items(split, folder, pairs)
     cache.mkdir(parents=True, exist_ok=True)
     for item in items:
-        made = DriftedPairMaker(item, list(select_plans(item, plans)))
+        maker = DriftedPairMaker(item, list(select_plans(item, plans)))
         for factor in DRIFT_FACTORS if is_drifting(item.sensors) else (0.0,):
             name = DriftedItem(item, factor).name
             path = cache / f"{name}.npz"
             if not path.exists() and not read_refusal(cache, name):
-                row = make_item(name, str(cache), partial(made.build_arrays, factor), LONGEST_BENT_PAIR)
+                row = make_item(name, str(cache), partial(maker.build_arrays, factor), LONGEST_BENT_PAIR)
                 log_line(f"{'-'.join(item.sensors)} drift {factor:g}: {row.reason or 'made'} in {row.seconds:.0f} s")
             if path.exists():
                 yield load_drifted_pair(path)

@@ -74,8 +74,8 @@ def build_edited_truth(path: str | Path, output: str | Path) -> EditedTruth:
     try:
         out.mkdir(parents=True, exist_ok=True)
         for file, done in edited.items():
-            with replace_on_success(out / f"{names[file]}.tmap") as beside:
-                save_map(done.map, beside)
+            with replace_on_success(out / f"{names[file]}.tmap") as temporary:
+                save_map(done.map, temporary)
             save_map_truth(done.map, out / f"{names[file]}{TRUTH_SUFFIX}")
         pairs, captures = _collect_pairs(decisions, edited, names, out)
         if any(pair.pose is not None for pair in pairs):
@@ -116,8 +116,8 @@ def _format_table(edited: Mapping[Path, EditedMap], names: Mapping[Path, str]) -
 
 
 def _format_counts(name: str, rooms: int, ops: Counter[str]) -> tuple[str, str, str, str, str]:
-    words = ", ".join(f"{count} {op}" for op, count in sorted(ops.items(), key=lambda one: (-one[1], one[0])))
-    return name, str(rooms), str(ops.total()), f"{ops.total() / max(rooms, 1):.2f}", words
+    text = ", ".join(f"{count} {op}" for op, count in sorted(ops.items(), key=lambda one: (-one[1], one[0])))
+    return name, str(rooms), str(ops.total()), f"{ops.total() / max(rooms, 1):.2f}", text
 
 
 def _collect_pairs(
@@ -169,7 +169,7 @@ def save_map_truth(map: TopometricMap, path: Path) -> None:
     listed = [{"name": r.name, "polygon": np.round(r.polygon, 4).tolist(), "floor": r.floor, "ceiling": r.ceiling} for r in rooms]
     arrays = {"points": (points - shift).astype(np.float32), "shift": shift, "source": np.array(map.source)}
     arrays |= {f"truth.{name}": np.asarray(value) for name, value in vars(truth).items()}
-    with replace_on_success(path) as beside, open(beside, "wb") as file:
+    with replace_on_success(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, allow_pickle=False, rooms=np.array(json.dumps(listed)), **arrays)
 
 

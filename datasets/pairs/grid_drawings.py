@@ -89,11 +89,11 @@ def build_drawings(
         raise InputError(f"data.drawings must be at most the pairs of each of data.sets, not {recipe.drawings}")
     items, plans = draw_grid_items(recipe)
     folder = Path(sharing.cache).resolve() / "grids"
-    made = [item for item in items if (folder / f"{item.name}.npz").exists()]
+    built = [item for item in items if (folder / f"{item.name}.npz").exists()]
     tasks = []
-    for k, item in enumerate(made):
+    for k, item in enumerate(built):
         if item.set < len(recipe.drawings) and item.number < recipe.drawings[item.set]:
-            before = tuple(made[max(k - LOOKED_BACK, 0) : k][::-1])
+            before = tuple(built[max(k - LOOKED_BACK, 0) : k][::-1])
             given = [list(select_plans(one.item, plans)) for one in (item, *before)]
             for side in "ab":
                 tasks += [(DrawingItem(item, before, side, own), given, str(folder)) for own in (True, False)]

@@ -293,7 +293,7 @@ def _sample_room(building: Building, rng: np.random.Generator) -> int:
 
 
 def estimate_overlay_pose(a: Building, b: Building, rooms: Array, yaw: float) -> Sim3:
-    """The pose b -> a of a turn at which the floors of these rooms lie on each other the most."""
+    """Return the pose b -> a of a turn at which the floors of these rooms lie on each other the most."""
     turn = Sim3(yaw)
     floors = []
     for building, pose in ((a, Sim3()), (b, turn)):

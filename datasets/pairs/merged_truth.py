@@ -157,11 +157,11 @@ def select_consistent(tried: Sequence[TriedPair]) -> list[TriedPair]:
     Pairs are taken one by one, those first that most triangles confirm, then the more probable ones. A pair within what hangs
     together already must say what the pairs before say.
     """
-    believed = [one for one in tried if not one.refused]
+    accepted = [one for one in tried if not one.refused]
     reasons: dict[tuple[str, str], str] = {}
     frame: dict[str, str] = {}
     pose: dict[str, Sim3] = {}
-    for one in sorted(believed, key=lambda one: (-_count_triangles(one, believed), -one.probability, one.a, one.b)):
+    for one in sorted(accepted, key=lambda one: (-_count_triangles(one, accepted), -one.probability, one.a, one.b)):
         for name in (one.a, one.b):
             frame.setdefault(name, name)
             pose.setdefault(name, Sim3())
@@ -173,7 +173,7 @@ def select_consistent(tried: Sequence[TriedPair]) -> list[TriedPair]:
         shift, old = moved @ pose[one.b].inverse(), frame[one.b]
         for name in [name for name, of in frame.items() if of == old]:
             frame[name], pose[name] = frame[one.a], shift @ pose[name]
-    kept = [one for one in believed if (one.a, one.b) not in reasons]
+    kept = [one for one in accepted if (one.a, one.b) not in reasons]
     while loose := [one for one in kept if _is_unconfirmed(one, kept)]:
         weakest = min(loose, key=lambda one: (one.probability, one.a, one.b))
         reasons[weakest.a, weakest.b] = "no cycle of other pairs confirms it"
@@ -181,11 +181,11 @@ def select_consistent(tried: Sequence[TriedPair]) -> list[TriedPair]:
     return [replace(one, refused=one.refused or reasons.get((one.a, one.b), "")) for one in tried]
 
 
-def _count_triangles(one: TriedPair, believed: Sequence[TriedPair]) -> int:
+def _count_triangles(one: TriedPair, accepted: Sequence[TriedPair]) -> int:
     """How many triangles of believed pairs close over a pair, less those that do not."""
     assert one.pose is not None
     beside = [
-        {other.b if other.a == end else other.a: other for other in believed if end in (other.a, other.b)}
+        {other.b if other.a == end else other.a: other for other in accepted if end in (other.a, other.b)}
         for end in (one.a, one.b)
     ]
     third = beside[0].keys() & beside[1].keys()
@@ -241,8 +241,8 @@ def write_pairs_file(listing: PairsFile, maps: Mapping[str, TopometricMap], take
     values = {"captures": captures, "pairs": pairs, "negatives": 0.0, "voxel_size": listing.voxel_size}
     try:
         above.mkdir(parents=True, exist_ok=True)
-        with replace_on_success(file) as beside:
-            beside.write_text(yaml.safe_dump(values, sort_keys=False, allow_unicode=True), encoding="utf-8")
+        with replace_on_success(file) as temporary:
+            temporary.write_text(yaml.safe_dump(values, sort_keys=False, allow_unicode=True), encoding="utf-8")
     except OSError as error:
         raise InputError(f"{file}: can't be written ({error.strerror or error}); give another folder") from error
 
@@ -250,7 +250,7 @@ def write_pairs_file(listing: PairsFile, maps: Mapping[str, TopometricMap], take
 def _format_table(tried: Sequence[TriedPair]) -> list[str]:
     rows = [("pair", "probability", "rooms", "")]
     for one in tried:
-        chance = "over 0.99" if one.probability > LEAST_BELIEVED else f"{one.probability:.2f}"
-        rows.append((f"{one.a} {one.b}", chance, str(one.rooms or "-"), f"refused: {one.refused}" if one.refused else "taken"))
+        formatted = "over 0.99" if one.probability > LEAST_BELIEVED else f"{one.probability:.2f}"
+        rows.append((f"{one.a} {one.b}", formatted, str(one.rooms or "-"), f"refused: {one.refused}" if one.refused else "taken"))
     widths = [max(len(row[k]) for row in rows) for k in range(3)]
     return ["  ".join([*(text.ljust(w) for text, w in zip(row, widths, strict=False)), row[3]]).rstrip() for row in rows]

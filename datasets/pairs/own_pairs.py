@@ -191,15 +191,15 @@ def extract_captures(
 
 def hash_capture(capture: Capture) -> str:
     """Hash the bytes of a capture and of the files that it names: of a folder or an octree all, else those beside it."""
-    path, beside = capture.path, capture.path.parent
+    path, companion = capture.path, capture.path.parent
     if path.is_dir() or path.name in OCTREES:
-        top = path if path.is_dir() else beside
+        top = path if path.is_dir() else companion
         files = sorted(p for p in top.rglob("*") if p.is_file())
     else:
-        top, files = beside, [path]
+        top, files = companion, [path]
         if path.suffix.lower() in NAMING:
             text = path.read_text(encoding="utf-8", errors="replace")
-            files += sorted(p for p in beside.rglob("*") if p != path and p.name in text and p.is_file())
+            files += sorted(p for p in companion.rglob("*") if p != path and p.name in text and p.is_file())
     if capture.read.get("poses"):
         files.append(Path(capture.read["poses"]))
     digest = hashlib.sha256(path.name.encode())
@@ -298,8 +298,8 @@ def _captures_held_out(listing: PairsFile, pairs: Sequence[PairTruth]) -> dict[s
         found = {max((drawn[pair.a], drawn[pair.b]), key=PARTS.index) for pair in pairs}
         if found >= set(drawn.values()) | {"train"}:
             return {name: drawn.get(name, "train") for name in listing.captures}
-    said = f"of its {len(names)} captures, all of one building, none can be held out"
-    raise InputError(f"{listing.path}: {said}; add captures of it, or of another building")
+    text = f"of its {len(names)} captures, all of one building, none can be held out"
+    raise InputError(f"{listing.path}: {text}; add captures of it, or of another building")
 
 
 def _negatives(
@@ -424,15 +424,15 @@ def check_folder(
     wrong = len(faults)
     for part, pair in ((part, pair) for part, of in parts.items() for pair in of):
         counts = [str(len(maps[name].rooms)) if name in maps else "-" for name in (pair.a, pair.b)]
-        common, said = "-", "a capture has no map"
+        common, notes = "-", "a capture has no map"
         if pair.a in maps and pair.b in maps:
             try:
                 overlap = find_overlap(pair, (maps[pair.a], maps[pair.b]))
                 common = f"{overlap.common:.1f}"
-                said = " ".join(f"{i}-{j}" for i, j in overlap.matches.tolist()) or ("different" if pair.different else "none")
+                notes = " ".join(f"{i}-{j}" for i, j in overlap.matches.tolist()) or ("different" if pair.different else "none")
             except InputError as error:
-                wrong, said = wrong + pair.listed, f"WRONG: {error}" if pair.listed else "left out: no floor in common"
-        rows.append((part, f"{pair.a} {pair.b}", " ".join(counts), common, said))
+                wrong, notes = wrong + pair.listed, f"WRONG: {error}" if pair.listed else "left out: no floor in common"
+        rows.append((part, f"{pair.a} {pair.b}", " ".join(counts), common, notes))
     widths = [max(len(row[k]) for row in rows) for k in range(4)]
     lines = ["  ".join([*(text.ljust(w) for text, w in zip(row, widths, strict=False)), row[-1]]) for row in rows]
     lines += [f"WRONG: {name}: {reason}" for name, reason in faults.items()]

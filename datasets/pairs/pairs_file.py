@@ -139,8 +139,10 @@ def read_pairs_file(path: str | Path, data: str = OWN_DATA, paired: bool = True)
     rows = _list(given.get("pairs"), f"{where}: pairs")
     pairs = tuple(_pair(row, f"{where}: pairs[{k}]", captures) for k, row in enumerate(rows))
     twice = [frozenset((p.a, p.b)) for p in pairs]
-    if again := next((k for k, names in enumerate(twice) if names in twice[:k]), None):
-        raise InputError(f"{where}: pairs[{again}]: {pairs[again].a} and {pairs[again].b} are listed before; keep one of the two")
+    if repeated := next((k for k, names in enumerate(twice) if names in twice[:k]), None):
+        raise InputError(
+            f"{where}: pairs[{repeated}]: {pairs[repeated].a} and {pairs[repeated].b} are listed before; keep one of the two"
+        )
     pairs += tuple(_pairs_of_frames(captures, set(twice)))
     if paired and not any(not pair.different for pair in pairs):
         raise InputError(f"{where}: no two captures share a place; list pairs, or name the frame that captures have in common")
@@ -228,15 +230,15 @@ def _pair(row: Any, where: str, captures: Mapping[str, Capture]) -> PairTruth:
     given = [key for key in PAIR_KEYS[2:] if row.get(key) not in (None, False)]
     framed = captures[a].frame != "" and captures[a].frame == captures[b].frame
     if len(given) > 1 or (not given and not framed):
-        said = f"has {' and '.join(given)}" if given else "says nothing of how they lie to each other"
-        raise InputError(f"{where}: {said}; give one of {', '.join(PAIR_KEYS[2:])}, or both captures the same frame")
+        text = f"has {' and '.join(given)}" if given else "says nothing of how they lie to each other"
+        raise InputError(f"{where}: {text}; give one of {', '.join(PAIR_KEYS[2:])}, or both captures the same frame")
     if given and given[0] == "different":
         if row["different"] is not True:
             raise InputError(f"{where}.different: must be true, not {_shown(row['different'])}; else leave it out")
         return PairTruth(a, b, different=True)
     if captures[a].building != captures[b].building:
-        said = f"{a} is of building {captures[a].building!r}, {b} of {captures[b].building!r}"
-        raise InputError(f"{where}: {said}; captures that share a place need the same building")
+        text = f"{a} is of building {captures[a].building!r}, {b} of {captures[b].building!r}"
+        raise InputError(f"{where}: {text}; captures that share a place need the same building")
     if given == ["rooms"]:
         return PairTruth(a, b, rooms=_rooms(row["rooms"], f"{where}.rooms"))
     return PairTruth(a, b, read_transform(row["transform"], f"{where}.transform") if given else np.eye(4))

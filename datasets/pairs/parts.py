@@ -74,7 +74,7 @@ def sample_two_parts(
 
 
 def compute_dice(a: Iterable[int], b: Iterable[int]) -> float:
-    """Rooms in common, of the mean number of rooms (Dice)."""
+    """Return rooms in common, of the mean number of rooms (Dice)."""
     a, b = set(a), set(b)
     return 2 * len(a & b) / max(len(a) + len(b), 1)
 

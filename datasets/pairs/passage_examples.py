@@ -64,7 +64,7 @@ class PassageExamples:
 
 
 def build_passages(recipe: PlanRecipe, sharing: BuildSettings, log_line: LogFn = lambda text: None) -> list[Path]:
-    """The files of a set, made where they are missing, in the order of the seeds."""
+    """Return the files of a set, made where they are missing, in the order of the seeds."""
     return build_scans(recipe, "passages", partial(_draw, flat=recipe.flat), make_passage_file, sharing, log_line)[0]
 
 
@@ -74,7 +74,7 @@ def make_passage_file(item: PlanItem, plan: Plan | None, folder: str) -> BuildRo
 
 
 def load_passages(path: Path) -> PassageExamples:
-    """The passages of a file.
+    """Return the passages of a file.
 
     Raises:
         InputError: it is damaged.
@@ -85,19 +85,19 @@ def load_passages(path: Path) -> PassageExamples:
 
 
 def make_passages(item: PlanItem, plan: Plan | None) -> PassageExamples:
-    """The passages of one scan."""
-    made, p, watch = simulate_item_scan(item, plan), PRESETS["default"], Stopwatch()
+    """Return the passages of one scan."""
+    simulated, p, watch = simulate_item_scan(item, plan), PRESETS["default"], Stopwatch()
     assert isinstance(p, DefaultParameters)
-    scan, navigable = read_navigable(transform_cloud(made.cloud, made.frame), MAP_CELL, p, watch)
+    scan, navigable = read_navigable(transform_cloud(simulated.cloud, simulated.frame), MAP_CELL, p, watch)
     found = gather_evidence(scan, navigable, p, watch)
-    visited = set(made.visited.tolist())
+    visited = set(simulated.visited.tolist())
     rows: list[tuple[Array, float, float, bool]] = []
     for storey in found.storeys:
         columns = np.stack(np.meshgrid(*(np.arange(n) for n in storey.segment.shape), indexing="ij"), axis=-1)
         flat = storey.plan.origin + (columns + 0.5) * storey.plan.edge
         places = np.concatenate([flat, storey.plan.floor[..., None]], axis=-1)
         rows += collect_storey_passages(
-            storey, compute_plan_truth(made.building, storey.plan, places, made.frame, made.shift)[0], visited
+            storey, compute_plan_truth(simulated.building, storey.plan, places, simulated.frame, simulated.shift)[0], visited
         )
     count, kind = len(rows), "walls" if found.walls is not None else ""
     features, odds, shown, parted = zip(*rows, strict=True) if rows else ((), (), (), ())

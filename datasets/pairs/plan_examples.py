@@ -319,16 +319,16 @@ def load_examples(path: Path) -> list[PlanExample]:
 
 def make_examples(item: PlanItem, plan: Plan | None) -> list[PlanExample]:
     """Make the storeys of one scan."""
-    made = simulate_item_scan(item, plan)
-    storeys = build_storey_plans(transform_cloud(made.cloud, made.frame), VOXEL_SIZES[item.seed % len(VOXEL_SIZES)])
+    scan = simulate_item_scan(item, plan)
+    storeys = build_storey_plans(transform_cloud(scan.cloud, scan.frame), VOXEL_SIZES[item.seed % len(VOXEL_SIZES)])
     if not storeys:
         raise InputError(f"{item.seed}: no storey was seen")
     return [
         PlanExample(
             plan,
-            *compute_plan_truth(made.building, plan, places, made.frame, made.shift),
-            made.visited,
-            f"{made.sensor}/{item.source}",
+            *compute_plan_truth(scan.building, plan, places, scan.frame, scan.shift),
+            scan.visited,
+            f"{scan.sensor}/{item.source}",
         )
         for plan, places in storeys
     ]

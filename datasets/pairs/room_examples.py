@@ -155,26 +155,26 @@ def make_room_file(item: RoomItem, plan: Plan | None, folder: str) -> BuildRow:
 def build_room_rows(item: RoomItem, plan: Plan | None) -> Mapping[str, Array]:
     """Features and answers of the rooms of a scan: `x` and answers without poses; `posed.x`, `posed.p` and answers with them. `x`
     are `GRID_FEATURES` of robots' grids of buildings that stand in the open."""
-    made = simulate_open_scan(item, plan) if item.surroundings else simulate_item_scan(item, plan)
+    scan = simulate_open_scan(item, plan) if item.surroundings else simulate_item_scan(item, plan)
     features = GRID_FEATURES if item.surroundings and item.flat else ROOM_FEATURES
-    visited = np.isin(np.arange(len(made.building.rooms)), made.visited)
-    anchors, drift = made.shift or (None, None)
-    points = made.cloud.points.astype(np.float64) + made.cloud.shift
-    truth = transform_truth(build_truth(made.building, visited, points, anchors, drift), made.frame)
-    cloud, voxel = transform_cloud(made.cloud, made.frame), VOXEL_SIZES[item.seed % len(VOXEL_SIZES)]
+    visited = np.isin(np.arange(len(scan.building.rooms)), scan.visited)
+    anchors, drift = scan.shift or (None, None)
+    points = scan.cloud.points.astype(np.float64) + scan.cloud.shift
+    truth = transform_truth(build_truth(scan.building, visited, points, anchors, drift), scan.frame)
+    cloud, voxel = transform_cloud(scan.cloud, scan.frame), VOXEL_SIZES[item.seed % len(VOXEL_SIZES)]
     arrays: dict[str, Array] = {}
     for prefix, source in (("", replace(cloud, poses=None, pose_of=None)), ("posed.", cloud)):
         if prefix and (source.poses is None or item.surroundings):
             continue
         map = extract(source, voxel_size=voxel, carve=False)
-        answers = compute_room_truth(map, truth, made.building.rooms)
+        answers = compute_room_truth(map, truth, scan.building.rooms)
         rows = answers.judged
         arrays |= {f"{prefix}{name}": getattr(answers, name)[rows] for name in ANSWERS}
         arrays[f"{prefix}x"] = compute_room_features(map, features)[rows]
         if prefix:
             poses = compute_pose_features(map, read_scan(cloud, voxel).rays)
             arrays["posed.p"] = (np.full((len(rows), len(POSE_FEATURES)), np.nan) if poses is None else poses)[rows]
-    about = {"file": f"{item.name}.npz", **asdict(item), "sensor": made.sensor}
+    about = {"file": f"{item.name}.npz", **asdict(item), "sensor": scan.sensor}
     return {**arrays, "about": np.frombuffer(json.dumps(about, sort_keys=True).encode(), np.uint8)}
 
 

@@ -39,7 +39,7 @@ def simulate_maps(
     scale: bool = False,
     hard: str | None = None,
 ) -> tuple[Building, Pair | PointCloud, Sim3]:
-    """A building with a pair of maps of it, or with one cloud where one sensor is given; and the frame of the first cloud.
+    """Return a building with a pair of maps of it, or with one cloud where one sensor is given; and the frame of the first cloud.
 
     Args:
         kind, seed, storeys: of the building (`make_building`); "other-storey" takes two storeys at least, with one plan.
@@ -71,7 +71,7 @@ def simulate_maps(
 
 
 def prepare_outputs(
-    building: Building, made: Pair | PointCloud, frame: Sim3, folder: Path, signs: str | None = None
+    building: Building, simulated: Pair | PointCloud, frame: Sim3, folder: Path, signs: str | None = None
 ) -> list[Output]:
     """Return the files of a simulation, and what writes each.
 
@@ -81,12 +81,12 @@ def prepare_outputs(
     Raises:
         InputError: signs of another building, whose doors are not known.
     """
-    clouds = {"a": made} if isinstance(made, PointCloud) else {"a": made.a, "b": made.b}
+    clouds = {"a": simulated} if isinstance(simulated, PointCloud) else {"a": simulated.a, "b": simulated.b}
     files: list[Output] = [(folder / f"{name}.ply", partial(save_cloud, cloud)) for name, cloud in clouds.items()]
-    files.append((folder / "truth.json", partial(save_truth, building, made, frame)))
-    files.append((folder / "plan.png", partial(save_figure, building, made, frame)))
+    files.append((folder / "truth.json", partial(save_truth, building, simulated, frame)))
+    files.append((folder / "plan.png", partial(save_figure, building, simulated, frame)))
     if signs is not None:
-        read = simulate_signs(building, made, READERS[signs], frame)
+        read = simulate_signs(building, simulated, READERS[signs], frame)
         files += [(folder / f"{name}.landmarks.csv", partial(save_landmarks, of)) for name, of in zip(clouds, read, strict=True)]
     return files
 
@@ -109,14 +109,14 @@ def save_cloud(cloud: PointCloud, path: Path) -> None:
         file.write(rows.tobytes())
 
 
-def save_truth(building: Building, made: Pair | PointCloud, frame: Sim3, path: Path) -> None:
+def save_truth(building: Building, simulated: Pair | PointCloud, frame: Sim3, path: Path) -> None:
     """Write `truth` as JSON."""
     from topomerge.io.listing import format_json
 
-    path.write_text(format_json(describe_truth(building, made, frame)), encoding="utf-8")
+    path.write_text(format_json(describe_truth(building, simulated, frame)), encoding="utf-8")
 
 
-def describe_truth(building: Building, made: Pair | PointCloud, frame: Sim3) -> dict[str, Any]:
+def describe_truth(building: Building, simulated: Pair | PointCloud, frame: Sim3) -> dict[str, Any]:
     """Describe the truth of the files, as plain values; everything of a map is in the frame of its cloud.
 
     `T_ab` (4 x 4, row-major) maps points of b into the frame of a; null for maps of two buildings.
@@ -124,9 +124,9 @@ def describe_truth(building: Building, made: Pair | PointCloud, frame: Sim3) -> 
     from topomerge.archive import convert_to_plain
 
     listing: dict[str, Any] = {"format": TRUTH_FORMAT, "building": building.name, "seed": building.seed}
-    if isinstance(made, PointCloud):
-        return convert_to_plain({**listing, "maps": [_describe_map(building, made, frame, "a.ply", ())]})
-    pair, transform = made, made.truth
+    if isinstance(simulated, PointCloud):
+        return convert_to_plain({**listing, "maps": [_describe_map(building, simulated, frame, "a.ply", ())]})
+    pair, transform = simulated, simulated.truth
     assert pair.frames is not None
     listing |= {
         "kind": pair.kind,
@@ -177,25 +177,28 @@ SLICE = (0.3, 2.0)  # m above the floor: walls and furniture
 WIDEST = 1600  # pixels
 
 
-def save_figure(building: Building, made: Pair | PointCloud, frame: Sim3, path: Path, dpi: int = 100) -> None:
+def save_figure(building: Building, simulated: Pair | PointCloud, frame: Sim3, path: Path, dpi: int = 100) -> None:
     """Write `picture` as PNG; the same maps give the same file."""
-    plot_maps(building, made, frame).savefig(path, format="png", dpi=dpi, metadata={"Software": None})
+    plot_maps(building, simulated, frame).savefig(path, format="png", dpi=dpi, metadata={"Software": None})
 
 
-def plot_maps(building: Building, made: Pair | PointCloud, frame: Sim3) -> Figure:
+def plot_maps(building: Building, simulated: Pair | PointCloud, frame: Sim3) -> Figure:
     """Draw each storey that a map visits in the frame of the building; maps of two buildings stand side by side."""
-    if isinstance(made, PointCloud):
+    if isinstance(simulated, PointCloud):
         every = tuple(i for i, r in enumerate(building.rooms) if r.kind != "lift")
-        panels = _list_panels(building.rooms, [(made, frame, every, 0)])
-        title = f"{made.source}: {len(building.rooms)} rooms"
+        panels = _list_panels(building.rooms, [(simulated, frame, every, 0)])
+        title = f"{simulated.source}: {len(building.rooms)} rooms"
     else:
-        assert made.frames is not None
-        sides = [(made.a, made.frames[0], made.visited[0], 0), (made.b, made.frames[1], made.visited[1], 1)]
-        if made.kind == "overlap":
+        assert simulated.frames is not None
+        sides = [
+            (simulated.a, simulated.frames[0], simulated.visited[0], 0),
+            (simulated.b, simulated.frames[1], simulated.visited[1], 1),
+        ]
+        if simulated.kind == "overlap":
             panels = _list_panels(building.rooms, sides)
         else:
             panels = [p for side in sides for p in _list_panels(_transform_rooms(side[0], side[1]), [side])]
-        title = f"{made.name}: {100 * made.overlap:.0f} % of rooms in common"
+        title = f"{simulated.name}: {100 * simulated.overlap:.0f} % of rooms in common"
     return _draw(panels, title, len({side[3] for p in panels for side in p[2]}))
 
 

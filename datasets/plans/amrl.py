@@ -35,7 +35,7 @@ def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
 
 
 def parse_sketch(text: bytes) -> Sketch:
-    """One storey.
+    """Return one storey.
 
     Raises:
         InputError: no JSON, or not a list of segments; larger than 350 m across; walls that enclose nothing.

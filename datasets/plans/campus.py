@@ -74,7 +74,7 @@ def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
 
 
 def parse_sketch(text: bytes) -> Sketch:
-    """One storey.
+    """Return one storey.
 
     Raises:
         InputError: no XML, or with a DOCTYPE; not of this format; no scale or a hopeless one; outlines that cross themselves.

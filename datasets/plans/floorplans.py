@@ -191,8 +191,8 @@ def _list_names(file: Path) -> list[str]:
 def summarise(results: Iterable[tuple[str, Plan | Refusal] | Refusal]) -> dict[str, int]:
     """Count the refused plans by reason, the commonest first; plans among the results count as "taken"."""
     items = [item[1] if isinstance(item, tuple) else item for item in results]
-    words = [item.reason.partition(":")[0] if isinstance(item, Refusal) else "taken" for item in items]
-    return dict(Counter(words).most_common())
+    parts = [item.reason.partition(":")[0] if isinstance(item, Refusal) else "taken" for item in items]
+    return dict(Counter(parts).most_common())
 
 
 def _find_reader(path: Path) -> str:

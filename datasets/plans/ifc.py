@@ -106,7 +106,7 @@ class ElementSolids:
 
 
 def build_sketch(rooms: list[tuple[Any, Array]], holes: list[tuple[str, Array, Array]], floor: float, above: float) -> Sketch:
-    """One storey from its spaces and the model's holes."""
+    """Return one storey from its spaces and the model's holes."""
     height = float(np.clip(above - floor, *HEIGHTS))
     tops = [float(t[..., 2].max() - t[..., 2].min()) for _, t in rooms]
     result = Sketch(height=height, ceiling=float(np.clip(np.median(tops), 2.0, height - 0.2)))

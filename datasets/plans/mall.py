@@ -47,7 +47,7 @@ def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
 
 
 def read_sketch(path: Path) -> Sketch:
-    """One storey; its origin is the nearest tenth of a degree, so that the storeys of a mall lie over each other.
+    """Return one storey; its origin is the nearest tenth of a degree, so that the storeys of a mall lie over each other.
 
     Raises:
         InputError: no JSON, not of this format, `floor_info.json` missing or of another size.

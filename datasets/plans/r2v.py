@@ -81,7 +81,7 @@ def _refuse(reason: str) -> Sketch:
 
 
 def parse_sketch(text: bytes) -> Sketch:
-    """One apartment.
+    """Return one apartment.
 
     Raises:
         InputError: a line that can't be read; no walls; walls that enclose nothing; no scale.
@@ -108,16 +108,16 @@ def parse_sketch(text: bytes) -> Sketch:
 def _parse_rows(text: bytes) -> Rows:
     rows: Rows = []
     for number, line in enumerate(text.decode("utf-8", "replace").splitlines(), 1):
-        words = line.split()
-        if not words:
+        fields = line.split()
+        if not fields:
             continue
         try:
-            ends = np.array(words[:4], np.float64).reshape(2, 2) * (1, -1)  # y up
+            ends = np.array(fields[:4], np.float64).reshape(2, 2) * (1, -1)  # y up
         except ValueError:
             ends = np.full((2, 2), np.nan)
-        if len(words) < 5 or not np.isfinite(ends).all():
+        if len(fields) < 5 or not np.isfinite(ends).all():
             raise InputError(f"bad line: {number} is not 'x1 y1 x2 y2 category'")
-        rows.append((ends, words[4], words[5] if len(words) > 5 else ""))
+        rows.append((ends, fields[4], fields[5] if len(fields) > 5 else ""))
     return rows
 
 

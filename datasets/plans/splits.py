@@ -138,8 +138,8 @@ def write_lists(data: Path, folder: Path) -> None:
             lines[split] += sorted(f"{source}/{n}" for n in dealt[split] if n in taken)
     for split in SPLITS:
         head = f"# Buildings for {split}: written by python -m topomerge.datasets.plans.splits; see datasets/plans/splits.py\n"
-        with replace_on_success(folder / f"{split}.txt") as beside:
-            beside.write_text(head + "\n".join(lines[split]) + "\n", encoding="utf-8")
+        with replace_on_success(folder / f"{split}.txt") as temporary:
+            temporary.write_text(head + "\n".join(lines[split]) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -197,6 +197,6 @@ def build_framed_pair(
     frames = draw_frames(2, False, np.random.default_rng(seed))
     truth = frames[0] @ published @ frames[1].inverse()
     flat = [c.points[:, :2].astype(np.float64) + c.shift[:2] for c in (a, b)]
-    there = published.apply(np.column_stack([flat[1], np.zeros(len(flat[1]))]))[:, :2]
+    placed = published.apply(np.column_stack([flat[1], np.zeros(len(flat[1]))]))[:, :2]
     clouds = transform_cloud(a, frames[0]), transform_cloud(b, frames[1])
-    return Pair(name, *clouds, truth, (), measure_floor_overlap(flat[0], there), (sensor, sensor), source, building)
+    return Pair(name, *clouds, truth, (), measure_floor_overlap(flat[0], placed), (sensor, sensor), source, building)

@@ -93,10 +93,10 @@ def read_log(path: Path) -> tuple[Array, Array]:
     ranges: list[Array] = []
     for number, line in enumerate(text.splitlines(), 1):
         if line.startswith(b"FLASER "):
-            words = line.split()
+            fields = line.split()
             try:
-                beams = int(words[1])
-                values = np.array(words[2 : beams + 5], float)
+                beams = int(fields[1])
+                values = np.array(fields[2 : beams + 5], float)
             except (ValueError, IndexError) as error:
                 raise InputError(f"{path}: line {number} is no scan ({error}); copy it again") from error
             if (

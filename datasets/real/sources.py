@@ -89,7 +89,7 @@ def measure_residual(pair: Pair) -> WallResidual:
 
 
 def fit_walls(a: Array, b: Array, guess: Sim3, scale: bool = False) -> Sim3:
-    """The similarity near a guess that lays walls b (m, 2) on walls a (n, 2): iterated closest points (Besl & McKay 1992),
+    """Return the similarity near a guess that lays walls b (m, 2) on walls a (n, 2): iterated closest points (Besl & McKay 1992),
     trimmed at `REACHES`.
 
     Args:
@@ -177,7 +177,7 @@ def iter_pair_makers(source: str, folder: Path) -> Iterator[tuple[str, Callable[
 
 
 def collect(source: str, makers: Iterator[tuple[str, Callable[[], Pair]]]) -> Iterator[tuple[str, Pair | Refusal]]:
-    """Pairs by their makers; whatever one of them, or the source as a whole, raises is a `Refusal`."""
+    """Yield pairs by their makers; whatever one of them, or the source as a whole, raises is a `Refusal`."""
     while True:
         try:
             name, make = next(makers)
@@ -242,7 +242,7 @@ PROLONGED = {"2017": "2016"}  # session -> the one whose map it goes on from, an
 
 
 def find_captures(source: str, title: str) -> tuple[str, str]:
-    """Names of the captures, within the source, that map a and map b of a real pair come from; equal ones are one capture.
+    """Return names of the captures, within the source, that map a and map b of a real pair come from; equal ones are one capture.
 
     Halmstad: each walk with a phone, and each drawing, is a capture of its own. UTexas: the robot grid and the line map of a
     floor are two surveys, while the partial grids hold the very pixels of the whole ones. STRANDS: a session each, but for that
@@ -254,18 +254,18 @@ def find_captures(source: str, title: str) -> tuple[str, str]:
     Raises:
         InputError: another source, or a title that its module does not give.
     """
-    words = title.split("-")
-    if source == "halmstad" and len(words) == 2:
-        return words[0], words[1]
-    if source == "utexas" and len(words) == 2:
-        return f"{words[0]} grid", f"{words[0]} {'lines' if words[1] == 'lines' else 'grid'}"
-    if source == "strands" and len(words) == 3:
-        first, second = (PROLONGED.get(year, year) for year in words[1:])
-        return f"{words[0]} {first}", f"{words[0]} {second}"
-    if source == "carmen" and len(words) >= 3:
-        log = "-".join(words[:-2])
+    fields = title.split("-")
+    if source == "halmstad" and len(fields) == 2:
+        return fields[0], fields[1]
+    if source == "utexas" and len(fields) == 2:
+        return f"{fields[0]} grid", f"{fields[0]} {'lines' if fields[1] == 'lines' else 'grid'}"
+    if source == "strands" and len(fields) == 3:
+        first, second = (PROLONGED.get(year, year) for year in fields[1:])
+        return f"{fields[0]} {first}", f"{fields[0]} {second}"
+    if source == "carmen" and len(fields) >= 3:
+        log = "-".join(fields[:-2])
         return log, log
-    if source == "ifc" and len(words) >= 2:
+    if source == "ifc" and len(fields) >= 2:
         model = title.removesuffix("-scan")
         return model, model
     raise InputError(f"{source}/{title}: no such real pair; its source is one of {', '.join(REAL_SOURCES)}")

@@ -50,7 +50,7 @@ class World:
 
 
 def draw_world(rng: np.random.Generator, count: int, width: float | None = None) -> World:
-    """Rooms on both sides of a corridor: `count` of them of one width beside each other, or as many of about 4 m."""
+    """Return rooms on both sides of a corridor: `count` of them of one width beside each other, or as many of about 4 m."""
     length, depth, corridor = count * (width or 4.0), rng.uniform(3.6, 5.0), 2.0
     rooms, doors = [[0.0, depth, length, depth + corridor]], []
     for low, high, wall in ((0.0, depth, depth), (depth + corridor, depth + corridor + depth, depth + corridor)):
@@ -70,32 +70,32 @@ def draw_world(rng: np.random.Generator, count: int, width: float | None = None)
 def furnish_room(world: World, room: int, count: int, rng: np.random.Generator) -> Array:
     """(k, 5) boxes on the floor of a room, clear of each other and of its doors, most of them along walls."""
     x0, y0, x1, y1 = world.rooms[room]
-    made: list[list[float]] = []
+    things: list[list[float]] = []
     for _ in range(6 * count):
         wide, deep, tall = rng.uniform(0.5, 1.7), rng.uniform(0.4, 0.9), rng.uniform(0.4, 1.9)
         wide, deep = (wide, deep) if rng.random() < 0.5 else (deep, wide)
-        if len(made) == count or x1 - x0 < wide + 0.6 or y1 - y0 < deep + 0.6:
+        if len(things) == count or x1 - x0 < wide + 0.6 or y1 - y0 < deep + 0.6:
             continue
         x, y = rng.uniform(x0 + 0.06, x1 - wide - 0.06), rng.uniform(y0 + 0.06, y1 - deep - 0.06)
         if rng.random() < 0.6:
             sides = [(x0 + 0.05, y), (x1 - wide - 0.05, y), (x, y0 + 0.05), (x, y1 - deep - 0.05)]
             x, y = sides[int(rng.integers(4))]
-        touches = any(x < o[2] + 0.1 and x + wide > o[0] - 0.1 and y < o[3] + 0.1 and y + deep > o[1] - 0.1 for o in made)
+        touches = any(x < o[2] + 0.1 and x + wide > o[0] - 0.1 and y < o[3] + 0.1 and y + deep > o[1] - 0.1 for o in things)
         blocks = any(x - 0.5 < d[0] < x + wide + 0.5 and y - 0.5 < d[1] < y + deep + 0.5 for d in world.clear_of(room))
         if not touches and not blocks:
-            made.append([x, y, x + wide, y + deep, tall])
-    return np.array(made).reshape(-1, 5)
+            things.append([x, y, x + wide, y + deep, tall])
+    return np.array(things).reshape(-1, 5)
 
 
 def furnish_all(world: World, rng: np.random.Generator) -> World:
-    """The world with one to four things in each room beside the corridor."""
+    """Return the world with one to four things in each room beside the corridor."""
     rooms = range(1, len(world.rooms))
     things = [furnish_room(world, room, int(rng.integers(1, 5)), rng) for room in rooms]
     return World(world.rooms, world.doors, [world.things[0], *things])
 
 
 def move_things(world: World, share: float, rng: np.random.Generator) -> World:
-    """The world with a share of its things at other places of their rooms."""
+    """Return the world with a share of its things at other places of their rooms."""
     things = []
     for room, boxes in enumerate(world.things):
         stays = rng.random(len(boxes)) > share
@@ -146,7 +146,7 @@ def sample_plane(corner: Sequence3, first: Sequence3, second: Sequence3, rng: np
 
 
 def draw_pair(kind: str, seed: int) -> tuple[tuple[Array, Sim3], tuple[Array, Sim3]]:
-    """Points and frame of both maps of a pair."""
+    """Return points and frame of both maps of a pair."""
     rng = np.random.default_rng([seed, (*APART, *TOGETHER).index(kind)])
     if kind in ("storeys", "halves", *TOGETHER):
         first = furnish_all(draw_world(rng, int(rng.integers(3, 6))), rng)
@@ -164,7 +164,7 @@ def draw_pair(kind: str, seed: int) -> tuple[tuple[Array, Sim3], tuple[Array, Si
 
 
 def furnish_row(world: World, width: float, kind: str, rng: np.random.Generator) -> World:
-    """A row with the things of one room of each side in all of its rooms, moved or new ones as the kind has them."""
+    """Return a row with the things of one room of each side in all of its rooms, moved or new ones as the kind has them."""
     if kind == "row-other":
         return furnish_all(world, rng)
     things = [world.things[0]]

@@ -319,11 +319,13 @@ def _list_furniture(old: Building, new: Building, visited: Sequence[int]) -> lis
     """Things that stand on the floor of a visited room in one session, and not there in the other one."""
     tables = []
     for building in (old, new):
-        there = np.isin(np.arange(len(building.things)), building.thing_of)
+        present = np.isin(np.arange(len(building.things)), building.thing_of)
         t = building.things
         floors = np.array([r.floor for r in building.rooms])[t["room"]]
         low, high = t["centre"][:, 2] - t["size"][:, 2] / 2 - floors, t["centre"][:, 2] + t["size"][:, 2] / 2 - floors
-        shown = there & ~np.isin(t["kind"], KEPT_APART) & t["movable"] & (low < 0.5) & (high > 0.3) & np.isin(t["room"], visited)
+        shown = (
+            present & ~np.isin(t["kind"], KEPT_APART) & t["movable"] & (low < 0.5) & (high > 0.3) & np.isin(t["room"], visited)
+        )
         tables.append(t[shown])
     out = []
     for kind, own, others in (("furniture gone", tables[0], tables[1]), ("furniture new", tables[1], tables[0])):

@@ -159,12 +159,12 @@ def simulate_readings(
     strength -= settings.floor * np.abs(points.level - level)[None]
     strength += settings.shadow * _compute_shadows(track, points, level) + settings.gain * rng.normal()
     strength += settings.noise * rng.normal(size=strength.shape)
-    chance = (1 - settings.missed) * np.clip((strength - settings.sensitivity) / WEAK, 0.0, 1.0)
-    scan, heard = np.nonzero(rng.random(strength.shape) < chance)
+    probability = (1 - settings.missed) * np.clip((strength - settings.sensitivity) / WEAK, 0.0, 1.0)
+    scan, readings = np.nonzero(rng.random(strength.shape) < probability)
     names = points.addresses
     position = np.column_stack([track, np.full(len(track), height)])[scan]
-    number = np.round(strength[scan, heard])
-    return build_landmarks("radio", [names[k] for k in heard], "simulated", position, sigma=0.3, number=number, group=scan)
+    number = np.round(strength[scan, readings])
+    return build_landmarks("radio", [names[k] for k in readings], "simulated", position, sigma=0.3, number=number, group=scan)
 
 
 def _compute_shadows(track: Array, points: AccessPoints, level: int) -> Array:
@@ -209,7 +209,7 @@ def add_radio(
     levels = np.clip(np.searchsorted(building.storeys["floor"], at[:, 2], side="right") - 1, 0, None)
     parts = [map.landmarks]
     for level in np.unique(levels).tolist():
-        heard = simulate_readings(plans, points, at[levels == level, :2], level, settings, session)
-        heard.table["group"] += 100_000 * level
-        parts.append(move_landmarks(heard, frame) if frame else heard)
+        readings = simulate_readings(plans, points, at[levels == level, :2], level, settings, session)
+        readings.table["group"] += 100_000 * level
+        parts.append(move_landmarks(readings, frame) if frame else readings)
     return replace(map, landmarks=join_landmarks(parts))

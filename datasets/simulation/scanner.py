@@ -161,9 +161,9 @@ def cast(building: Building, sensor: Sensor, poses: Array, number: int, rng: np.
         packed[..., 3:] = np.matmul(spun, these[:, :3, :3].astype(np.float32).transpose(0, 2, 1))
         flat = packed.reshape(-1, 6)
         ranges, triangle, cosine, normal = _shoot(scene, flat)
-        chance = rng.random(len(triangle))
-        pane = (triangle >= 0) & glass[triangle] & (chance >= sensor.glass)
-        ghost = pane & (chance >= 1 - sensor.ghost)
+        probability = rng.random(len(triangle))
+        pane = (triangle >= 0) & glass[triangle] & (probability >= sensor.glass)
+        ghost = pane & (probability >= 1 - sensor.ghost)
         through = pane & ~ghost
         if through.any():
             clear = clear or _build_scene(building.vertices, building.triangles[near[~glass]])
@@ -322,11 +322,11 @@ def _corrupt_hits(building: Building, poses: Array, hits: RayHits, sensor: Senso
     count = len(hits.ranges)
     thing = building.thing_of[hits.triangle]
     faint = rng.random(len(building.things) + 1) < sensor.dark
-    chance = np.full(count, 1 - sensor.lost)
-    chance[faint[thing] & (thing >= 0)] *= 0.15
-    chance[hits.cosine < np.sin(np.radians(sensor.grazing))] *= 0.1
-    chance[np.isin(building.labels[hits.triangle], PLAIN)] *= sensor.plain
-    returned = rng.random(count) < chance
+    probability = np.full(count, 1 - sensor.lost)
+    probability[faint[thing] & (thing >= 0)] *= 0.15
+    probability[hits.cosine < np.sin(np.radians(sensor.grazing))] *= 0.1
+    probability[np.isin(building.labels[hits.triangle], PLAIN)] *= sensor.plain
+    returned = rng.random(count) < probability
     if sensor.lowest > 0:
         returned &= compute_hit_points(poses, hits, hits.ranges)[:, 2] - poses[hits.pose, 2, 3] + sensor.height > sensor.lowest
     sigma = sensor.noise[0] + sensor.noise[1] * hits.ranges + sensor.quadratic * hits.ranges**2

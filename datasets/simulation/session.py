@@ -20,7 +20,7 @@ SMALL_MOVE = 0.15  # m, standard deviation of a small move
 
 
 def simulate_session(building: Building, difficulty: Difficulty | None = None, rng: np.random.Generator | int = 0) -> Building:
-    """The building as another session finds it; rooms, stairs and storeys are the same.
+    """Return the building as another session finds it; rooms, stairs and storeys are the same.
 
     Args:
         difficulty: its `moved`, `gone`, `doors_moved`, `open`, `half` and `people` are used.

@@ -123,7 +123,7 @@ def place_signs(building: Building, numbering: Numbering, rng: np.random.Generat
 
 
 def number_rooms(building: Building, numbering: Numbering) -> dict[int, str]:
-    """Number the rooms of a building: along its longer side, storey by storey; toilets bear no number."""
+    """Return number the rooms of a building: along its longer side, storey by storey; toilets bear no number."""
     middles = np.array([room.polygon.mean(axis=0) for room in building.rooms]).reshape(-1, 2)
     axis = int(np.argmax(np.ptp(middles, axis=0))) if len(middles) else 0
     texts: dict[int, str] = {}

@@ -241,10 +241,10 @@ def _estimate_leaf(door: Array, own: Array | None, points: Array, floor: float) 
     v, u = apart[near] @ normal, apart[near] @ np.array([-normal[1], normal[0]])
     flat = np.abs(v) < FACE_SPAN
     inner = v[flat & (np.abs(u) < width / 2 - 0.12)]
-    beside = v[flat & (np.abs(u) > width / 2 + 0.08) & (np.abs(u) < width / 2 + 0.5)]
-    if min(len(inner), len(beside)) < LEAST_POINTS:
+    adjoining = v[flat & (np.abs(u) > width / 2 + 0.08) & (np.abs(u) < width / 2 + 0.5)]
+    if min(len(inner), len(adjoining)) < LEAST_POINTS:
         return blind
-    faces = _find_faces(beside)
+    faces = _find_faces(adjoining)
     if len(faces) < 2:  # the wall was seen from one side
         return blind
     flush = min(float((np.abs(inner - face) < FACE_REACH).mean()) for face in faces)

@@ -36,16 +36,16 @@ def describe_change(change: Change) -> str:
 def format_changes(changes: Changes) -> str:
     """Return the tables that `topomerge diff` prints, without a line break at the end."""
     counts = changes.count_kinds()
-    said = ", ".join(f"{n} {kind}" for kind, n in counts.items()) or "nothing has changed that both maps could see"
+    text = ", ".join(f"{n} {kind}" for kind, n in counts.items()) or "nothing has changed that both maps could see"
     seen = ", ".join(f"{v:.0f} m² of storey {k}" for k, v in sorted(changes.compared.items()))
-    lines = [f"{said}; both maps saw {seen}"]
+    lines = [f"{text}; both maps saw {seen}"]
     if changes.changes:
         columns = ("change", "storey", "size m", "x m", "y m", "probability", "what")
         lines += ["", *format_columns(columns, [_list_cells(c) for c in changes.changes])]
     states = [row.state for row in changes.elements]
     if states:
-        told = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
-        lines += ["", f"{len(states)} elements of the model: {told}"]
+        message = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
+        lines += ["", f"{len(states)} elements of the model: {message}"]
     return "\n".join(lines)
 
 
@@ -110,9 +110,9 @@ def save_geojson(changes: Changes, path: str | Path) -> None:
         row = convert_to_plain(_serialise_change(change))
         properties = {name: value for name, value in row.items() if name not in ("shape", "place")}
         features.append({"type": "Feature", "id": f"change {k}", "geometry": _build_geometry(change), "properties": properties})
-    with replace_on_success(path) as beside:
+    with replace_on_success(path) as temporary:
         text = format_collection({"type": "FeatureCollection", "crs": None, "topomerge": about}, features)
-        beside.write_text(text, encoding="utf-8", errors="replace")
+        temporary.write_text(text, encoding="utf-8", errors="replace")
 
 
 def _build_geometry(change: Change) -> dict[str, Any]:
@@ -150,11 +150,11 @@ def save_bcf(changes: Changes, path: str | Path) -> None:
     assert file.project is not None
     file.project.project_id = _make_guid("project", names)
     for k, change in enumerate(changes.changes):
-        words = replace_forbidden(describe_change(change))
-        guid = _make_guid("topic", str(k), names, words, str(change.place.tolist()))
-        told = "; ".join(f"{name} {value:g}" for name, value in change.evidence.items())
+        text = replace_forbidden(describe_change(change))
+        guid = _make_guid("topic", str(k), names, text, str(change.place.tolist()))
+        message = "; ".join(f"{name} {value:g}" for name, value in change.evidence.items())
         topic = model.Topic(
-            title=words, description=replace_forbidden(f"Probability {change.probability:.2f}. {told}"), creation_author=AUTHOR,
+            title=text, description=replace_forbidden(f"Probability {change.probability:.2f}. {message}"), creation_author=AUTHOR,
             creation_date=XmlDateTime.from_string(STAMP), guid=guid, topic_type=change.kind, topic_status=STATUS, index=k,
         )  # fmt: skip
         handler = TopicHandler(topic_dir=cast(Any, Path(guid)))  # of which only the name is used
@@ -164,9 +164,9 @@ def save_bcf(changes: Changes, path: str | Path) -> None:
         view.visualization_info.perspective_camera = _build_camera(model, change)
         handler.add_visinfo_handler(view)
         file.topics[guid] = handler
-    with replace_on_success(path) as beside:
-        file.save(beside)
-        _fix_dates(beside)
+    with replace_on_success(path) as temporary:
+        file.save(temporary)
+        _fix_dates(temporary)
 
 
 def _make_guid(*words: str) -> str:
@@ -213,5 +213,5 @@ def save_json(changes: Changes, path: str | Path) -> None:
     Raises:
         InputError: the path can't be written.
     """
-    with replace_on_success(path) as beside:
-        beside.write_text(format_json(serialise_changes(changes)), encoding="utf-8", errors="replace")
+    with replace_on_success(path) as temporary:
+        temporary.write_text(format_json(serialise_changes(changes)), encoding="utf-8", errors="replace")

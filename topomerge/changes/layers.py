@@ -195,10 +195,10 @@ def build_storey_layers(old: TopometricMap, new: TopometricMap, placement: Place
         index = np.stack(np.meshgrid(np.arange(size[0]), np.arange(size[1]), indexing="ij"), axis=-1).reshape(-1, 2)
         places = (low + (index + 0.5) * CHANGE_CELL) @ axes
         height = np.full(len(places), v.plan.floor_guess)
-        there = placement.invert_points(np.column_stack([places, height]))
+        placed = placement.invert_points(np.column_stack([places, height]))
         shape, observed = (int(size[0]), int(size[1])), v.plan.observed & w.plan.observed
         a = _draw_map(old, v.plan, places, shape, observed, furnished[0])
-        b = _draw_map(new, w.plan, there[:, :2], shape, observed, furnished[1])
+        b = _draw_map(new, w.plan, placed[:, :2], shape, observed, furnished[1])
         storeys = _find_storey(old, v.plan.floor_guess), _find_storey(new, w.plan.floor_guess)
         slack = estimate_slack(a, b, pose.scale)
         out.append(StoreyLayers(low, axes, float(v.plan.floor_guess), storeys, a, b, slack))

@@ -43,11 +43,11 @@ def build_script(shell: str, commands: Sequence[Command]) -> str:
         shell: one of `SHELLS`.
         commands: those that it shall know.
     """
-    words = {
+    names = {
         c.name: [*(_build_word(flags, settings, c.paths) for flags, settings in c.arguments), *COMMON_OPTIONS] for c in commands
     }
     return {"bash": _build_bash_script, "zsh": _build_zsh_script, "fish": _build_fish_script}[shell](
-        words, {c.name: c.summary for c in commands}
+        names, {c.name: c.summary for c in commands}
     )
 
 

@@ -315,9 +315,9 @@ def write_all(outputs: Sequence[tuple[str | Path, Callable[[Path], None]]]) -> N
 
     with ExitStack() as stack:
         for path, save in outputs:
-            beside = stack.enter_context(replace_on_success(path))
+            temporary = stack.enter_context(replace_on_success(path))
             try:
-                save(beside)
+                save(temporary)
             except OSError as error:
                 raise InputError(f"{path}: can't be written ({error.strerror or error}); give another place") from error
         if len(outputs) > 1:  # a kill between two renames must not leave one file of this run beside one of an earlier run

@@ -42,12 +42,12 @@ def _make_pairs(args: argparse.Namespace) -> int:
     if (Path(args.output) / "pairs.yaml").exists():
         raise InputError(f"{args.output}: holds a pairs.yaml; give another folder, or remove it")
     given = collect_given(args, "scale")
-    made = build_merged_truth(args.folder, args.output, args.cache, args.jobs, log_line=lambda text: _tell(args, text), **given)
-    print_text("\n".join(made.lines))
-    if not made.pairs:
+    built = build_merged_truth(args.folder, args.output, args.cache, args.jobs, log_line=lambda text: _tell(args, text), **given)
+    print_text("\n".join(built.lines))
+    if not built.pairs:
         raise InputError(f"{args.folder}: none of its pairs reaches {LEAST_BELIEVED} and is closed; nothing was written")
     if not args.quiet:
-        counts = f"{made.pairs} pairs of {made.captures} captures in {made.buildings} building{'s' * (made.buildings != 1)}"
+        counts = f"{built.pairs} pairs of {built.captures} captures in {built.buildings} building{'s' * (built.buildings != 1)}"
         print_line(f"{counts} -> {Path(args.output) / 'pairs.yaml'}")
     return 0
 
@@ -59,11 +59,11 @@ def _collect_edits(args: argparse.Namespace) -> int:
         raise InputError("-o: dataset from-edits needs a folder to write what is true into")
     if collect_given(args, "scale"):
         raise InputError("--scale: is for dataset from-merges; leave it out")
-    made = build_edited_truth(args.folder, args.output)
-    print_text("\n".join(made.lines))
+    built = build_edited_truth(args.folder, args.output)
+    print_text("\n".join(built.lines))
     if not args.quiet:
-        maps = f"{made.maps} corrected map{'s' * (made.maps != 1)}, {made.pairs} pair{'s' * (made.pairs != 1)}"
-        print_line(f"{maps}, {made.edits / max(made.rooms, 1):.2f} edits a room -> {args.output}")
+        maps = f"{built.maps} corrected map{'s' * (built.maps != 1)}, {built.pairs} pair{'s' * (built.pairs != 1)}"
+        print_line(f"{maps}, {built.edits / max(built.rooms, 1):.2f} edits a room -> {args.output}")
     return 0
 
 

@@ -93,9 +93,9 @@ def _find_verb(args: argparse.Namespace, path: Path) -> str:
         InputError: none or several, or one that does not fit the input or the other options.
     """
     given = [name for name in VERBS if getattr(args, name, None) not in (None, False)]
-    words = [f"--{'from' if name == 'source' else name.replace('_', '-')}" for name in given]
+    arguments = [f"--{'from' if name == 'source' else name.replace('_', '-')}" for name in given]
     if len(given) > 1:
-        raise InputError(f"{words[0]} and {words[1]}: give one of them; each edit is a line of its own")
+        raise InputError(f"{arguments[0]} and {arguments[1]}: give one of them; each edit is a line of its own")
     if not given and not args.output:
         raise InputError(f"{path}: say what to do: give --split-room, --join-rooms, --add-door or another edit, or --list")
     verb = given[0] if given else ""
@@ -105,11 +105,11 @@ def _find_verb(args: argparse.Namespace, path: Path) -> str:
             raise InputError(f"--{name.replace('_', '-')}: is for {takers}; leave it out")
     for name in ("line", "to"):
         if verb in DETAILS[name] and not hasattr(args, name):
-            raise InputError(f"{words[0]}: needs --{name}")
+            raise InputError(f"{arguments[0]}: needs --{name}")
     if path.is_dir() and (verb in MAP_VERBS or args.output):
         raise InputError(f"{path}: is the folder of a merge; give a .tmap to correct a map")
     if not path.is_dir() and verb in MERGE_VERBS:
-        raise InputError(f"{words[0]}: is for the folder of a merge, not for a .tmap")
+        raise InputError(f"{arguments[0]}: is for the folder of a merge, not for a .tmap")
     return verb
 
 
@@ -196,8 +196,8 @@ def _find_room(map: TopometricMap, number: Any, path: Path) -> list[float]:
     from topomerge.edits.draft import find_room_place
 
     if not str(number).strip().isdecimal() or int(number) >= len(map.rooms):
-        there = f"0 to {len(map.rooms) - 1}" if len(map.rooms) else "none"
-        raise InputError(f"{path} has no room {number} ({there}); see them with `topomerge info`")
+        valid = f"0 to {len(map.rooms) - 1}" if len(map.rooms) else "none"
+        raise InputError(f"{path} has no room {number} ({valid}); see them with `topomerge info`")
     place: list[float] = find_room_place(map, int(number)).round(3).tolist()
     return place
 
@@ -218,8 +218,8 @@ def _find_row(map: TopometricMap, given: Sequence[float], verb: str, args: argpa
         return _find_place(map, given, args)
     table, what = (map.windows, "window") if verb.endswith("window") else (map.edges, "door")
     if given[0] != int(given[0]) or not 0 <= given[0] < len(table):
-        there = f"0 to {len(table) - 1}" if len(table) else "none"
-        raise InputError(f"there is no {what} {given[0]:g} ({there}); see them with `topomerge info --json`")
+        valid = f"0 to {len(table) - 1}" if len(table) else "none"
+        raise InputError(f"there is no {what} {given[0]:g} ({valid}); see them with `topomerge info --json`")
     place: list[float] = table["centre"][int(given[0])].tolist()
     return place
 

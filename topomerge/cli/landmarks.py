@@ -85,8 +85,8 @@ def _check_journal(args: argparse.Namespace) -> None:
 def _check_place(args: argparse.Namespace, map: TopometricMap) -> None:
     for name, count in (("room", len(map.rooms)), ("storey", len(map.storeys))):
         if getattr(args, name, 0) >= max(count, 1) or (hasattr(args, name) and not count):
-            there = f"0 to {count - 1}" if count else "none"
-            raise InputError(f"{args.input}: has no {name} {getattr(args, name)} ({there}); see them with `topomerge info`")
+            valid = f"0 to {count - 1}" if count else "none"
+            raise InputError(f"{args.input}: has no {name} {getattr(args, name)} ({valid}); see them with `topomerge info`")
 
 
 def _build_added(args: argparse.Namespace) -> Landmarks:
@@ -138,8 +138,8 @@ def match_values(landmarks: Landmarks, kinds: Sequence[str], patterns: Sequence[
     """
     import numpy as np
 
-    words = ["".join(pattern.casefold().split()) for pattern in patterns]
-    any_of = re.compile("|".join(re.escape(word).replace(r"\*", ".*").replace(r"\?", ".") for word in words))
+    parts = ["".join(pattern.casefold().split()) for pattern in patterns]
+    any_of = re.compile("|".join(re.escape(word).replace(r"\*", ".*").replace(r"\?", ".") for word in parts))
     fits = [any_of.fullmatch("".join(value.casefold().split())) is not None for value in landmarks.values]
     out: Array = np.array([*fits, False], bool)[landmarks.table["value"]] & landmarks.is_kind(*kinds)
     return out
@@ -158,8 +158,8 @@ def run_find(args: argparse.Namespace) -> int:
     elif found:
         print_text("\n".join(_format_found(found)))
     else:
-        words = ", ".join(f"{kind} {' or '.join(patterns)}" for kind, patterns in given.items())
-        print_line(f"not found: {words} (in {len(maps)} map{'s' * (len(maps) != 1)})")
+        text = ", ".join(f"{kind} {' or '.join(patterns)}" for kind, patterns in given.items())
+        print_line(f"not found: {text} (in {len(maps)} map{'s' * (len(maps) != 1)})")
     return 0 if found else 2
 
 

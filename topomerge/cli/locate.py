@@ -117,8 +117,8 @@ def run_bridge(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         pass
     if not args.quiet:
-        said = ", ".join(f"{n} {what}" for what, n in sorted(bridge.counts.items())) or "nothing came"
-        print_line(f"{counts.read} messages: {said}; {counts.broken} unreadable -> {args.output}", sys.stderr)
+        message = ", ".join(f"{n} {what}" for what, n in sorted(bridge.counts.items())) or "nothing came"
+        print_line(f"{counts.read} messages: {message}; {counts.broken} unreadable -> {args.output}", sys.stderr)
     return 0 if bridge.merger.links else 2
 
 

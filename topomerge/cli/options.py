@@ -27,7 +27,7 @@ def parse_positive(text: str) -> float:
 
 
 def parse_share(text: str) -> float:
-    """A number from 0 to 1, as the `type` of an argument."""
+    """Return a number from 0 to 1, as the `type` of an argument."""
     return _parse_number(text, lambda value: 0 <= value <= 1, "from 0 to 1")
 
 

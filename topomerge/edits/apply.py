@@ -115,8 +115,8 @@ def load_corrected_map(path: str | Path, lines: int | None = None) -> Topometric
 def correct_map(map: TopometricMap, journal: Journal, lines: int | None = None) -> TopometricMap:
     """Apply a journal, or its first lines; warnings of the map say what does not apply."""
     done = apply_edits(map, journal.edits[:lines])
-    told = (*journal.warnings, *(f"{journal.path}: {refused}" for refused in done.refused))
-    return replace(done.map, warnings=(*done.map.warnings, *told)) if told else done.map
+    messages = (*journal.warnings, *(f"{journal.path}: {refused}" for refused in done.refused))
+    return replace(done.map, warnings=(*done.map.warnings, *messages)) if messages else done.map
 
 
 def _convert_value(value: Any) -> Any:
@@ -234,8 +234,8 @@ def _find_rooms_along(draft: Draft, line: Array, among: list[int] | None) -> tup
     for up in (0, 1, -1, 2, -2):
         rows = draft.navigable.find_rows(cells + (0, 0, up))
         room = np.where((room < 0) & (rows >= 0), draft.floor_room[np.maximum(rows, 0)], room)
-    wanted = room >= 0 if among is None else np.isin(room, among)
-    return (int(room[wanted.argmax()]), int(wanted.argmax())) if wanted.any() else (-1, len(line))
+    requested = room >= 0 if among is None else np.isin(room, among)
+    return (int(room[requested.argmax()]), int(requested.argmax())) if requested.any() else (-1, len(line))
 
 
 def _place_door(draft: Draft, row: int, place: Array) -> None:

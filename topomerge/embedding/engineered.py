@@ -170,7 +170,7 @@ LAYOUT_CLIMB = 2.0  # m at most between doors of one storey
 
 
 def compute_door_layout(edge_index: Array, middle: Array, door: Array) -> tuple[Array, Array]:
-    """Pairs of edges (columns of `edge_index`) whose doors are two, and near, in both orders; and (M, 5) float32 of each.
+    """Return pairs of edges (columns of `edge_index`) whose doors are two, and near, in both orders; and (M, 5) float32 of each.
 
     Args:
         edge_index: (2, 2E) as of `embedding.graph`: the second half are the ways back of the first.
@@ -272,9 +272,9 @@ def compute_walk_matrix(map: TopometricMap) -> Array:
     """(R, R) probability of each step of a lazy walk: to stay, or through one of the room's doors, alike often."""
     count = len(map.rooms)
     ends = map.edges["rooms"].reshape(-1, 2)
-    beside = np.eye(count)
-    beside[ends[:, 0], ends[:, 1]] = beside[ends[:, 1], ends[:, 0]] = 1.0
-    out: Array = beside / beside.sum(axis=1, keepdims=True)
+    adjacent = np.eye(count)
+    adjacent[ends[:, 0], ends[:, 1]] = adjacent[ends[:, 1], ends[:, 0]] = 1.0
+    out: Array = adjacent / adjacent.sum(axis=1, keepdims=True)
     return out
 
 

@@ -340,9 +340,9 @@ def add_proximity_edges(graph: Mapping[str, Array], reach: float) -> dict[str, A
     middle = (pos[first] + pos[second]) / 2
     index, attr, places = (np.asarray(graph[name]) for name in ("edge_index", "edge_attr", "edge_pos"))
     half = index.shape[1] // 2
-    ways = np.concatenate([index[:, :half], [first, second], index[:, half:], [second, first]], axis=1)
+    directions = np.concatenate([index[:, :half], [first, second], index[:, half:], [second, first]], axis=1)
     return {
-        "edge_index": ways.astype(np.int64),
+        "edge_index": directions.astype(np.int64),
         "edge_attr": np.concatenate([attr[:half], features, attr[half:], back]).astype(np.float32),
         "edge_pos": np.concatenate([places[:half], middle, places[half:], middle]),
     }

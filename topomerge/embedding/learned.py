@@ -52,7 +52,7 @@ POINT_TABLES = {
 
 
 def load_embedder(path: str | Path | None = None) -> LearnedEmbedder:
-    """A trained embedder. Neither torch, Hydra nor the training code is needed.
+    """Return a trained embedder. Neither torch, Hydra nor the training code is needed.
 
     Args:
         path: a run, or what `topomerge export-embedder` wrote; None: the one that ships with the package.
@@ -135,9 +135,9 @@ class LearnedEmbedder:
         if turns == 1:
             return rows[0], bins[0]
         dustbin = np.mean(bins, axis=0)
-        facts = compute_room_features(arrays["x"], dustbin, arrays["pos"][:, 2])
+        features = compute_room_features(arrays["x"], dustbin, arrays["pos"][:, 2])
         direction = float(arrays["turn"][0]) if len(arrays["turn"]) else 0.0
-        return TurnedRows(np.stack(rows, axis=1), rotate_to_walls(arrays), self.embedder, facts, direction), dustbin
+        return TurnedRows(np.stack(rows, axis=1), rotate_to_walls(arrays), self.embedder, features, direction), dustbin
 
     @property
     def needs_points(self) -> bool:
@@ -158,7 +158,7 @@ class LearnedEmbedder:
 
 
 def load_learned(path: str | None = None) -> Descriptor:
-    """The trained embedder in a folder (see `topomerge.load_embedder`), or the one that ships with the package."""
+    """Return the trained embedder in a folder (see `topomerge.load_embedder`), or the one that ships with the package."""
     return load_embedder(path)
 
 

@@ -215,8 +215,8 @@ def rotate_graph(graph: Mapping[str, Array], turns: int) -> dict[str, Array]:
     for part in CROP_SHAPES.keys() & out.keys():
         out[part] = rotate_crops(part, out[part], turns)
     if "edge_way" in out:
-        ways = _convert_to_complex(out["edge_way"].reshape(len(out["edge_way"]), 2, 2)) * 1j**turns
-        out["edge_way"] = np.stack([ways.real, ways.imag], axis=2).reshape(len(ways), 4).astype(np.float32)
+        directions = _convert_to_complex(out["edge_way"].reshape(len(out["edge_way"]), 2, 2)) * 1j**turns
+        out["edge_way"] = np.stack([directions.real, directions.imag], axis=2).reshape(len(directions), 4).astype(np.float32)
     return out
 
 
@@ -254,15 +254,15 @@ def collect_room_cells(map: TopometricMap) -> list[Array]:
 def find_neighbours(map: TopometricMap, steps: int = 1) -> list[Array]:
     """Return ascending rooms within `steps` doors or stairs of each room, the room itself among them."""
     count = len(map.rooms)
-    beside: list[set[int]] = [set() for _ in range(count)]
+    neighbours: list[set[int]] = [set() for _ in range(count)]
     for a, b in map.edges["rooms"].tolist():
-        beside[a].add(b)
-        beside[b].add(a)
+        neighbours[a].add(b)
+        neighbours[b].add(a)
     neighbourhoods = []
     for room in range(count):
         reached, border = {room}, {room}
         for _ in range(steps):
-            border = {n for r in border for n in beside[r]} - reached
+            border = {n for r in border for n in neighbours[r]} - reached
             reached |= border
         neighbourhoods.append(np.array(sorted(reached)))
     return neighbourhoods

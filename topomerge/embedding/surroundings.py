@@ -50,9 +50,9 @@ def cut_crops(map_sheet: Mapping[str, Array], part: str = CROP_PART, rooms: Arra
         return _cut(map_sheet, anchor[number], number, WIDE_CROP, WIDE_STEP)
     doors = np.asarray(map_sheet["door_anchor"])[:, :DOOR_CROPS]
     doors = doors if rooms is None else doors[number]
-    there = np.isfinite(doors).all(axis=2)
+    finite = np.isfinite(doors).all(axis=2)
     out = np.zeros((len(number), *CROP_SHAPES[DOOR_PART]), np.uint8)
-    out[there] = _cut(map_sheet, doors[there], number[np.nonzero(there)[0]], DOOR_CROP)
+    out[finite] = _cut(map_sheet, doors[finite], number[np.nonzero(finite)[0]], DOOR_CROP)
     return out
 
 

@@ -102,7 +102,7 @@ def build_card(network: Network, temperature: float, about: Mapping[str, Any] | 
 
 
 def check_settings(path: Path, values: Mapping[str, Any], format_number: int) -> Network:
-    """The network that the settings of a file describe; its encoders need not be known here, only what it reads.
+    """Return the network that the settings of a file describe; its encoders need not be known here, only what it reads.
 
     Raises:
         InputError: of another format or class, incomplete, or trained on other features.

@@ -72,7 +72,7 @@ def list_sets(settings: Settings) -> list[tuple[str, int, int]]:
 
 
 def list_inputs(settings: Settings) -> list[str]:
-    """Names of the sets."""
+    """Return names of the sets."""
     return [str(one) for one in list_sets(settings)]
 
 
@@ -95,7 +95,7 @@ class AtlasSet:
 
 
 def draw_set(split: str, maps: int, number: int) -> tuple[Atlas, Atlas | None]:
-    """The clouds of a set, and where it has one the other building's."""
+    """Return the clouds of a set, and where it has one the other building's."""
     rng = np.random.default_rng([maps, number, {"train": 0, "validation": 1, "test": 2}[split]])
     names = sorted(ATLAS_SENSORS)
     weight = np.array([ATLAS_SENSORS[n] for n in names], float)
@@ -140,7 +140,7 @@ def make_set(split: str, maps: int, number: int, cache: Path) -> Path:
 
 
 def load_set(folder: Path) -> AtlasSet:
-    """A set that was made."""
+    """Return a set that was made."""
     about = json.loads((folder / "truth.json").read_text())
     truth = tuple(None if t is None else convert_to_sim3(np.array(t)) for t in about.pop("truth"))
     return AtlasSet(folder.name, tuple(sorted(folder.glob("map_*.tmap"))), truth, about)
@@ -166,16 +166,16 @@ def errors(made: AtlasSet, result: AtlasResult) -> dict[int, tuple[float, float]
 
 def measure_set(split: str, maps: int, number: int, cache: Path) -> Row:
     """Make one set and put its maps together."""
-    made = load_set(make_set(split, maps, number, cache))
+    built = load_set(make_set(split, maps, number, cache))
     began = process_time()
-    result = build_atlas(made.files)
+    result = build_atlas(built.files)
     seconds = process_time() - began
-    off = errors(made, result)
+    off = errors(built, result)
     right = [k for k, e in off.items() if e is not None and e[0] < RIGHT[0] and e[1] < RIGHT[1]]
-    belong = sum(t is not None for t in made.truth)
+    belong = sum(t is not None for t in built.truth)
     best = max((sum(k in right for k in members[1:]) for members in result.components), default=0)
     return {
-        "maps": len(made.files),
+        "maps": len(built.files),
         "seconds": seconds,  # of one core
         "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "registered": result.registered[0],
@@ -186,8 +186,8 @@ def measure_set(split: str, maps: int, number: int, cache: Path) -> Row:
         "components": [list(c) for c in result.components if len(c) > 1],
         "errors": {str(k): e for k, e in off.items()},
         "thrown": [list(link.maps) for link in result.rejected],
-        "building": made.about["building"],
-        "sensors": made.about["sensors"],
+        "building": built.about["building"],
+        "sensors": built.about["sensors"],
     }
 
 

@@ -51,8 +51,8 @@ def measure_displacements(bent: DriftedPair, side: int, pose: Sim3, bending: Ben
     """
     undrift, frames = bent.undrift[side], bent.frames
     true = frames[side].inverse().apply(undrift.places + undrift.shifts)
-    laid = undrift.places if bending is None else bending.apply(undrift.places)
-    return true, (laid if side == 0 else pose.apply(laid)) - frames[0].apply(true)
+    placed = undrift.places if bending is None else bending.apply(undrift.places)
+    return true, (placed if side == 0 else pose.apply(placed)) - frames[0].apply(true)
 
 
 def measure_room_errors(
@@ -122,15 +122,15 @@ class Settings(TaskSettings):
 
 
 def list_inputs(settings: TaskSettings) -> list[str]:
-    """Names of the pairs' recipe."""
+    """Return names of the pairs' recipe."""
     return [f"{settings.data.set or 'validation'} {settings.data.limit or BENT_PAIRS}"]
 
 
 @lru_cache(maxsize=1)
 def load_bent(split: str, pairs: int, cache: str) -> dict[str, DriftedPair]:
     """Load the pairs of a split, made where they are missing."""
-    made = iter_drifted_pairs(split, str(find_real_data()), pairs, Path(cache) / "bent", lambda text: None)
-    return {bent.pair.name: bent for bent in made}
+    maker = iter_drifted_pairs(split, str(find_real_data()), pairs, Path(cache) / "bent", lambda text: None)
+    return {bent.pair.name: bent for bent in maker}
 
 
 def measure(settings: TaskSettings, log_line: LogFn) -> list[Row]:
@@ -148,20 +148,20 @@ def measure_pair(name: str, split: str, pairs: int, cache: str) -> Row:
 
 
 def prepare_pair(pair: GridPair) -> tuple[Prepared, Prepared]:
-    """Both maps as cells only."""
+    """Return both maps as cells only."""
     a, b = (prepare(g, f) for g, f in zip((pair.a, pair.b), pair.free, strict=True))
     return a, b
 
 
 def get_drift(pair: GridPair) -> tuple[Drift, Drift]:
-    """The usual drift of both maps' sensors; one that is not listed is unknown."""
+    """Return the usual drift of both maps' sensors; one that is not listed is unknown."""
     names: Any = pair.about["sensors"]
     a, b = (get_sensor_drift("unknown" if name == "phone" else name) for name in names)
     return a, b
 
 
 def build_simulated_row(bent: DriftedPair, split: str) -> Row:
-    """The rooms of a pair under the pose of the rigid registration, and bent."""
+    """Return the rooms of a pair under the pose of the rigid registration, and bent."""
     pair = bent.pair
     a, b = prepare_pair(pair)
     clock = [time.process_time()]
@@ -183,7 +183,7 @@ def build_simulated_row(bent: DriftedPair, split: str) -> Row:
 
 
 def rooms(rows: Sequence[Row], key: str, value: str) -> tuple[list[float], list[str]]:
-    """A value of every room, and the physical building of each."""
+    """Return a value of every room, and the physical building of each."""
     pairs = [(r[value], get_physical_building(row)) for row in rows for r in row.get(key, ())]
     return [v for v, _ in pairs], [p for _, p in pairs]
 

@@ -58,8 +58,8 @@ def _words(difficulty: dict[str, float]) -> tuple[tuple[str, float], ...]:
 
 
 def dev() -> list[Case]:
-    """A small set to develop on: training seeds and plans only."""
-    made: tuple[tuple[str, int, str, dict[str, float], str], ...] = (
+    """Return a small set to develop on: training seeds and plans only."""
+    cases: tuple[tuple[str, int, str, dict[str, float], str], ...] = (
         ("office", 1, "tls", {}, ""),
         ("office", 2, "depth", {}, ""),
         ("office", 3, "lidar", {"glass": 0.6}, ""),
@@ -81,7 +81,7 @@ def dev() -> list[Case]:
         ("office", 4, "depth", {}, "drift"),
         ("office", 5, "tls", {}, "noise"),
     )
-    out = [Case("dev", "procedural", k, sensor, seed, rooms=12, difficulty=_words(d), spoil=s) for k, seed, sensor, d, s in made]
+    out = [Case("dev", "procedural", k, sensor, seed, rooms=12, difficulty=_words(d), spoil=s) for k, seed, sensor, d, s in cases]
     out += [Case("dev", "procedural", "office", "lidar", 6, storeys=2, rooms=20)]
     out += [Case("dev", "procedural", "house", "tls", 7, storeys=2)]
     out += [Case("dev", "r2v", "00/02/09a30b61b563f93faf6a6466ffab/0001", "depth", 1)]
@@ -100,7 +100,7 @@ def simulate_scan() -> list[Case]:
 
 
 def hard() -> list[Case]:
-    """The same five buildings made hard in one way after the other; and buildings of two to four storeys."""
+    """Return the same five buildings made hard in one way after the other; and buildings of two to four storeys."""
     places = (("office", "tls"), ("school", "lidar"), ("hospital", "depth"), ("hotel", "tls"), ("lab", "depth"))
     out = [
         Case(name, "procedural", kind, sensor, TEST + 100 + i, rooms=ROOM_NUMBERS, difficulty=_words(difficulty), spoil=spoil)
@@ -150,7 +150,7 @@ def ifc() -> list[Case]:
 
 
 def pairs() -> list[Case]:
-    """Two sessions in one building, by two sensors, with 60 % of the rooms in common."""
+    """Return two sessions in one building, by two sensors, with 60 % of the rooms in common."""
     sensors = (("tls", "depth"), ("lidar", "tls"), ("depth", "depth"), ("lidar", "depth"))
     moved = {"moved": 0.6, "gone": 0.2, "doors_moved": 0.6}
     sets: tuple[tuple[str, dict[str, float], tuple[str, ...]], ...]

@@ -78,8 +78,8 @@ class Case:
 def draw_cases(development: bool) -> list[Case]:
     """Draw each kind of building by each pair of sensors."""
     first = DEV_SEEDS if development else TEST_SEEDS
-    made = [(kind, sensors) for kind in BUILDING_KINDS for sensors in SENSORS]
-    cases = [Case(kind, first + i, sensors, (i + i // len(SENSORS)) % UNCHANGED != 0) for i, (kind, sensors) in enumerate(made)]
+    built = [(kind, sensors) for kind in BUILDING_KINDS for sensors in SENSORS]
+    cases = [Case(kind, first + i, sensors, (i + i // len(SENSORS)) % UNCHANGED != 0) for i, (kind, sensors) in enumerate(built)]
     small = [case for case in cases if case.kind in SMALL]  # come first, so that a limit takes what is quickly measured
     models = MODELS["dev" if development else ""]
     scans = [Case(name, k, (sensor,)) for k, sensor in enumerate(MODEL_SENSORS) for name in models]
@@ -87,7 +87,7 @@ def draw_cases(development: bool) -> list[Case]:
 
 
 def list_inputs(settings: TaskSettings) -> list[str]:
-    """Names of the cases."""
+    """Return names of the cases."""
     return [case.name for case in limit_cases(draw_cases(settings.data.set == "dev"), settings)]
 
 
@@ -118,8 +118,8 @@ def score_pair(case: Case) -> Row:
         return row
     changes = compare_maps(maps[0], maps[1], placement)
     row |= {"align_s": aligned - began, "compare_s": process_time() - aligned, "m2": sum(changes.compared.values())}
-    told = list_told(changes, pair)
-    row["groups"] = {name: score_kinds(told, pair.changes, kinds) for name, kinds in GROUPS.items()}
+    reported = list_told(changes, pair)
+    row["groups"] = {name: score_kinds(reported, pair.changes, kinds) for name, kinds in GROUPS.items()}
     elements = [c.element for c in changes.changes]
     row["alarms"] = {e: elements.count(e) for e in ("wall", "door", "room", "furniture")}
     return row
@@ -133,13 +133,13 @@ def list_told(changes: Changes, pair: ChangedPair) -> list[tuple[str, Array]]:
         out: Array = back.apply(point[None])[0, :2]
         return out
 
-    told = []
+    reported = []
     for change in changes.changes:
         moved = change.kind == "furniture moved"
-        told.append(("furniture new" if moved else change.kind, place(change, change.place)))
+        reported.append(("furniture new" if moved else change.kind, place(change, change.place)))
         if moved and change.from_place is not None:
-            told.append(("furniture gone", place(change, change.from_place)))
-    return told
+            reported.append(("furniture gone", place(change, change.from_place)))
+    return reported
 
 
 def score_kinds(told: Sequence[tuple[str, Array]], true: Sequence[TrueChange], kinds: Sequence[str]) -> list[int]:
@@ -193,7 +193,7 @@ def score_model(case: Case) -> Row:
 
 
 def shift_element(element: ModelElement, by: Array) -> ModelElement:
-    """An element at another place."""
+    """Return an element at another place."""
     return replace(element, vertices=element.vertices + by)
 
 

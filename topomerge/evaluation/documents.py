@@ -78,8 +78,8 @@ def write_blocks(page: Path, blocks: Mapping[str, str], stamp: Stamp) -> list[st
             written.append(name)
     if not written:
         raise InputError(f"{page}: has no marks of {', '.join(blocks)}; put <!-- NAME:begin --> and <!-- NAME:end --> into it")
-    with replace_on_success(page) as beside:
-        beside.write_text(text, encoding="utf-8")
+    with replace_on_success(page) as temporary:
+        temporary.write_text(text, encoding="utf-8")
     return written
 
 

@@ -47,15 +47,15 @@ class Settings(TaskSettings):
 def draw_cases(development: bool) -> list[Case]:
     """Draw every kind of building by both sensors."""
     first = TRAINING if development else DOOR_SEEDS
-    made = [(kind, sensor) for sensor in ("tls", "depth") for kind in BUILDING_KINDS]
+    cases = [(kind, sensor) for sensor in ("tls", "depth") for kind in BUILDING_KINDS]
     return [
         Case("doors", "procedural", kind, sensor, first + i, rooms=8, difficulty=(("frames", FRAMES),), spacing=0.025)
-        for i, (kind, sensor) in enumerate(made)
+        for i, (kind, sensor) in enumerate(cases)
     ]
 
 
 def list_inputs(settings: TaskSettings) -> list[str]:
-    """Names of the scans."""
+    """Return names of the scans."""
     return [case.key for case in limit_cases(draw_cases(settings.data.set == "dev"), settings)]
 
 
@@ -86,11 +86,11 @@ def score_doors(case: Case, scan: Scan, how: str) -> Row:
     requested = find_between_visited(scan)
     edges = map.edges[np.isin(map.edges["kind"], ("door", "opening"))]
     pairs = match_places(truth.doors[:, 2:], truth.transform_to_building(edges["centre"]))
-    there = np.zeros(len(truth.doors), bool)
-    there[pairs[:, 0]] = True
+    present = np.zeros(len(truth.doors), bool)
+    present[pairs[:, 0]] = True
     for name in STATES:
         own = requested & (state == name)
-        row[name] = [int((there & own).sum()), int(own.sum())]
+        row[name] = [int((present & own).sum()), int(own.sum())]
     row["right"] = [verdict.doors.right, verdict.doors.extracted]
     said_shut = ~edges["open"] & ~find_looked_into(map, edges)
     said_half = edges["half"] & ~find_looked_into(map, edges)

@@ -84,12 +84,12 @@ def list_pages(settings: TaskSettings) -> list[Page]:
         source = shapes.name.split("/")[0]
         counts[source] = counts.get(source, 0) + 1
         if counts[source] % EVERY.get(source, 1) == 0 and len(shapes.rooms) >= FEWEST_ROOMS:
-            pages += [Page(shapes, number, spoilt) for spoilt in (False, True)]
+            pages += [Page(shapes, number, corrupted) for corrupted in (False, True)]
     return limit_cases(pages, settings)
 
 
 def list_inputs(settings: TaskSettings) -> list[str]:
-    """Names of the pages."""
+    """Return names of the pages."""
     return [page.name for page in list_pages(settings)]
 
 
@@ -220,15 +220,15 @@ def score_walls(occupied: Array, drawing: Drawing, zoom: float) -> float:
         return 0.0
     near = WALL_NEAR * drawing.scale
     right = float((ndimage.distance_transform_edt(~true)[found] <= near).mean())
-    there = float((ndimage.distance_transform_edt(~found)[true] <= near).mean())
-    return 2 * right * there / (right + there) if right + there else 0.0
+    present = float((ndimage.distance_transform_edt(~found)[true] <= near).mean())
+    return 2 * right * present / (right + present) if right + present else 0.0
 
 
 def tabulate(rows: Sequence[Row], settings: TaskSettings) -> dict[str, str]:
     """Tabulate a line for each source as drawn and as seen, and for all."""
     lines = []
-    for spoilt, what in ((False, "as drawn"), (True, "as seen")):
-        some = [row for row in rows if row["spoilt"] == spoilt]
+    for corrupted, what in ((False, "as drawn"), (True, "as seen")):
+        some = [row for row in rows if row["spoilt"] == corrupted]
         for source, group in {**group_rows(some, lambda row: str(row["source"])), "all": some}.items():
             if group:
                 lines.append([what, source, *summarise(group)])

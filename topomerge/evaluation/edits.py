@@ -75,7 +75,7 @@ def list_cases(settings: Settings) -> list[Case]:
 
 
 def list_inputs(settings: Settings) -> list[str]:
-    """Names of the scans."""
+    """Return names of the scans."""
     return [case.key for case in list_cases(settings)]
 
 
@@ -262,8 +262,8 @@ def _list_door_edits(map: TopometricMap, truth: FloorTruth) -> list[Edit]:
     edits: list[Edit] = []
     for d in missing.tolist():
         place = transform_to_scan(truth, truth.doors[d : d + 1, 2:])[0].tolist()
-        told = [] if own[ends[d, 0]] == own[ends[d, 1]] else [find_room_place(map, int(own[t])).tolist() for t in ends[d]]
-        between = {"between": told} if told else {}
+        places = [] if own[ends[d, 0]] == own[ends[d, 1]] else [find_room_place(map, int(own[t])).tolist() for t in ends[d]]
+        between = {"between": places} if places else {}
         far = np.hypot(*(at[wrong] - truth.doors[d, 2:])[:, :2].T) if len(wrong) else np.zeros(0)
         if len(far) and far.min() <= MOVED_DOOR:
             edits.append(Edit("move_door", {"at": map.edges["centre"][wrong[far.argmin()]].tolist(), "to": place, **between}))

@@ -117,8 +117,8 @@ def compute_headline(ranks: list[Row], settings: Evaluation) -> dict[str, tuple[
 
 
 def _write(path: Path, text: str) -> None:
-    with replace_on_success(path) as beside:
-        beside.write_text(text + "\n", encoding="utf-8")
+    with replace_on_success(path) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
 
 
 def claim(folder: Path, plain_settings: dict[str, Any]) -> None:
@@ -176,7 +176,7 @@ def with_own_pairs(settings: Evaluation, log_line: LogFn) -> Evaluation:
 
 
 def own_cache(cache: Path) -> Path:
-    """The cache of one's own pairs, which is that of the training: the folder above one that is called `evaluation`."""
+    """Return the cache of one's own pairs, which is that of the training: the folder above one that is called `evaluation`."""
     return cache.parent if cache.name == "evaluation" else cache
 
 
@@ -246,11 +246,11 @@ def _describe_evaluation(ranks: list[Row], merges: list[Row], settings: Evaluati
     pairs, buildings = len({r["pair"] for r in rows}), len({r["building"] for r in rows})
     first = next(iter({r["variant"]: None for r in ranks}), "")
     queries = [sum(r[f"queries{g}"] for r in ranks if r["variant"] == first) for g in ("", "_twin")]
-    chance = sum(r["chance"] for r in ranks if r["variant"] == first) / max(queries[0], 1)
+    by_chance = sum(r["chance"] for r in ranks if r["variant"] == first) / max(queries[0], 1)
     text = (
         f"{pairs} pairs of maps, {buildings} buildings"
         + (
-            f", {queries[0]} rooms with a partner, {queries[1]} of them with a twin; by chance recall@1 is {chance:.2f}"
+            f", {queries[0]} rooms with a partner, {queries[1]} of them with a twin; by chance recall@1 is {by_chance:.2f}"
             if ranks
             else ""
         )

@@ -58,7 +58,7 @@ def is_good(row: Row, limits: tuple[float, float] = (0.5, 5.0)) -> bool:
 
 
 def get_physical_building(row: Row) -> str:
-    """The physical building of map a."""
+    """Return the physical building of map a."""
     return str(row.get("physical") or find_physical_building(row.get("source", "procedural"), row["building"]))
 
 
@@ -101,18 +101,18 @@ def measure_hit_buildings(rows: Sequence[Row]) -> dict[str, float]:
 
 
 def format_tally(name: str, rows: Sequence[Row]) -> list[object]:
-    """A line of the table: under `NEGATIVE_HEADS`."""
+    """Return a line of the table: under `NEGATIVE_HEADS`."""
     shares = measure_hit_buildings(rows)
     hit = sum(share > 0 for share in shares.values())
     low, high = compute_exact_interval(hit, len(shares))
     alike = [r for r in rows if not is_tellable(r)]
     most = np.round(sorted((r["probability"] for r in rows), reverse=True)[:3], 2).tolist()
     interval = f"{hit}: {100 * low:.1f} to {100 * high:.1f} %"
-    believed = sum(map(is_false_merge, rows))
+    accepted = sum(map(is_false_merge, rows))
     return [
         name,
         len(rows),
-        believed,
+        accepted,
         len(shares),
         interval,
         len(alike),
@@ -130,12 +130,12 @@ def iter_difficulties(row: Row) -> Iterator[str]:
 
 
 def select_negatives(rows: Sequence[Row]) -> list[Row]:
-    """The pairs that must not merge, each with its `negative`."""
+    """Return the pairs that must not merge, each with its `negative`."""
     return [{**r, "negative": kind} for r in rows if not is_broken(r) and (kind := classify_negative(r))]
 
 
 def tabulate_false_merges(rows: Sequence[Row]) -> str:
-    """The table of `negatives`: kinds, all, those that nobody can tell apart, and what is difficult."""
+    """Return the table of `negatives`: kinds, all, those that nobody can tell apart, and what is difficult."""
     out = [format_tally(kind, mine) for kind in PRIOR if (mine := [r for r in rows if r["negative"] == kind])]
     out.append(format_tally("**all**", rows))
     alike = [r for r in rows if not is_tellable(r)]
@@ -147,7 +147,7 @@ def tabulate_false_merges(rows: Sequence[Row]) -> str:
 
 
 def compute_rate(rows: Sequence[Row], prior: Mapping[str, float] = PRIOR) -> tuple[float, float, float]:
-    """Share of false merges at a prior of kinds, and the ends of its 95 % interval; nan where there is no row.
+    """Return share of false merges at a prior of kinds, and the ends of its 95 % interval; nan where there is no row.
 
     Of each kind the mean over its physical buildings of the share of their pairs. What of a kind is not sure is drawn as of k of
     n buildings, Beta(k + 1/2, n - k + 1/2) (Jeffreys' prior). Kinds without a row are left out, and the others' shares raised.
@@ -168,7 +168,7 @@ def compute_rate(rows: Sequence[Row], prior: Mapping[str, float] = PRIOR) -> tup
 
 
 def format_headline(rows: Sequence[Row]) -> str:
-    """The rate at `PRIOR` with every pair in, and without what nobody can tell apart, in words."""
+    """Return the rate at `PRIOR` with every pair in, and without what nobody can tell apart, in words."""
     shares = ", ".join(f"{kind} {weight:g}" for kind, weight in PRIOR.items())
     missing = [kind for kind in PRIOR if not any(r["negative"] == kind for r in rows)]
     rate, low, high = (100 * v for v in compute_rate(rows))
@@ -199,15 +199,15 @@ def compute_calibration(rows: Sequence[Row]) -> Calibration:
 
 
 def errors(groups: Mapping[str, Sequence[Row]]) -> str:
-    """A line a group of pairs: the calibration error with and without the mass near zero, and how believed pairs fare."""
+    """Return a line a group of pairs: the calibration error with and without the mass near zero, and how believed pairs fare."""
     out: list[Sequence[object]] = []
     for name, rows in groups.items():
         if rows:
-            whole, believed = compute_calibration(rows), [r for r in rows if r["believed"]]
-            means = [float(np.mean([f(r) for r in believed])) for f in (probability_of, is_good)] if believed else []
+            whole, accepted = compute_calibration(rows), [r for r in rows if r["believed"]]
+            means = [float(np.mean([f(r) for r in accepted])) for f in (probability_of, is_good)] if accepted else []
             above = [write_error(whole.above), int(whole.above.count.sum())] if whole.above else ["–", 0]
             out.append(
-                [name, len(rows), write_error(whole), *above[::-1], len(believed), ", ".join(f"{m:.2f}" for m in means) or "–"]
+                [name, len(rows), write_error(whole), *above[::-1], len(accepted), ", ".join(f"{m:.2f}" for m in means) or "–"]
             )
     return write_table(CALIBRATION_HEADS, out)
 
@@ -223,7 +223,7 @@ def write_error(c: Calibration) -> str:
 
 
 def reliability(rows: Sequence[Row]) -> str:
-    """A line a bin of equal mass and origin: of all pairs, and of those of 0.1 and above."""
+    """Return a line a bin of equal mass and origin: of all pairs, and of those of 0.1 and above."""
     out: list[Sequence[object]] = []
     for name in ORIGINS:
         whole = compute_calibration([r for r in rows if classify_origin(r) == name])

@@ -28,8 +28,8 @@ def save_figures(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[
     ):
         figure = draw(ranks, matches, merges)
         if figure is not None:
-            with replace_on_success(folder / f"{name}.png") as beside:
-                figure.savefig(beside, dpi=120, bbox_inches="tight", format="png")
+            with replace_on_success(folder / f"{name}.png") as temporary:
+                figure.savefig(temporary, dpi=120, bbox_inches="tight", format="png")
             done.append(f"{name}.png")
     return done
 

@@ -26,8 +26,8 @@ def write_headline(path: Path, figures: Mapping[str, tuple[str, str]], stamp: St
         if entry["name"] in figures:
             entry["result"], entry["of"] = figures[entry["name"]]
             entry["stamp"] = stamp.write_comment()
-    with replace_on_success(path) as beside:
-        beside.write_text(json.dumps({"figures": entries}, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    with replace_on_success(path) as temporary:
+        temporary.write_text(json.dumps({"figures": entries}, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     if path.resolve() == FIGURES:
         write_readme()
 
@@ -36,8 +36,8 @@ def write_readme(readme: Path = ROOT / "README.md", path: Path = FIGURES) -> Non
     """Write the figures into the README, between the marks of `headline`."""
     begin, end = "<!-- headline:begin -->", "<!-- headline:end -->"
     before, rest = readme.read_text(encoding="utf-8").split(begin, 1)
-    with replace_on_success(readme) as beside:
-        beside.write_text(f"{before}{begin}\n\n{tabulate_headline(path)}\n\n{end}{rest.split(end, 1)[1]}", encoding="utf-8")
+    with replace_on_success(readme) as temporary:
+        temporary.write_text(f"{before}{begin}\n\n{tabulate_headline(path)}\n\n{end}{rest.split(end, 1)[1]}", encoding="utf-8")
 
 
 def tabulate_headline(path: Path = FIGURES) -> str:

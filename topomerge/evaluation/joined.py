@@ -49,7 +49,7 @@ class Settings(TaskSettings):
 
 
 def list_inputs(settings: TaskSettings) -> list[str]:
-    """Names of the pairs' recipe."""
+    """Return names of the pairs' recipe."""
     return [f"{settings.data.set or 'validation'} {settings.data.limit or JOINED_PAIRS}"]
 
 
@@ -78,7 +78,7 @@ def measure_pair(name: str, split: str, pairs: int) -> Row:
 
 
 def extract_with_truth(maker: DriftedPairMaker, side: int, factor: float) -> tuple[TopometricMap, FloorTruth]:
-    """A map of a pair, extracted, and what is true about it, in its frame."""
+    """Return a map of a pair, extracted, and what is true about it, in its frame."""
     building, visited, frames = maker.place
     cloud, undrift = maker.simulate_map(side, factor)
     frame = frames[side]
@@ -98,7 +98,7 @@ def compute_scores(map: TopometricMap, truth: FloorTruth) -> dict[str, float]:
 
 
 def build_row(maker: DriftedPairMaker, name: str, factor: float) -> Row:
-    """Both maps, joined rigidly and bent."""
+    """Return both maps, joined rigidly and bent."""
     (a, truth_a), (b, truth_b) = (extract_with_truth(maker, side, factor) for side in (0, 1))
     frames = maker.place[2]
     right = frames[0] @ frames[1].inverse()

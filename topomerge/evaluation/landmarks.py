@@ -90,7 +90,7 @@ def make_recipe(settings: Settings) -> LookalikeRecipe:
 
 
 def list_inputs(settings: Settings) -> list[str]:
-    """Names of the pairs, or of the buildings whose signs are scored alone."""
+    """Return names of the pairs, or of the buildings whose signs are scored alone."""
     if settings.data.set in ALONE:
         return [f"signs {k}" for k in range(settings.data.limit or BUILDINGS)]
     return [item.name for item in draw_lookalike_items(make_recipe(settings))]
@@ -166,7 +166,7 @@ def tabulate_alone(rows: Sequence[Row]) -> str:
             odds = np.array([o for relation, o in scored if relation == kind])
             cells += [f"{np.logaddexp(0, -odds).mean():.3f}", f"{(odds < -SURE_ODDS).mean():.3f}"]
         lines.append([name, len(here) // len(RELATIONS), *cells])
-    heads = [f"{what}{words}" for what in ("this place", *RELATIONS) for words in ("", ": told wrong")]
+    heads = [f"{what}{suffix}" for what in ("this place", *RELATIONS) for suffix in ("", ": told wrong")]
     return write_table(["reader", "places", *heads], lines)
 
 
@@ -199,11 +199,11 @@ def measure_pair(file: Path, item: LookalikeItem, readings: Sequence[str]) -> Ro
     outcomes: list[Row] = []
     for name in readings:
         reader = READINGS[name]
-        told = (Landmarks(), Landmarks()) if reader is None else read_lookalike_signs(item, reader)
-        some = min(map(len, told)) > 0
+        signs = (Landmarks(), Landmarks()) if reader is None else read_lookalike_signs(item, reader)
+        some = min(map(len, signs)) > 0
         alone = next((row for row in outcomes if not min(row["landmarks"])), None)
-        found = alone if alone is not None and not some else _register_pair(pair, told)
-        outcomes.append({**found, "reading": name, "landmarks": [len(t) for t in told]})
+        found = alone if alone is not None and not some else _register_pair(pair, signs)
+        outcomes.append({**found, "reading": name, "landmarks": [len(t) for t in signs]})
     return {"kind": item.kind, "again": item.again, "tellable": pair.about.get("tellable"), "readings": outcomes}
 
 

@@ -54,7 +54,7 @@ class Settings(TaskSettings):
 
 
 def list_inputs(settings: Settings) -> list[str]:
-    """Names of what is measured."""
+    """Return names of what is measured."""
     if settings.data.set == "captures":
         return [f"capture {k}" for k in range(settings.data.limit or CAPTURES)]
     split = settings.data.set or "validation"
@@ -78,23 +78,23 @@ def measure(settings: Settings, log_line: LogFn) -> list[Row]:
 def load_atlas(split: str, folder: Path) -> tuple[PlaceIndex, list[LocatedMap]]:
     """Load the index of the maps of a split, made where they are missing, and their truth."""
     with limit_threads():
-        made = [load_located_map(make_located_map(split, k, folder)) for k in range(MAPS[split])]
-        return PlaceIndex.from_maps({m.path.stem: load_map(m.path) for m in made}), made
+        maps = [load_located_map(make_located_map(split, k, folder)) for k in range(MAPS[split])]
+        return PlaceIndex.from_maps({m.path.stem: load_map(m.path) for m in maps}), maps
 
 
 def measure_building(split: str, number: int, folder: Path) -> Row:
     """Ask where scans of each kind were taken in a building with a map, and for two kinds in one without."""
-    index, made = load_atlas(split, folder)
+    index, maps = load_atlas(split, folder)
     scans = []
     for n, kind in enumerate(SCANS):
-        for stranger in (False, True) if (number + n) % 3 == 0 else (False,):
+        for negative in (False, True) if (number + n) % 3 == 0 else (False,):
             try:
-                scan = make_located_scan(split, number, kind, stranger)
+                scan = make_located_scan(split, number, kind, negative)
             except InputError:
                 continue
-            pose, moved = made[number].place_scan(scan)
+            pose, moved = maps[number].place_scan(scan)
             true = replace(pose, translation=tuple((np.array(pose.translation) + moved).tolist()))  # type: ignore[arg-type]
-            scans.append({"kind": kind, **measure_scan(index, scan.cloud, None if stranger else (number, true))})
+            scans.append({"kind": kind, **measure_scan(index, scan.cloud, None if negative else (number, true))})
     return {"scans": scans}
 
 
@@ -186,8 +186,8 @@ def iter_windows(b: PointCloud, true: Sim3, a: PointCloud, rng: np.random.Genera
     for row in rng.permutation(len(b.points))[:200].tolist():
         middle = b.points[row, :2]
         inside = (np.abs(b.points[:, :2] - middle) < WINDOW / 2).all(axis=1)
-        there = true.apply(b.points[inside][::20].astype(float))[:, :2]
-        if inside.sum() > 300 and (tree.query(there)[0] < 0.5).mean() > 0.7:
+        placed = true.apply(b.points[inside][::20].astype(float))[:, :2]
+        if inside.sum() > 300 and (tree.query(placed)[0] < 0.5).mean() > 0.7:
             free = b.free
             if free is not None:
                 at = free.compute_centroids()[:, :2]
@@ -208,14 +208,14 @@ def classify_outcome(scan: Row) -> str:
 def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
     """Tabulate a line a kind of scan, of places in the atlas and of others."""
     lines = []
-    for stranger in (False, True):
+    for negative in (False, True):
         kinds = list(dict.fromkeys(s["kind"] for r in rows for s in r["scans"]))
         for kind in [*kinds, *(["all"] if len(kinds) > 1 else [])]:
             some = [
-                (k, s) for k, r in enumerate(rows) for s in r["scans"] if s["stranger"] == stranger and kind in (s["kind"], "all")
+                (k, s) for k, r in enumerate(rows) for s in r["scans"] if s["stranger"] == negative and kind in (s["kind"], "all")
             ]
             if some:
-                lines.append(tabulate_line(kind, stranger, some))
+                lines.append(tabulate_line(kind, negative, some))
     head = ["scan", "of", "scans", "told and right room", "95 %", "pose of these within 0.3 m, 5°", "told and wrong", "95 %"]
     head += ["among those named", "cannot tell", "not here", "no walls", "s of one core, median", "slowest"]
     return {f"locate-{settings.data.set or 'validation'}": write_table(head, lines)}
@@ -225,7 +225,7 @@ def tabulate_line(kind: str, stranger: bool, some: Sequence[tuple[int, Row]]) ->
     """Tabulate some scans, each with the number of its building."""
     outcome = [classify_outcome(s) for _, s in some]
     counts = {name: outcome.count(name) for name in OUTCOMES}
-    told = [s for (_, s), what in zip(some, outcome, strict=True) if what == "right"]
+    text = [s for (_, s), what in zip(some, outcome, strict=True) if what == "right"]
     share, low, high = bootstrap_mean(np.array([o == "right" for o in outcome], float), np.array([k for k, _ in some]))
     worst = compute_exact_interval(counts["wrong"], len(some))
     seconds = [s["seconds"] for _, s in some]
@@ -234,7 +234,7 @@ def tabulate_line(kind: str, stranger: bool, some: Sequence[tuple[int, Row]]) ->
     good = (
         ["–", "–", "–"]
         if stranger
-        else [f"{share:.2f}", f"{low:.2f}–{high:.2f}", f"{sum(s['pose'] for s in told)} of {len(told)}"]
+        else [f"{share:.2f}", f"{low:.2f}–{high:.2f}", f"{sum(s['pose'] for s in text)} of {len(text)}"]
     )
     return [
         kind, "no map" if stranger else "a map", len(some), *good, counts["wrong"], f"{worst[0]:.3f}–{worst[1]:.3f}",

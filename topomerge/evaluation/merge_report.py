@@ -67,14 +67,14 @@ def format_measures(rows: Sequence[Row]) -> list[object]:
 
 
 def select_positives(rows: Sequence[Row]) -> list[Row]:
-    """Pairs that share a room."""
+    """Return pairs that share a room."""
     return [r for r in rows if classify_pair(r) in AREA_NAMES]
 
 
 def describe_source(row: Row) -> str:
     """Where a simulated pair is from, in words."""
-    words = {"procedural": "procedural buildings", "campus": "schools (real plans)", "r2v": "flats (real plans)"}
-    return words.get(str(row["source"]), str(row["source"]))
+    names = {"procedural": "procedural buildings", "campus": "schools (real plans)", "r2v": "flats (real plans)"}
+    return names.get(str(row["source"]), str(row["source"]))
 
 
 def describe_pairs(rows: Sequence[Row]) -> str:
@@ -100,7 +100,7 @@ def name_plan(row: Row) -> str:
 
 
 def merged(mine: Sequence[Row], drawn: Sequence[Row]) -> list[str]:
-    """Pairs that share rooms: by kind of pair and area, by source, by sensors, and with floor plans."""
+    """Return pairs that share rooms: by kind of pair and area, by source, by sensors, and with floor plans."""
     whole = select_positives(mine)
     large = [r for r in whole if classify_pair(r) in LARGE]
     groups = [f"{m}, {area}" for m in MODALITIES for area in AREA_NAMES]
@@ -129,12 +129,12 @@ def tabulate_real(rows: Sequence[Row]) -> str:
     for name in sorted(set(names)):
         mine = [r for r, group in zip(rows, names, strict=True) if group == name]
         scale = [abs(r["scale"] - 1) for r in mine if r["scale"] and is_good(r)]
-        believed = [r for r in mine if r["believed"]]
+        accepted = [r for r in mine if r["believed"]]
         wrong = [r["name"].split("/")[1] for r in mine if not is_good(r)]
         out.append([
             name, len(mine), len({get_physical_building(r) for r in mine}), sum(map(is_good, mine)), sum(is_good(r, (0.1,
             1.0)) for r in mine),
-            sum(is_good(r) for r in believed), sum(not is_good(r) for r in believed), f"{100 * max(scale, default=0.0):.1f} %",
+            sum(is_good(r) for r in accepted), sum(not is_good(r) for r in accepted), f"{100 * max(scale, default=0.0):.1f} %",
             f"{np.median([r['seconds'] for r in mine]):.1f}", ", ".join(wrong),
         ])  # fmt: skip
     return write_table(REAL_HEADS, out)
@@ -190,7 +190,7 @@ def tabulate_own(rows: Sequence[Row]) -> str:
     shared, apart = ([r for r in rows if (r["kind"] == "overlap") is which] for which in (True, False))
     right = [r for r in shared if r["right"]]
     wrong = [sum(r["believed"] and not r["right"] for r in of) for of in (shared, apart)]
-    said = (
+    warnings = (
         f"{len(shared)} pairs of one place: {len(right)} placed right, {sum(r['believed'] for r in right)} of these believed, "
         f"{wrong[0]} merged wrongly. {len(apart)} pairs of two places: {wrong[1]} merged wrongly."
     )
@@ -200,7 +200,7 @@ def tabulate_own(rows: Sequence[Row]) -> str:
         verdict = "two places" if r["kind"] != "overlap" else "right" if r["right"] else "wrong"
         said_so = f"{r['probability']:.2f}{' believed' if r['believed'] else ''}"
         lines.append([r["pair"], f"{r['common']:.0f}", verdict, said_so, *off, f"{r['seconds']:.1f}"])
-    return f"{said}\n\n{write_table(('pair', 'm² in common', 'pose', 'probability', 'off m', 'off °', 's'), lines)}"
+    return f"{warnings}\n\n{write_table(('pair', 'm² in common', 'pose', 'probability', 'off m', 'off °', 's'), lines)}"
 
 
 def tabulate_boxes(rows: Sequence[Row]) -> str:

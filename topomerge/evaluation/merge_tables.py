@@ -111,9 +111,9 @@ def tabulate_descriptor_effect(merges: Sequence[Row]) -> Table:
         verdicts = sum(a["believed"] == b["believed"] for a, b in both)
         apart = np.array([_measure_pose_difference(a["place"], b["place"]) for a, b in both]).reshape(-1, 2)
         poses = int((apart < SAME_POSE).all(axis=1).sum())
-        chance = max((abs(a["probability"] - b["probability"]) for a, b in both), default=0.0)
+        probability = max((abs(a["probability"] - b["probability"]) for a, b in both), default=0.0)
         counts = map(str, (len(both), verdicts, poses))
-        rows.append([first, second, *counts, f"{np.max(apart[:, 0], initial=0.0):.3f}", f"{chance:.3f}"])
+        rows.append([first, second, *counts, f"{np.max(apart[:, 0], initial=0.0):.3f}", f"{probability:.3f}"])
     same = f"same pose ({SAME_POSE[0]:g} m, {SAME_POSE[1]:g}°)"
     head = ["merged with", "and with", "pairs", "same verdict", same, *LARGEST]
     return Table("Effect of room descriptors: the same pairs, merged with and without them", head, rows, 2)

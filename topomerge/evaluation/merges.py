@@ -93,7 +93,7 @@ def list_sets(settings: TaskSettings) -> list[str]:
 
 
 def list_inputs(settings: TaskSettings) -> list[str]:
-    """Names of the sets: a split and a recipe say all about a pair."""
+    """Return names of the sets: a split and a recipe say all about a pair."""
     return [f"{name} {settings.data.limit} {getattr(settings, 'path', '')}".strip() for name in list_sets(settings)]
 
 
@@ -160,11 +160,11 @@ def score_pair(pair: GridPair, split: str) -> Row:
 def time_registration(a: Any, b: Any, scaled: bool, free: Any = None) -> tuple[Row, Registration]:
     """Register two maps on one core: what it says, and the seconds."""
     began = time.process_time()
-    words = {} if free is None else {"free": free}
+    options = {} if free is None else {"free": free}
     with limit_threads():
-        registration = register(a, b, scale="free" if scaled else "fixed", **words)
-    said = {"probability": registration.probability, "believed": registration.accepted, "posterior": registration.posterior}
-    return {**said, "seconds": time.process_time() - began}, registration
+        registration = register(a, b, scale="free" if scaled else "fixed", **options)
+    outcome = {"probability": registration.probability, "believed": registration.accepted, "posterior": registration.posterior}
+    return {**outcome, "seconds": time.process_time() - began}, registration
 
 
 def compare_pose(pose: Sim3 | None, pair: GridPair) -> Row:

@@ -191,7 +191,7 @@ def build_fixed_descriptor(maps: Maps, rows: tuple[Rows, Rows]) -> Descriptor:
 
 
 def match_mutually(learned: Any, maps: Maps) -> tuple[Array, Array]:
-    """Rooms that are each other's likeliest partner, likelier than none, and how likely: the geometric mean of both sides.
+    """Return rooms that are each other's likeliest partner, likelier than none, and how likely: the geometric mean of both sides.
 
     Raises:
         InputError: the embedder tells no probabilities.
@@ -229,12 +229,12 @@ def _choose_scale(pair: EvaluationPair) -> str:
 
 
 def _build_verdict(
-    registration: Registration | None, believed: bool, matches: Sequence[RoomMatch], seconds: float
+    registration: Registration | None, accepted: bool, matches: Sequence[RoomMatch], seconds: float
 ) -> dict[str, Any]:
     transform = None if registration is None else registration.transform
     return {
         "probability": float(registration.probability) if registration else 0.0,
-        "believed": believed,
+        "believed": accepted,
         "threshold": float(load_model()["threshold"]),
         "pose": None if transform is None else transform.matrix.tolist(),
         "rooms": [list(m.rooms) for m in matches],
@@ -248,10 +248,10 @@ def predict_all(pairs: Sequence[Path], folder: Path, settings: Evaluation, log_l
     folder.mkdir(parents=True, exist_ok=True)
     targets = [folder / f"{p.stem}.npz" for p in pairs]
     left = [(p, t) for p, t in zip(pairs, targets, strict=True) if settings.remake or not t.exists()]
-    said = time.monotonic()
+    last = time.monotonic()
     for number, _ in enumerate(_iter_predicted(left, settings), 1):
-        if time.monotonic() - said > 10 or number == len(left):
-            said = time.monotonic()
+        if time.monotonic() - last > 10 or number == len(left):
+            last = time.monotonic()
             log_line(f"{len(targets) - len(left) + number} of {len(targets)} pairs predicted")
     return targets
 

@@ -62,7 +62,7 @@ class Settings(TaskSettings):
 
 
 def list_inputs(settings: Settings) -> list[str]:
-    """Names of what is measured."""
+    """Return names of what is measured."""
     if settings.data.set == "storeys":
         return [f"{building} {part}" for building in STOREYS for part in range(PARTS)]
     return [f"{name} {walks or 'all'}" for name in WIFI_STOREYS for walks in WALKS]
@@ -97,8 +97,8 @@ def measure_walks(name: str, walks: int, trials: int) -> Row:
         at = collect_radio_scans(b.landmarks).position
         errors = [float(np.linalg.norm((p.pose.apply(at) - truth.apply(at))[:, :2], axis=1).mean()) for p in found]
         best = found[0] if found else None
-        told = (best.probability, best.sigma, best.is_sure) if best else (0.0, 999.0, False)
-        rows.append([errors[0] if found else 999.0, *told, min(errors, default=999.0)])
+        outcome = (best.probability, best.sigma, best.is_sure) if best else (0.0, 999.0, False)
+        rows.append([errors[0] if found else 999.0, *outcome, min(errors, default=999.0)])
     row: Row = {"storey": name, "walks": walks, "trials": rows}
     if walks == 0:
         row["ranked"] = dict.fromkeys(QUERIES, 0)
@@ -146,9 +146,9 @@ def simulate_sessions(plan: RadioPlan, plans: Sequence[RadioPlan], part: int) ->
     for session, side in enumerate(sides):
         track = plan.free[side]
         track = track[np.unique(np.floor(track / TRACK_GAP), axis=0, return_index=True)[1]]
-        heard = simulate_readings(plans, points, track, plan.level, settings, session)
-        heard.table["position"][:, 2] = HELD
-        out.append(heard)
+        readings = simulate_readings(plans, points, track, plan.level, settings, session)
+        readings.table["position"][:, 2] = HELD
+        out.append(readings)
     return out[0], out[1]
 
 

@@ -75,7 +75,7 @@ class Search:
 
 
 def get_building(pair: EvaluationPair) -> str:
-    """The physical building of a pair."""
+    """Return the physical building of a pair."""
     return find_physical_building(str(pair.about["source"]), str(pair.about["building"]))
 
 
@@ -124,7 +124,7 @@ def search_real_pairs(
 
 
 def measure_named_partners(pairs: Sequence[tuple[Rows, Rows]]) -> float:
-    """Share of pairs of which one map names the other, in an atlas of all of them."""
+    """Return share of pairs of which one map names the other, in an atlas of all of them."""
     named = list(iter_most_similar([a for a, _ in pairs] + [b for _, b in pairs], FIRST[-1]))
     return float(np.mean([k + len(pairs) in named[k] or k in named[k + len(pairs)] for k in range(len(pairs))]))
 
@@ -135,15 +135,15 @@ def format_partners(pairs: Sequence[EvaluationPair], rows: Sequence[tuple[Rows, 
     rng = np.random.default_rng(0)
     draws = [rng.permutation(len(common))[:PARTNER_PAIRS] for _ in range(PARTNER_DRAWS)]
     few = np.mean([measure_named_partners([common[k] for k in draw]) for draw in draws])
-    said = f"Pairs in which one map is among the {FIRST[-1]} most similar of the other: {few:.2f} of {PARTNER_PAIRS} pairs in an"
+    text = f"Pairs in which one map is among the {FIRST[-1]} most similar of the other: {few:.2f} of {PARTNER_PAIRS} pairs in an"
     all_of_them = f"{measure_named_partners(common):.2f} of {len(common)} in one of {2 * len(common)}"
-    return f"{said} atlas of {2 * PARTNER_PAIRS} maps ({PARTNER_DRAWS} draws), {all_of_them}."
+    return f"{text} atlas of {2 * PARTNER_PAIRS} maps ({PARTNER_DRAWS} draws), {all_of_them}."
 
 
 def table(results: Sequence[tuple[str, Sequence[Search]]], maps: int, buildings: int, rooms: int) -> str:
     """Named results as Markdown."""
     groups = np.array([r.building for r in results[0][1]])
-    chance = [1 - (1 - 1 / buildings) ** n for n in FIRST]
+    by_chance = [1 - (1 - 1 / buildings) ** n for n in FIRST]
     lines = [
         f"Queries: {len(groups)} maps of {len(set(groups))} physical buildings; atlas: {maps} maps of {buildings} buildings with "
         f"{rooms} rooms. In brackets 95 % intervals over buildings.",
@@ -157,7 +157,7 @@ def table(results: Sequence[tuple[str, Sequence[Search]]], maps: int, buildings:
         same = np.mean([r.first == one.first for r, one in zip(of, results[0][1], strict=True)])
         seconds = np.median([r.seconds for r in of])
         lines.append(f"| {name} | {' | '.join(first)} | {same:.2f} | {right} | {seconds:.2f} |")
-    return "\n".join([*lines, f"| by chance | {' | '.join(f'{c:.2f}' for c in chance)} | | | |"])
+    return "\n".join([*lines, f"| by chance | {' | '.join(f'{c:.2f}' for c in by_chance)} | | | |"])
 
 
 def load_real_pairs(cache: Path) -> list[EvaluationPair]:
@@ -183,7 +183,7 @@ def find_manifest(settings: Settings, log_line: LogFn) -> Path:
 
 
 def list_inputs(settings: Settings) -> list[str]:
-    """Names of set and descriptor."""
+    """Return names of set and descriptor."""
     return [settings.data.set, settings.path or settings.manifest, settings.descriptor]
 
 
@@ -195,10 +195,10 @@ def measure(settings: Settings, log_line: LogFn) -> list[Row]:
     log_line(f"{len(rows)} pairs described")
     if settings.data.set == "real":
         real = load_real_pairs(Path(settings.cache) / "evaluation")
-        results, said = search_real_pairs(pairs, rows, real, describe)
+        results, summary = search_real_pairs(pairs, rows, real, describe)
         atlas = [*real, *pairs]
         text = table([(name, results)], len(atlas), len({get_building(pair) for pair in atlas}), count_rooms(atlas))
-        return [{"name": "retrieval-real", "text": f"{text}\n\n{said}"}]
+        return [{"name": "retrieval-real", "text": f"{text}\n\n{summary}"}]
     compared = [(name, search_pairs(pairs, rows, len(pairs)))]
     if len(pairs) > SHORTLIST:
         compared.append((f"{name}, shortlist of {SHORTLIST}", search_pairs(pairs, rows, SHORTLIST)))

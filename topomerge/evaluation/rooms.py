@@ -96,7 +96,7 @@ def _list_edited_cases(settings: Settings) -> list[Case]:
 
 
 def list_inputs(settings: Settings) -> list[str]:
-    """Names of the scans."""
+    """Return names of the scans."""
     return [f"{case.key} {settings.presets}" for case in list_cases(settings)]
 
 

@@ -86,8 +86,8 @@ class Case:
         *above, plan = Path(self.building).parts
         plan = plan if self.source != "r2v" else f"{above[-1][-6:]}_{plan}"
         source = self.source if self.source != "procedural" else ""
-        words = [self.set, source, plan, self.seed or "", self.sensor, self.spoil, f"day{self.day}" if self.day else ""]
-        return re.sub(r"[^\w.-]+", "_", "-".join(str(w) for w in words if w))
+        parts = [self.set, source, plan, self.seed or "", self.sensor, self.spoil, f"day{self.day}" if self.day else ""]
+        return re.sub(r"[^\w.-]+", "_", "-".join(str(w) for w in parts if w))
 
     @property
     def key(self) -> str:
@@ -111,9 +111,9 @@ def load_scan(case: Case, folder: Path, data: Path | None) -> Scan:
     path = folder / f"{case.key}.npz" if case.source != EDITED_SOURCE else Path(case.building)
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        made = make_scan(case, data)
-        with replace_on_success(path) as beside, open(beside, "wb") as file:
-            np.savez(file, allow_pickle=False, **_build_arrays(made))
+        scan = make_scan(case, data)
+        with replace_on_success(path) as temporary, open(temporary, "wb") as file:
+            np.savez(file, allow_pickle=False, **_build_arrays(scan))
     with np.load(path, allow_pickle=False) as file:
         return _build_scan(dict(file))
 
@@ -213,7 +213,7 @@ def find_plan(source: str, name: str, data: Path) -> Any:
 
 
 def raise_grid(case: Case, grid: Path, plan: Path) -> Scan:
-    """A robot's grid with its walls raised, and the rooms and doors of its plan. GDC's list of rooms is not complete."""
+    """Return a robot's grid with its walls raised, and the rooms and doors of its plan. GDC's list of rooms is not complete."""
     from topomerge.datasets.buildings.construction import build_building
     from topomerge.datasets.plans.floorplans import read_plans
 
@@ -278,8 +278,8 @@ def save_picture(scan: Scan, map: TopometricMap, columns: Array, verdict: Any, t
             draw_storey(axes, scan, map, columns[k], k, verdict, points)
         figure.suptitle(title, fontsize=9)
         figure.tight_layout()
-        with replace_on_success(path) as beside:
-            figure.savefig(beside, format="png", dpi=80)
+        with replace_on_success(path) as temporary:
+            figure.savefig(temporary, format="png", dpi=80)
 
 
 def draw_storey(axes: Any, scan: Scan, map: TopometricMap, labels: Array, k: int, verdict: Any, points: Array) -> None:

@@ -84,10 +84,10 @@ def score_all(pairs: Sequence[Path], predictions: Sequence[Path], settings: Eval
                 {**head, "seconds": record["seconds"][v.name], **count_ranks(pair, cost), **count_ranks_after(pair, cost, agreed)}
             )
             for method in v.methods:
-                rooms, chance = data[f"{v.name}/{method}/rooms"], data[f"{v.name}/{method}/probability"]
+                rooms, text = data[f"{v.name}/{method}/rooms"], data[f"{v.name}/{method}/probability"]
                 seconds = float(data[f"{v.name}/{method}/seconds"])
                 row = {**head, "method": method, "seconds": seconds, **count_matches(pair, rooms)}
-                matches.append({**row, "chance": chance.tolist(), "good": is_right_match(pair, rooms).tolist()})
+                matches.append({**row, "chance": text.tolist(), "good": is_right_match(pair, rooms).tolist()})
         if record["merge"]:
             floors = collect_room_floors(pair.load_maps()[1], find_shared_rooms(pair).values())
             merges += [{**about, "variant": n, **count_merges(pair, verdict, floors)} for n, verdict in record["merge"].items()]
@@ -205,16 +205,16 @@ def count_ranks(pair: EvaluationPair, cost: Array) -> Row:
     """`queries`: rooms of either map with a true partner in the other; `first`, `five`: whose partner ranks first, within five;
     `reciprocal`: sum of 1 / rank; each also with and without a twin, and where neither room was looked into only (`_whole`), or
     one was (`_glimpsed`). `chance`: first ones to be expected of a draw."""
-    rank, twin, entered, chance = [], [], [], 0.0
+    rank, twin, entered, by_chance = [], [], [], 0.0
     for side, c, m in ((0, cost, pair.matches), (1, cost.T, pair.matches[:, ::-1])):
         rooms, room_ranks = rank_partners(c, m)
         rank.append(room_ranks)
         twin.append(pair.twin[side][rooms])
         entered_rooms = m[~pair.glimpsed[side][m[:, 0]] & ~pair.glimpsed[1 - side][m[:, 1]], 0]
         entered.append(np.isin(rooms, entered_rooms))
-        chance += len(m) / max(c.shape[1], 1)
+        by_chance += len(m) / max(c.shape[1], 1)
     r, t, w = np.concatenate(rank), np.concatenate(twin).astype(bool), np.concatenate(entered)
-    out: Row = {"pairs": 1, "chance": chance}
+    out: Row = {"pairs": 1, "chance": by_chance}
     for name, queries in zip((*GROUPS, WHOLE, GLIMPSED), (t | True, t, ~t, w, ~w), strict=True):
         out[f"queries{name}"] = int(queries.sum())
         out[f"first{name}"] = int((r[queries] == 1).sum())
@@ -269,17 +269,17 @@ def count_merges(pair: EvaluationPair, verdict: Mapping[str, Any], floors: Seque
         flat = any(s in FLAT_SENSORS for s in pair.about["sensors"])
         near, fine = is_within(error, flat, NEAR_POSE), is_within(error, flat, FINE_POSE)
         off = measure_displacements(pose, pair.transform, floors, flat and is_on_storey(error[1]))
-    believed = bool(verdict["believed"])
+    accepted = bool(verdict["believed"])
     rooms = np.array(verdict["rooms"], np.int64).reshape(-1, 2)
     return {
         "mergeable": int(mergeable),
         "near": int(near),
         "fine": int(fine),
-        "believed": int(believed),
-        "merged": int(believed and near),
-        "merged_fine": int(believed and fine),
-        "false": int(believed and not near),
-        "refused": int(near and not believed),
+        "believed": int(accepted),
+        "merged": int(accepted and near),
+        "merged_fine": int(accepted and fine),
+        "false": int(accepted and not near),
+        "refused": int(near and not accepted),
         "with_rooms": int(len(off) > 0),
         "every_room": int(len(off) > 0 and bool((off <= ROOM_NEAR).all())),
         "rooms_shared": len(off),

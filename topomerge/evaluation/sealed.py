@@ -41,7 +41,7 @@ once a release by `make sealed`. Blocks are appended, never written again.
 
 
 def measure_sealed_item(item: SealedItem, split: str) -> list[Row]:
-    """The rows of an item, in this process; the gate is open for as long as that takes."""
+    """Return the rows of an item, in this process; the gate is open for as long as that takes."""
     with open_sealed_set() if split == SEALED else nullcontext():
         return measured(item)
 
@@ -57,14 +57,14 @@ def run(
     print(f"sealed: {len(items)} items", file=sys.stderr, flush=True)
     if jobs == 1:
         return [row for item in items for row in measure_sealed_item(item, split)]
-    made: Iterable[list[Row]] = Parallel(jobs, batch_size=1, pre_dispatch=jobs)(
+    results: Iterable[list[Row]] = Parallel(jobs, batch_size=1, pre_dispatch=jobs)(
         delayed(measure_sealed_item)(i, split) for i in items
     )
-    return [row for rows in made for row in rows]
+    return [row for rows in results for row in rows]
 
 
 def commit() -> str:
-    """The commit of the sources, with a word where they differ from it; nothing outside a checkout."""
+    """Return the commit of the sources, with a word where they differ from it; nothing outside a checkout."""
     named, changed = read_commit()
     return f"{named[:12]} with changes that are not committed" if changed else named[:12]
 
@@ -101,8 +101,8 @@ def format_block(rows: Sequence[Row], version: str, command: str, seconds: float
 def append_text(page: Path, text: str) -> None:
     """Add text to the end of a page: what stands there stays as it is, byte for byte, and the page is whole at any time."""
     before = page.read_bytes() if page.is_file() else HEAD.encode()
-    with replace_on_success(page) as beside:
-        beside.write_bytes(before + text.encode())
+    with replace_on_success(page) as temporary:
+        temporary.write_bytes(before + text.encode())
 
 
 def parse_public_sets(words: Sequence[str]) -> list[tuple[str, Path]]:

@@ -63,7 +63,7 @@ RANKED_METRICS = ("recall@1", "recall@1_single", "recall@5")
 
 
 def rank_building_rooms(kind: str, seed: int, sensors: tuple[str, str]) -> list[Row]:
-    """Two scans of a procedural building."""
+    """Return two scans of a procedural building."""
     settings = PairSettings(overlap=RANKED_OVERLAP, sensors=sensors, rooms=RANKED_ROOMS)
     pair = make_pair(make_building(kind, seed), settings, seed, source="procedural")
     return count_pair_ranks(pair, find_physical_building("procedural", pair.building))
@@ -100,7 +100,7 @@ def build_evaluation_pair(pair: Pair, maps: Sequence[TopometricMap]) -> Evaluati
 
 
 def table(rows: Sequence[Row]) -> list[str]:
-    """Lines in Markdown."""
+    """Return lines in Markdown."""
     out = ["| ranking of rooms | embedder | pairs | buildings | rooms with a partner | recall@1 | without twin | recall@5 |"]
     out.append("|" + "---|" * 8)
     for group in dict.fromkeys(row["group"] for row in rows):
@@ -171,7 +171,7 @@ def list_items(split: str, data: Path | None, public: Sequence[tuple[str, Path]]
 
 
 def measured(item: SealedItem) -> list[Row]:
-    """The rows of an item; of one that fails, one that says why."""
+    """Return the rows of an item; of one that fails, one that says why."""
     about = {"part": item.part, "group": item.group}
     try:
         with (
@@ -185,12 +185,12 @@ def measured(item: SealedItem) -> list[Row]:
 
 
 def measure_rooms(case: Case) -> list[Row]:
-    """Rooms of a procedural building."""
+    """Return rooms of a procedural building."""
     return [_build_room_row(make_scan(case, None), f"procedural/{case.building}-{case.seed}")]
 
 
 def measure_plan_rooms(folder: Path, name: str) -> list[Row]:
-    """Rooms of a plan that is erected and scanned."""
+    """Return rooms of a plan that is erected and scanned."""
     source, building = _load_plan(folder, name)
     case = Case("real plans", source, name, "tls", 1, rooms=min(VISITED_ROOMS["plan"], len(building.rooms)))
     return [_build_room_row(simulate_case(case, building), find_physical_building(source, name))]
@@ -223,13 +223,13 @@ def _load_plan(folder: Path, name: str) -> tuple[str, Any]:
 
 
 def measure_plan_pair(folder: Path, name: str) -> list[Row]:
-    """Two scans of a plan, half of their rooms in common."""
+    """Return two scans of a plan, half of their rooms in common."""
     pair = _simulate_plan_pair(folder, name)
     return [build_merge_row(_build_grid_pair(pair), find_physical_building(pair.source, name))]
 
 
 def rank_plan_rooms(folder: Path, name: str) -> list[Row]:
-    """The ranking of rooms between these scans."""
+    """Return the ranking of rooms between these scans."""
     pair = _simulate_plan_pair(folder, name)
     return count_pair_ranks(pair, find_physical_building(pair.source, name))
 
@@ -241,17 +241,17 @@ def _simulate_plan_pair(folder: Path, name: str) -> Pair:
 
 
 def measure_grid_pair(item: GridItem) -> list[Row]:
-    """A pair of grids, made in a folder that goes with it."""
+    """Return a pair of grids, made in a folder that goes with it."""
     with tempfile.TemporaryDirectory() as folder:
-        made = make_grids(item, [], folder)
-        if made.reason:
-            raise InputError(made.reason)
+        scan = make_grids(item, [], folder)
+        if scan.reason:
+            raise InputError(scan.reason)
         pair = load_grids(Path(folder) / f"{item.name}.npz")
     return [build_merge_row(pair, find_physical_building("procedural", str(pair.about["building"])))]
 
 
 def measure_public_pairs(source: str, folder: Path) -> list[Row]:
-    """The sealed pairs of a published set; of those that can't be read a row that says why."""
+    """Return the sealed pairs of a published set; of those that can't be read a row that says why."""
     out = []
     for name, pair in iter_public_pairs(folder, source):
         if not is_sealed(source, name.removeprefix(f"{source}/")):
@@ -283,7 +283,7 @@ def measure_robot_pairs(data: Path) -> list[Row]:
 
 
 def rank_robot_rooms(data: Path) -> list[Row]:
-    """The ranking of rooms between both halves of each sealed grid."""
+    """Return the ranking of rooms between both halves of each sealed grid."""
     out: list[Row] = []
     for number, (name, flats) in enumerate(load_robot_halves(data).items()):
         place = find_physical_building("strands", name)
@@ -304,15 +304,15 @@ def _build_grid_pair(pair: Pair) -> GridPair:
 
 def build_merge_row(pair: GridPair, place: str) -> Row:
     """What became of a pair."""
-    said, registration = time_registration(pair.a, pair.b, bool(pair.about.get("scaled")), pair.free)
+    outcome, registration = time_registration(pair.a, pair.b, bool(pair.about.get("scaled")), pair.free)
     pose = registration.transform
     about = {key: pair.about.get(key) for key in ("sensors", "kind", "overlap", "differs")}
-    row = {"place": place, "common": pair.common, **about, "believed": said["believed"], "probability": said["probability"]}
+    row = {"place": place, "common": pair.common, **about, "believed": outcome["believed"], "probability": outcome["probability"]}
     return row | compare_pose(pose, pair) | {"answered": pose is not None}
 
 
 def load_robot_halves(data: Path) -> dict[str, tuple[FlatMap, FlatMap] | str]:
-    """Both halves of each sealed grid of known scale, or why there are none."""
+    """Return both halves of each sealed grid of known scale, or why there are none."""
     out: dict[str, tuple[FlatMap, FlatMap] | str] = {}
     folder = data / SEALED_FOLDERS["strands"][0]
     for number, path in enumerate(sorted(p for p in folder.rglob("*.yaml") if is_sealed_file(p))):
@@ -324,12 +324,12 @@ def load_robot_halves(data: Path) -> dict[str, tuple[FlatMap, FlatMap] | str]:
 
 
 def build_pair(name: str, flats: tuple[FlatMap, FlatMap], place: str, number: int) -> Pair:
-    """A pair of both halves, each in a frame of its own."""
+    """Return a pair of both halves, each in a frame of its own."""
     return build_flat_pair(name, *flats, Sim3(), ("laser2d", "laser2d"), "strands", place, number)
 
 
 def cut_floor(flat: FlatMap, seed: int) -> tuple[FlatMap, FlatMap]:
-    """Two parts of a floor, each `HALF` of its free floor, cut across at any angle.
+    """Return two parts of a floor, each `HALF` of its free floor, cut across at any angle.
 
     Raises:
         InputError: no free floor.
@@ -349,7 +349,7 @@ def select_part(flat: FlatMap, inside: Callable[[Array], Array]) -> FlatMap:
 
 # Tables
 def classify_merge(row: Row) -> str:
-    """The row of the table that a pair belongs to."""
+    """Return the row of the table that a pair belongs to."""
     if row["kind"] != "overlap":
         alike = "" if is_distinguishable(row) else ", which nobody can tell apart"
         return f"{row['group']}: {row['kind'].replace('-', ' ')}{alike}"
@@ -359,7 +359,7 @@ def classify_merge(row: Row) -> str:
 
 
 def format_tables(rows: Sequence[Row]) -> Iterator[str]:
-    """Lines in Markdown: of each part that was measured, and what could not be."""
+    """Yield lines in Markdown: of each part that was measured, and what could not be."""
     fine = [row for row in rows if "failed" not in row]
     for part, lines in (("rooms", iter_room_table), ("merges", iter_merge_table), ("ranking", table)):
         if some := [row for row in fine if row["part"] == part]:
@@ -370,10 +370,10 @@ def format_tables(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def iter_room_table(rooms: Sequence[Row]) -> Iterator[str]:
-    """Rooms by sensor."""
+    """Yield rooms by sensor."""
     yield from ("| rooms, maps of | maps | IoU | MCC | recall | precision |", "|---|---|---|---|---|---|")
-    made = [row for row in rooms if row["group"] != "real plans"]
-    for group, some in [*group_by_key(rooms, lambda row: row["group"]), ("all made buildings", made)]:
+    simulated = [row for row in rooms if row["group"] != "real plans"]
+    for group, some in [*group_by_key(rooms, lambda row: row["group"]), ("all made buildings", simulated)]:
         scores = [
             format_interval(np.array([r[k] for r in some]), np.array([r["place"] for r in some]))
             for k in ("iou", "mcc", "recall", "precision")

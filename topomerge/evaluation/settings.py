@@ -141,8 +141,8 @@ def check(settings: Evaluation) -> None:
         if not list_runs(run):
             raise InputError(f"run={run}: no run, and no folder of runs; name a run that was trained")
     names = [v.name for v in iter_variants(settings)]
-    if again := next((name for name in names if names.count(name) > 1), ""):
-        raise InputError(f"run: two are called {again!r}; rename a folder, or set titles=true")
+    if repeated := next((name for name in names if names.count(name) > 1), ""):
+        raise InputError(f"run: two are called {repeated!r}; rename a folder, or set titles=true")
 
 
 def iter_variants(settings: Evaluation) -> Iterator[Variant]:
@@ -192,9 +192,9 @@ def format_run_title(run: str) -> str:
         "around": node.around,
         "ways": node.ways,
     }
-    words = [node.kind, *(word for word, so in features.items() if so and node.kind != "none")]
+    text = [node.kind, *(word for word, so in features.items() if so and node.kind != "none")]
     seed = f", seed {about['seed']}" if about.get("seed") else ""
-    return f"{' + '.join(network.geometry.parts)}, {' '.join(words)}, {about.get('loss', 'infonce')}{seed}"
+    return f"{' + '.join(network.geometry.parts)}, {' '.join(text)}, {about.get('loss', 'infonce')}{seed}"
 
 
 def get_folder(settings: Evaluation) -> Path:

@@ -194,9 +194,9 @@ def tabulate_robustness(ranks: Sequence[Row], matches: Sequence[Row], merges: Se
                     format_value(compute_value([m for m in these if m["method"] == k], "F1", settings.rounds))
                     for k in _list_methods(matches)
                 ]
-                there = [r for r in ranks if (r["change"], r["value"], r["variant"]) == (change, v, name)]
+                present = [r for r in ranks if (r["change"], r["value"], r["variant"]) == (change, v, name)]
                 joined = [r for r in merges if (r["change"], r["value"], r["variant"]) == (change, v, name)]
-                first = compute_value(there, "recall@1", settings.rounds)
+                first = compute_value(present, "recall@1", settings.rounds)
                 right = format_value(compute_value(joined, "merged", settings.rounds), False)
                 rows.append([change, f"{v:g}", name, str(first.pairs), format_value(first), *cells, right])
     head = ["change", "value", "descriptor", "pairs", "recall@1", *(f"F1 {m}" for m in _list_methods(matches)), "merged right"]
@@ -228,7 +228,7 @@ def write_csv(rows: Sequence[Row], path: Path) -> None:
     if not rows:
         return
     names = [n for n in rows[0] if not isinstance(rows[0][n], list)]
-    with replace_on_success(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
+    with replace_on_success(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, names, extrasaction="ignore")
         writer.writeheader()
         writer.writerows({n: f"{r[n]:.6g}" if isinstance(r[n], float) else r[n] for n in names} for r in rows)
@@ -241,5 +241,5 @@ def write_section(path: Path, mark: str, text: str) -> None:
     if begin not in page or end not in page:
         page = f"{page.rstrip()}\n\n## {mark.capitalize()}\n\n{begin}\n{end}\n"
     before, rest = page.split(begin, 1)
-    with replace_on_success(path) as beside:
-        beside.write_text(f"{before}{begin}\n{text}\n{end}{rest.split(end, 1)[1]}", encoding="utf-8")
+    with replace_on_success(path) as temporary:
+        temporary.write_text(f"{before}{begin}\n{text}\n{end}{rest.split(end, 1)[1]}", encoding="utf-8")

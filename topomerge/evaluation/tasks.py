@@ -105,7 +105,7 @@ class EvaluationModule(Protocol):
         """Tables by the name of their block."""
 
     def list_inputs(self, settings: Any) -> list[str]:
-        """Names of what is measured."""
+        """Return names of what is measured."""
 
     def compute_headline(self, rows: Sequence[Row], settings: Any) -> dict[str, tuple[str, str]]:
         """Figures for the README: name -> (value, of what)."""
@@ -154,8 +154,8 @@ def run_task(task: str, words: Sequence[str], log_line: LogFn) -> Outcome:
     summary = "\n\n".join(blocks.values())
     folder = Path(settings.folder) / f"{task}-{(settings.data.set or 'default').replace(',', '-').replace('/', '-')}"
     folder.mkdir(parents=True, exist_ok=True)
-    with replace_on_success(folder / "report.md") as beside:
-        beside.write_text(f"# {folder.name}\n\n{summary}\n", encoding="utf-8")
+    with replace_on_success(folder / "report.md") as temporary:
+        temporary.write_text(f"# {folder.name}\n\n{summary}\n", encoding="utf-8")
     stamp = build_stamp(
         shlex.join(["python", "evaluate.py", f"task={task}", *(w for w in words if not w.startswith("task="))]),
         module.MAKERS,
@@ -185,11 +185,11 @@ def list_inputs_of(command: str) -> list[str] | None:
     Raises:
         InputError: the command is not taken any more, or its data is not here.
     """
-    words = shlex.split(command)
-    task = next((w[5:] for w in words if w.startswith("task=")), "")
-    if words[:2] != ["python", "evaluate.py"] or task not in MODULES:
+    arguments = shlex.split(command)
+    task = next((w[5:] for w in arguments if w.startswith("task=")), "")
+    if arguments[:2] != ["python", "evaluate.py"] or task not in MODULES:
         return None
-    return load_task(task).list_inputs(read_settings(task, words[2:]))
+    return load_task(task).list_inputs(read_settings(task, arguments[2:]))
 
 
 def measure_missing(
@@ -289,14 +289,14 @@ def make_pair_files(split: str, cache: str, jobs: int, log_line: LogFn, limit: i
     """
     find_real_data()
     settings = read_recipe(split, (f"cache={cache}", f"jobs={jobs}", f"data.limit={limit}"))
-    made = build_drawings if split.endswith(DRAWN) else build_grids
-    return list(made(settings.data, settings, log_line)[0])
+    build = build_drawings if split.endswith(DRAWN) else build_grids
+    return list(build(settings.data, settings, log_line)[0])
 
 
 def make_lookalike_files(split: str, cache: str, jobs: int, log_line: LogFn, limit: int = 0) -> list[Path]:
     """Make the files of look-alikes of a split that are missing; all, or so many of them, in their order."""
-    words = [f"data={LOOKALIKE_SETS[split]}", f"data.limit={limit}", f"cache={cache}", f"jobs={jobs}"]
-    settings = compose("build", LookalikeBuild, words)
+    arguments = [f"data={LOOKALIKE_SETS[split]}", f"data.limit={limit}", f"cache={cache}", f"jobs={jobs}"]
+    settings = compose("build", LookalikeBuild, arguments)
     paths, report = build_lookalikes(settings.data, settings, log_line)
     log_line(f"{report.items} pairs, {report.made} made now; refused: {report.refused}")
     return paths
@@ -330,7 +330,7 @@ def map_other_buildings(split: str) -> dict[tuple[int, int], str]:
 
 
 def find_buildings(pair: GridPair, split: str) -> tuple[str, str]:
-    """Names of the buildings of a and of b of a cached pair."""
+    """Return names of the buildings of a and of b of a cached pair."""
     about: dict[str, Any] = pair.about
     whole = str(about["building"])
     if about["kind"] != "other-building":

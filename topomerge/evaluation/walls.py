@@ -72,7 +72,7 @@ def draw_cases(development: bool) -> list[Case]:
 
 
 def list_inputs(settings: TaskSettings) -> list[str]:
-    """Names of the scans."""
+    """Return names of the scans."""
     return [case.key for case in limit_cases(draw_cases(settings.data.set == "dev"), settings)]
 
 
@@ -178,9 +178,9 @@ def measure_distances(at: Array, out: Array, others: Array, outs: Array) -> Arra
             ok = np.flatnonzero(np.isfinite(far[:, k]))
             r = rows[ok, k]
             same = (out[ok] * outs[r]).sum(axis=1) > TURNED
-            beside = np.abs((at[ok] - others[r])[:, 0] * outs[r, 1] - (at[ok] - others[r])[:, 1] * outs[r, 0]) < 0.1
+            near = np.abs((at[ok] - others[r])[:, 0] * outs[r, 1] - (at[ok] - others[r])[:, 1] * outs[r, 0]) < 0.1
             across = np.abs(((at[ok] - others[r]) * outs[r]).sum(axis=1))
-            use = same & beside
+            use = same & near
             off[ok[use]] = np.minimum(off[ok[use]], across[use])
     return off
 
@@ -257,7 +257,7 @@ def measure_overlaps(
 
 
 def format_summary(row: Row) -> dict[str, float]:
-    """The figures of a map, or of several whose places were put together."""
+    """Return the figures of a map, or of several whose places were put together."""
     finite = row["off"][np.isfinite(row["off"])]
     none = ~(row["off"] <= NONE)
     return {

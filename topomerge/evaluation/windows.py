@@ -55,13 +55,13 @@ class Settings(TaskSettings):
 def draw_cases(development: bool) -> list[Case]:
     """Draw every kind of building by each sensor."""
     first = WINDOW_TRAINING if development else WINDOW_SEEDS
-    made = [(kind, sensor) for sensor in OTHER_SENSORS for kind in BUILDING_KINDS]
-    others = [Case("windows", "procedural", kind, sensor, first + i, rooms=8) for i, (kind, sensor) in enumerate(made)]
+    cases = [(kind, sensor) for sensor in OTHER_SENSORS for kind in BUILDING_KINDS]
+    others = [Case("windows", "procedural", kind, sensor, first + i, rooms=8) for i, (kind, sensor) in enumerate(cases)]
     return doors.draw_cases(development) + others
 
 
 def list_inputs(settings: TaskSettings) -> list[str]:
-    """Names of the scans."""
+    """Return names of the scans."""
     return [case.key for case in limit_cases(draw_cases(settings.data.set == "dev"), settings)]
 
 
@@ -92,11 +92,11 @@ def score_windows(case: Case, scan: Scan, map: TopometricMap) -> Row:
     direction = np.arctan2(*(turned - at)[:, 1::-1].T)
     pairs = pair_windows(true, at, direction, own["width"])
     requested = find_in_visited(scan, true)
-    there = np.isin(np.arange(len(true)), pairs[:, 0])
+    present = np.isin(np.arange(len(true)), pairs[:, 0])
     t, m = true[pairs[:, 0]], own[pairs[:, 1]]
     errors = {"off": np.linalg.norm((at[pairs[:, 1]] - t[:, :3])[:, :2], axis=1), "width": np.abs(m["width"] - t[:, 4])}
     errors |= {"sill": np.abs(m["sill"] - t[:, 5]), "head": np.abs(m["head"] - t[:, 6])}
-    counts = {"right": [len(pairs), len(own)], "there": [int((there & requested).sum()), int(requested.sum())]}
+    counts = {"right": [len(pairs), len(own)], "there": [int((present & requested).sum()), int(requested.sum())]}
     return {"sensor": case.sensor, **counts, **{name: values.tolist() for name, values in errors.items()}}
 
 

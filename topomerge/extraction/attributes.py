@@ -27,7 +27,7 @@ SIDES_AT = (0.4, 0.6, 0.8)  # m before and behind a door, where its rooms are lo
 
 
 def select_distinct_doors(map: TopometricMap) -> TopometricMap:
-    """The map with each doorway once: of edges in one place the one whose rooms lie across it, of these the surest."""
+    """Return the map with each doorway once: of edges in one place the one whose rooms lie across it, of these the surest."""
     level = np.flatnonzero(np.isin(map.edges["kind"], LEVEL_KINDS))
     doors = map.edges[level]
     same = cKDTree(doors["centre"]).query_ball_point(doors["centre"], ONE_DOORWAY) if len(doors) else ()
@@ -79,7 +79,7 @@ NO_OTHER_DOOR = 1.2  # m about it: a way that drifted leads through the wall bes
 
 
 def add_walked_doors(map: TopometricMap, places: Array) -> tuple[TopometricMap, str]:
-    """The map with the doors through which a sensor was carried, and what the user should know about its way, or nothing.
+    """Return the map with the doors through which a sensor was carried, and what the user should know about its way, or nothing.
 
     Args:
         places: (n, 3) m, where the sensor was, in its order.
@@ -129,8 +129,8 @@ def _find_shut_door(map: TopometricMap, places: Array, strange: Sequence[Crossin
     if sorted(sides.tolist()) != list(rooms):
         return none
     apart = map.edges["centre"] - door["centre"]
-    beside = (np.hypot(*apart[:, :2].T) < NO_OTHER_DOOR) & (np.abs(apart[:, 2]) < SENSOR_HEIGHT[1])
-    return none if beside.any() else door
+    near = (np.hypot(*apart[:, :2].T) < NO_OTHER_DOOR) & (np.abs(apart[:, 2]) < SENSOR_HEIGHT[1])
+    return none if near.any() else door
 
 
 def find_room_changes(map: TopometricMap, places: Array) -> list[Crossing]:
@@ -232,7 +232,7 @@ def remove_patches(map: TopometricMap, places: Array) -> TopometricMap:
 def estimate_attributes(
     map: TopometricMap, scan: Scan, floor: Floor, walls: StoreyWalls | None, doors: bool = True
 ) -> tuple[TopometricMap, list[str]]:
-    """The map with how likely each room is one, its doors and windows; and what is odd about the sensor's way.
+    """Return the map with how likely each room is one, its doors and windows; and what is odd about the sensor's way.
 
     Args:
         floor: that the map was made of.

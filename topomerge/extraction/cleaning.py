@@ -83,7 +83,7 @@ def select_without_strays(cells: Array, counts: Array, edge: float) -> tuple[Arr
 
 
 def select_largest_place(cells: Array, counts: Array, edge: float) -> tuple[Array, str]:
-    """The cells of the largest place, and a warning if there are others, where the rectangle around all is absurdly large.
+    """Return the cells of the largest place, and a warning if there are others, where the rectangle around all is absurdly large.
 
     Args:
         cells: (n, 3) int64.

@@ -114,7 +114,7 @@ def build_von_neumann(with_origin: bool = False) -> Kernel:
 
 
 def build_moore(with_origin: bool = False) -> Kernel:
-    """The 26 cells that share a face, an edge or a corner with the origin; the origin itself only if asked for."""
+    """Return the 26 cells that share a face, an edge or a corner with the origin; the origin itself only if asked for."""
     return _build_ball(1.75, 3, 1.0, with_origin)  # sqrt(3) = 1.73 is the corner, 2 the next cell
 
 
@@ -129,7 +129,7 @@ def build_circle(radius: float, edge: float, with_origin: bool = True) -> Kernel
 
 
 def build_cylinder(radius: float, height: float, edge: float) -> Kernel:
-    """An upright cylinder, `height` m rounded up to cells; the origin is the centre of its lowest layer, weight 1."""
+    """Return an upright cylinder, `height` m rounded up to cells; the origin is the centre of its lowest layer, weight 1."""
     disc = build_circle(radius, edge).offsets
     up = np.arange(_count_layers(height, edge))[:, None, None] * (0, 0, 1)
     return Kernel.from_offsets(disc + up)

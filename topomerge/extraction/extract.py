@@ -86,7 +86,7 @@ def score_passages(x: Array, passages: Sequence[Passage], weights: Array) -> Arr
 
 
 def choose_scorer(walls: bool) -> Scorer:
-    """The score of a scan's passages: by all evidence; of slices, raised plans and joined maps by plan and parts.
+    """Return the score of a scan's passages: by all evidence; of slices, raised plans and joined maps by plan and parts.
 
     Args:
         walls: does the scan show walls at heights, and is it of one map?

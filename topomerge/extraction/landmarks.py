@@ -96,9 +96,9 @@ def add_landmarks(map: TopometricMap, landmarks: Landmarks) -> TopometricMap:
         return map
     cleaned = clean_landmarks(landmarks)
     absent = int((cleaned.table["room"] >= len(map.rooms)).sum())
-    words = f"{absent} landmark{'s' * (absent != 1)} of rooms that the map does not have ({len(map.rooms)} rooms, from 0)"
+    text = f"{absent} landmark{'s' * (absent != 1)} of rooms that the map does not have ({len(map.rooms)} rooms, from 0)"
     joined = join_landmarks([map.landmarks, assign_landmarks(map, cleaned)])
-    return replace(map, landmarks=joined, warnings=(*map.warnings, words) if absent else map.warnings)
+    return replace(map, landmarks=joined, warnings=(*map.warnings, text) if absent else map.warnings)
 
 
 def load_map_with_landmarks(path: str | Path) -> TopometricMap:
@@ -107,7 +107,7 @@ def load_map_with_landmarks(path: str | Path) -> TopometricMap:
     Raises:
         InputError: one of both can't be read.
     """
-    map, beside = load_map(path), find_landmark_file(Path(path))
-    if beside is None or beside.name in map.landmarks.sources:
+    map, companion = load_map(path), find_landmark_file(Path(path))
+    if companion is None or companion.name in map.landmarks.sources:
         return map
-    return add_landmarks(map, transform_landmarks(read_landmark_file(beside), lambda p: transform_points(map.levelling, p)))
+    return add_landmarks(map, transform_landmarks(read_landmark_file(companion), lambda p: transform_points(map.levelling, p)))

@@ -92,7 +92,7 @@ def dilate_upwards(grid: VoxelGrid, height: float) -> VoxelGrid:
 
 
 def select_unobstructed(grid: VoxelGrid, stick: Kernel) -> VoxelGrid:
-    """Cells whose convolution with the stick kernel is 0: nothing stands in the room that a body needs above them.
+    """Return cells whose convolution with the stick kernel is 0: nothing stands in the room that a body needs above them.
 
     The seeds sum occupancy under the kernel and keep sum = 0; as no weight is negative, the search may stop at the first cell.
     """

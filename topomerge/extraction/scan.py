@@ -155,12 +155,12 @@ class _Chunks:
                     self.fine.add(chunk)
                 yield chunk
             return
-        with ThreadPoolExecutor(1) as beside:
+        with ThreadPoolExecutor(1) as temporary:
             before: Future[None] | None = None
             for chunk in self._take_in():
                 if before is not None:
                     before.result()
-                before = beside.submit(self.fine.add, chunk)
+                before = temporary.submit(self.fine.add, chunk)
                 yield chunk
             if before is not None:
                 before.result()

@@ -139,13 +139,13 @@ def segment_storey(
         places: (n, 3) m, where the sensor was.
     """
     plan, probability, k = rasters.plans[i], rasters.probabilities[i], rasters.numbers[i]
-    clearance, laid = compute_clearance(plan), rasterise_part_rooms(plan, parts)
-    region = segment_regions(plan, probability, find_boundary_columns(laid) if laid else None)
+    clearance, placed = compute_clearance(plan), rasterise_part_rooms(plan, parts)
+    region = segment_regions(plan, probability, find_boundary_columns(placed) if placed else None)
     if k > 0:
         region = remove_upper_sides(rasters.grid, plan, region, places)
     passages = find_passages(plan, clearance, region, probability)
-    if laid:
-        odds = compute_door_log_odds(region, plan.edge, passages, laid)
+    if placed:
+        odds = compute_door_log_odds(region, plan.edge, passages, placed)
         passages = {pair: replace(passage, log_odds=odds[pair]) for pair, passage in passages.items()}
     growing = GrowingRooms(region, clearance, passages, plan.edge, score_by_plan)
     while growing.door_probability and growing.door_probability[pair := growing.weakest()] <= narrow:
@@ -185,8 +185,8 @@ def score_by_plan(x: Array, passages: Sequence[Passage]) -> Array:
     Args:
         x: (n, 17) `DOOR_FEATURES` of the sides as they have grown.
     """
-    plan, said = predict_door(x), np.array([passage.log_odds for passage in passages])
-    return np.where(said == 0, plan, sigmoid(log_odds(plan) + said))
+    plan, rule_odds = predict_door(x), np.array([passage.log_odds for passage in passages])
+    return np.where(rule_odds == 0, plan, sigmoid(log_odds(plan) + rule_odds))
 
 
 def log_odds(probability: Array) -> Array:
@@ -238,7 +238,7 @@ class GrowingRooms:
                 heappush(self.queue, (probability, pair))
 
     def weakest(self) -> Pair:
-        """The pair that the least likely door parts; there must be one."""
+        """Return the pair that the least likely door parts; there must be one."""
         while self.door_probability.get(self.queue[0][1]) != self.queue[0][0]:
             heappop(self.queue)
         return self.queue[0][1]

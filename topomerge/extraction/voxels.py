@@ -69,7 +69,7 @@ class LatticeCells:
             self.too_many, self._runs, self._far = True, [], []
 
     def get_cells(self) -> _Cells:
-        """Cells (n, 3), counts (n,) and sums (n, 3) of the places of points within them, in `OFFSET_STEPS` parts."""
+        """Return cells (n, 3), counts (n,) and sums (n, 3) of the places of points within them, in `OFFSET_STEPS` parts."""
         if self._origin is None:
             return np.zeros((0, 3), np.int64), np.zeros(0, np.int64), np.zeros((0, 3), np.int64)
         codes, counts, sums = self._unite_runs()

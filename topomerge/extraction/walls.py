@@ -72,18 +72,18 @@ def find_doorways(elevations: Elevations, doors: Array, locate: Locate) -> Array
 
 
 def relabel_walls(walls: StoreyWalls, number: Array) -> StoreyWalls:
-    """The walls with other numbers of what lies beside them: of rooms, once segments were merged.
+    """Return the walls with other numbers of what lies beside them: of rooms, once segments were merged.
 
     Args:
         number: (n,) of each segment, -1 none.
     """
     number = np.append(number, -1)
-    faces, ways = walls.elevations.faces.copy(), walls.doorways.copy()
+    faces, doorways = walls.elevations.faces.copy(), walls.doorways.copy()
     faces["room"] = number[faces["room"]]
-    sides = number[ways["rooms"]]
+    sides = number[doorways["rooms"]]
     sides[sides[:, 0] == sides[:, 1], 1] = -1
-    ways["rooms"] = np.where((sides[:, 0] < 0)[:, None], sides[:, ::-1], sides)
-    return replace(walls, elevations=replace(walls.elevations, faces=faces), doorways=ways[ways["rooms"][:, 0] >= 0])
+    doorways["rooms"] = np.where((sides[:, 0] < 0)[:, None], sides[:, ::-1], sides)
+    return replace(walls, elevations=replace(walls.elevations, faces=faces), doorways=doorways[doorways["rooms"][:, 0] >= 0])
 
 
 def _faces_of(grid: VoxelGrid, rasters: RasterisedStoreys, storey: SegmentedStorey, first: int) -> list[tuple[object, ...]]:

@@ -74,8 +74,8 @@ def resolve_link_threshold(threshold: float | None, maps: int = 2) -> float:
     Raises:
         InputError: not between 0 and 1.
     """
-    believed = LINK_BELIEVED[maps > FEW_MAPS]
-    return max(resolve_threshold(None), believed) if threshold is None else resolve_threshold(threshold)
+    accepted = LINK_BELIEVED[maps > FEW_MAPS]
+    return max(resolve_threshold(None), accepted) if threshold is None else resolve_threshold(threshold)
 
 
 def find_risk_threshold(risk: float) -> float:

@@ -238,8 +238,13 @@ class LiveMerger:
 
     def _tell(self, event: str, a: str, b: str) -> dict[str, Any]:
         link = self.links[a, b]
-        told = {"event": event, "robots": [a, b], "probability": round(link.probability, 4), "matrix": link.pose.matrix.round(5)}
-        plain: dict[str, Any] = convert_to_plain(told)
+        message = {
+            "event": event,
+            "robots": [a, b],
+            "probability": round(link.probability, 4),
+            "matrix": link.pose.matrix.round(5),
+        }
+        plain: dict[str, Any] = convert_to_plain(message)
         return plain
 
     def _part(self, a: str, b: str, probability: float) -> list[dict[str, Any]]:
@@ -250,10 +255,10 @@ class LiveMerger:
         """Name the observation that would settle two maps most, once."""
         if found.probability < self.settings.open or found.transform is None:
             return []
-        told = find_observations(self.maps[a], self.maps[b], found.transform, found.posterior, found.landmarks.witnesses)
-        if not told:
+        observations = find_observations(self.maps[a], self.maps[b], found.transform, found.posterior, found.landmarks.witnesses)
+        if not observations:
             return []
-        best = told[0]
+        best = observations[0]
         same = (best.action, best.map, *np.round(best.at).tolist())
         if self.asked.get((a, b)) == same:
             return []
@@ -302,8 +307,8 @@ class LiveMerger:
         ]
         frames = {name: robot.frame for name, robot in self.robots.items()}
         state = {"format": STATE_FORMAT, "robots": frames, "cell": self.settings.cell, "links": links}
-        with replace_on_success(self.folder / STATE_FILE) as beside:
-            beside.write_text(json.dumps(state, indent=1) + "\n", encoding="utf-8")
+        with replace_on_success(self.folder / STATE_FILE) as temporary:
+            temporary.write_text(json.dumps(state, indent=1) + "\n", encoding="utf-8")
 
     def _load(self) -> None:
         path = self.folder / STATE_FILE
@@ -348,8 +353,8 @@ def read_robot(path: Path) -> Mapping[str, Array]:
 def describe_event(event: Mapping[str, Any]) -> str:
     """Describe what has changed in a line."""
     a, b = event["robots"]
-    chance = f"{event['probability']:.2f}"
+    text = f"{event['probability']:.2f}"
     if event["event"] == "settle":
-        return f"{a} and {b} may belong together ({chance}); {event['next']['words']}"
-    words = {"joined": "joined", "moved": "lie otherwise now", "parted": "no longer believed to belong together"}
-    return f"{a} and {b}: {words[event['event']]} ({chance})"
+        return f"{a} and {b} may belong together ({text}); {event['next']['words']}"
+    names = {"joined": "joined", "moved": "lie otherwise now", "parted": "no longer believed to belong together"}
+    return f"{a} and {b}: {names[event['event']]} ({text})"

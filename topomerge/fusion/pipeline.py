@@ -51,30 +51,30 @@ LEFT_OPEN = 0.15  # probability of another alternative, from which on it is told
 
 
 def explain_verdict(registration: Registration, threshold: float, force: bool = False) -> str:
-    """One sentence: the verdict, what speaks for it and what against."""
+    """Return one sentence: the verdict, what speaks for it and what against."""
     if registration.transform is None:
         return f"not merged: {registration.reason}"
-    believed = registration.probability >= threshold
+    accepted = registration.probability >= threshold
     f = registration.features
-    sign = "reaches" if believed else "is below"
-    words = [
-        f"{'merged' if believed else 'not merged'}: probability {format_probability(registration.probability)} {sign} "
+    sign = "reaches" if accepted else "is below"
+    parts = [
+        f"{'merged' if accepted else 'not merged'}: probability {format_probability(registration.probability)} {sign} "
         f"{threshold:.2f}"
     ]
-    words.append(f"{f['walls']:.0f} m2 of walls agree, {f['free']:.0f} m2 of free floor seen by both")
-    words.append(f"{100 * f['conflict_share']:.1f} % of the walls stand on free floor of the other map")
-    words += registration.landmarks.list_sentences()
-    if registration.landmarks.factors and believed != (registration.walls >= threshold):
-        alone = f"the walls alone would {'not ' * believed}be believed ({format_probability(registration.walls)})"
-        words.append(alone)
-    if not believed:
+    parts.append(f"{f['walls']:.0f} m2 of walls agree, {f['free']:.0f} m2 of free floor seen by both")
+    parts.append(f"{100 * f['conflict_share']:.1f} % of the walls stand on free floor of the other map")
+    parts += registration.landmarks.list_sentences()
+    if registration.landmarks.factors and accepted != (registration.walls >= threshold):
+        alone = f"the walls alone would {'not ' * accepted}be believed ({format_probability(registration.walls)})"
+        parts.append(alone)
+    if not accepted:
         if compute_evidence_limit(f) < 1:
-            words.append("the maps share too little area for a verdict")
-        elif registration.posterior and (beside := describe_posterior(registration.posterior, threshold)):
-            words.append(beside)
-    if force and not believed:
-        words.append("joined anyway (--force)")
-    return "; ".join(words)
+            parts.append("the maps share too little area for a verdict")
+        elif registration.posterior and (alternatives := describe_posterior(registration.posterior, threshold)):
+            parts.append(alternatives)
+    if force and not accepted:
+        parts.append("joined anyway (--force)")
+    return "; ".join(parts)
 
 
 def format_probability(probability: float) -> str:
@@ -111,24 +111,24 @@ def list_evidence(registration: Registration) -> list[Row]:
         ("floors", f"{f['level']:.2f} m", "largest step between floors or ceilings that should coincide"),
     ]
     if f.get("ceiling_area", 0) > 0:
-        words = f"difference over {f['ceiling_area']:.0f} m²; storeys with the same plan often differ here"
-        rows.append(("ceilings", f"{f['ceilings']:.2f} m", words))
+        text = f"difference over {f['ceiling_area']:.0f} m²; storeys with the same plan often differ here"
+        rows.append(("ceilings", f"{f['ceilings']:.2f} m", text))
     rows += _list_winner_evidence(f)
     if np.isfinite(f.get("rmse", np.nan)):
         rows.append(("surfaces", f"{100 * f['rmse']:.1f} cm", "RMS distance of matching surfaces"))
     if registration.places is not None and len(registration.places):
         odds = registration.places.log_odds
-        words = f"{(odds > 0).sum()} look like the same place, {(odds <= 0).sum()} more like another one; coloured on the plan"
-        rows.append(("places compared", f"{len(odds)}", words))
+        text = f"{(odds > 0).sum()} look like the same place, {(odds <= 0).sum()} more like another one; coloured on the plan"
+        rows.append(("places compared", f"{len(odds)}", text))
     for kind, factor in registration.landmarks.factors.items():
         ahead, nearest = min((factor["here"] - factor[name], name) for name in POSTERIOR if name != "here")
         times = np.exp(min(abs(ahead), 15.0))
-        words = f"{times:,.0f} times as likely as of" if ahead > 0 else f"{times:,.0f} times less likely than of"
-        rows.append((f"landmarks: {kind}", f"{ahead:+.1f}", f"log odds: {words} {WORDS[nearest]}"))
+        text = f"{times:,.0f} times as likely as of" if ahead > 0 else f"{times:,.0f} times less likely than of"
+        rows.append((f"landmarks: {kind}", f"{ahead:+.1f}", f"log odds: {text} {WORDS[nearest]}"))
     if len(registration.alternatives) > 1:
         times = np.exp(min(f["margin"], 15.0))
-        words = f"{times:,.0f} times as probable" if times >= 1.5 else "about as probable"
-        rows.append(("lead over the next pose", words, "the best hypothesis against the next one, each judged alone"))
+        text = f"{times:,.0f} times as probable" if times >= 1.5 else "about as probable"
+        rows.append(("lead over the next pose", text, "the best hypothesis against the next one, each judged alone"))
     return rows
 
 
@@ -159,8 +159,8 @@ def _list_winner_evidence(f: Mapping[str, float]) -> list[Row]:
     if f["tall_conflict"] > 0:
         rows.append(("high walls on free floor", f"{f['tall_conflict']:.1f} m²", "higher than furniture; evidence against"))
     if f["hanging"] >= 1:
-        words = f"of {f['hanging']:.0f} pieces of lamps, beams and ducts match; storeys do not share theirs"
-        rows.append(("under the ceiling", f"{f['hanging_met']:.0f}", words))
+        text = f"of {f['hanging']:.0f} pieces of lamps, beams and ducts match; storeys do not share theirs"
+        rows.append(("under the ceiling", f"{f['hanging_met']:.0f}", text))
     return rows
 
 
@@ -279,9 +279,9 @@ def _explain_pair(registration: Registration, threshold: float, config: MergeCon
     """One sentence: what was decided by hand, or the verdict."""
     if (0, 1) not in config.decided:
         return explain_verdict(registration, threshold, config.force)
-    words = "not merged: rejected by hand" if config.decided[0, 1] is None else "merged: accepted by hand"
+    text = "not merged: rejected by hand" if config.decided[0, 1] is None else "merged: accepted by hand"
     forced = "; joined anyway (--force)" if config.decided[0, 1] is None and config.force else ""
-    return f"{words}; by what the maps show, the probability is {format_probability(registration.probability)}{forced}"
+    return f"{text}; by what the maps show, the probability is {format_probability(registration.probability)}{forced}"
 
 
 def _find_observations(a: TopometricMap, b: TopometricMap, registration: Registration, accepted: bool) -> list[Observation]:

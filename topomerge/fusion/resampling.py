@@ -151,10 +151,10 @@ def find_wall_copies(first: Seen, second: Seen, edge: float) -> Array:
     """
     reach = int(COPY_REACH / edge + 1e-6)
     flat = range(-reach, reach + 1)
-    beside = [(x, y) for x, y in product(flat, flat) if 0 < np.hypot(x, y) * edge <= COPY_REACH + 1e-6]
-    if not beside:
+    near = [(x, y) for x, y in product(flat, flat) if 0 < np.hypot(x, y) * edge <= COPY_REACH + 1e-6]
+    if not near:
         return np.full(len(second[0]), -1, np.int64)
-    offsets = np.array(sorted(beside, key=lambda o: (o[0] ** 2 + o[1] ** 2, o)), np.int64)
+    offsets = np.array(sorted(near, key=lambda o: (o[0] ** 2 + o[1] ** 2, o)), np.int64)
     low = 2 * ((np.minimum(first[0].min(axis=0), second[0].min(axis=0)) - AROUND) // 2)
     high = np.maximum(first[0].max(axis=0), second[0].max(axis=0)) + AROUND + 1 - low
     tables = [_build_table(cells - low, high) for cells in (first[0], second[0])]

@@ -56,7 +56,7 @@ def _transform_edges(edges: Array, placement: Placement) -> Array:
 
 
 def add_part_narrows(joined: TopometricMap, narrows: Array) -> TopometricMap:
-    """The joined map with those narrowings of its parts that it lacks.
+    """Return the joined map with those narrowings of its parts that it lacks.
 
     Args:
         narrows: EDGE_DTYPE as they lie in it, with its areas, -1 where there is none.
@@ -73,7 +73,7 @@ def add_part_narrows(joined: TopometricMap, narrows: Array) -> TopometricMap:
 
 
 def add_carried_odds(joined: TopometricMap, tables: Sequence[Array], member: Array, share: Array) -> tuple[TopometricMap, Array]:
-    """The joined map with the odds of those rooms that a part saw nearly whole, and (R,) bool, which these are.
+    """Return the joined map with the odds of those rooms that a part saw nearly whole, and (R,) bool, which these are.
 
     Args:
         tables: ROOM_DTYPE of the parts.
@@ -96,11 +96,11 @@ def add_part_doors(joined: TopometricMap, parts: Iterable[PlacedPart]) -> Topome
     Args:
         parts: as they lie in it.
     """
-    laid = [_PlacedFloor.from_part(part, joined) for part in parts]
+    placed = [_PlacedFloor.from_part(part, joined) for part in parts]
     level = np.isin(joined.edges["kind"], LEVEL_KINDS)
-    edges = joined.edges[[not level[k] or _is_confirmed(edge, laid) for k, edge in enumerate(joined.edges)]]
-    edges = _adopt_doors(edges, np.concatenate([np.zeros(0, EDGE_DTYPE), *(part.doors for part in laid)]))
-    for part in laid:
+    edges = joined.edges[[not level[k] or _is_confirmed(edge, placed) for k, edge in enumerate(joined.edges)]]
+    edges = _adopt_doors(edges, np.concatenate([np.zeros(0, EDGE_DTYPE), *(part.doors for part in placed)]))
+    for part in placed:
         new = [door for door in part.doors if not _is_among_edges(edges, door)]
         edges = np.concatenate([edges, np.array(new, EDGE_DTYPE)])
     return select_distinct_doors(replace(joined, edges=edges[np.lexsort((*edges["centre"].T[::-1], *edges["rooms"].T[::-1]))]))
@@ -190,9 +190,9 @@ def add_part_odds(joined: TopometricMap, parts: Sequence[PartRooms]) -> Topometr
     entered = np.full(count, -1.0)
     for part in parts:
         room = find_rooms_at(joined, part.places)
-        there = room >= 0
-        places = np.bincount(room[there], minlength=count)
-        mean = np.bincount(room[there], part.entered[part.room[there]], count) / np.maximum(places, 1)
+        present = room >= 0
+        places = np.bincount(room[present], minlength=count)
+        mean = np.bincount(room[present], part.entered[part.room[present]], count) / np.maximum(places, 1)
         entered = np.where(places * part.area >= LEAST_COVER * area, np.maximum(entered, mean), entered)
     rooms = joined.rooms.copy()
     rooms["entered"] = np.where(entered >= 0, entered, rooms["entered"])
@@ -267,9 +267,9 @@ def add_joined_landmarks(joined: TopometricMap, parts: Mapping[int, PlacedLandma
     """
     placed = [_assign_joined_rooms(joined, parts[n]) if n in parts else Landmarks() for n in range(len(names))]
     landmarks, summary = fuse_landmarks(placed, joined)
-    words = summary.describe_contradictions(names)
+    text = summary.describe_contradictions(names)
     parameters = {**joined.parameters, LANDMARK_PARAMETER: asdict(summary)}
-    return replace(joined, landmarks=landmarks, parameters=parameters, warnings=(*joined.warnings, *([words] if words else [])))
+    return replace(joined, landmarks=landmarks, parameters=parameters, warnings=(*joined.warnings, *([text] if text else [])))
 
 
 def _assign_joined_rooms(joined: TopometricMap, part: PlacedLandmarks) -> Landmarks:

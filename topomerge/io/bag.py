@@ -306,7 +306,7 @@ READ_NAMES = "PointCloud2, depth images, LaserScan or OccupancyGrid"
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """Points in the topmost frame, scan by scan, or the walls and floor of a map."""
+    """Yield points in the topmost frame, scan by scan, or the walls and floor of a map."""
     if find_spec("rosbags") is None:
         raise ImportError("no rosbags", name="rosbags")
     size = measure_bag_size(list_bag_files(path))
@@ -318,7 +318,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
 
 
 def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """The same in this process."""
+    """Yield the same in this process."""
     try:
         yield from _read(path, options)
     except MemoryError as error:  # lengths in a damaged bag are believed by the library

@@ -447,14 +447,14 @@ def decode_occupancy_grid(path: Path, message: Message) -> tuple[tuple[Array, Ar
         raise message.build_error(path, f"has {len(cells):,} cells for {height} x {width}")
     place, turn = info.origin.position, info.origin.orientation
     yaw = math.atan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y**2 + turn.z**2))
-    said: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     if math.isnan(yaw):
-        yaw, said = (
+        yaw, warnings = (
             0.0,
             (f"{path}: the map on {message.topic} is turned by a quaternion that is no number; it was read as no turn",),
         )
     if not (info.resolution > 0 and np.isfinite((info.resolution, place.x, place.y, yaw)).all()):
         raise message.build_error(path, f"has a resolution of {info.resolution:g} m or an origin that can't be used")
     values = cells.reshape(height, width)[::-1]  # the first row of a grid is the lowest, of an image the highest
-    plan = Plan(path, float(info.resolution), (float(place.x), float(place.y), yaw), warnings=said)
+    plan = Plan(path, float(info.resolution), (float(place.x), float(place.y), yaw), warnings=warnings)
     return (1.0 - values.clip(0, 100) / np.float32(100), values < 0), plan

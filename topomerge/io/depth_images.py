@@ -147,7 +147,7 @@ Show = Callable[[Frame, Array, Array | None], None]  # frame, its depth (h, w), 
 
 
 def iter_posed_scans(
-    path: Path, frames: Iterable[Frame | None], said: list[str], show: Show | None = None
+    path: Path, frames: Iterable[Frame | None], warnings: list[str], show: Show | None = None
 ) -> Iterator[PosedScan]:
     """Yield the scan of each frame; those without a pose are left out, and counted in what is said.
 
@@ -172,7 +172,7 @@ def iter_posed_scans(
     if lost == count:
         raise InputError(f"{path}: none of its {count:,} depth images has a pose that can be used; give another recording")
     if lost:
-        said.append(f"{lost:,} of {count:,} depth images have no pose that can be used and are left out")
+        warnings.append(f"{lost:,} of {count:,} depth images have no pose that can be used and are left out")
 
 
 def _build_scan(frame: Frame, show: Show | None) -> PosedScan:

@@ -365,9 +365,9 @@ def trace_drawing(
     drawing = parse_drawing(picture, known)
     if not drawing.free.any() or measure_straight_share(drawing.occupied) < LEAST_STRAIGHT:
         raise InputError(f"{path}: no walls around a room were found in it; if it is a robot's grid, give --no-drawing")
-    said = [f"{path.name}: was read as a drawn plan, without its page, texts and furniture"]
+    warnings = [f"{path.name}: was read as a drawn plan, without its page, texts and furniture"]
     if page.mended:
-        said.append(f"{path.name}: its page was {', '.join(page.mended)} first; places are those on that page")
+        warnings.append(f"{path.name}: its page was {', '.join(page.mended)} first; places are those on that page")
     if resolution is None:
         scale = estimate_scale(drawing, texts or ())
         if known is not None and not (scale and scale.written and abs(np.log(scale.resolution / known)) > AGREEING):
@@ -377,7 +377,7 @@ def trace_drawing(
             raise InputError(f"{path}: an image does not say how large a pixel is; give --resolution in metres a pixel{more}")
         known = scale.resolution
         why = ", ".join(repr(reason) if scale.written else reason for reason in scale.reasons[:3])
-        said.append(f"{path.name}: {known:.4g} m a pixel, give or take {scale.spread:.0%}, by {why}; --resolution sets it")
+        warnings.append(f"{path.name}: {known:.4g} m a pixel, give or take {scale.spread:.0%}, by {why}; --resolution sets it")
         if not np.isclose(choose_zoom(picture.shape[:2], known), drawing.zoom, rtol=0.1):
             drawing = parse_drawing(picture, known)
     assert known is not None
@@ -385,7 +385,7 @@ def trace_drawing(
     treads = resize_picture(np.repeat(find_treads(picture, known)[..., None] * np.uint8(255), 3, axis=2), zoom)[..., 0] > 127
     drawing = replace(drawing, stairs=treads & ndimage.binary_fill_holes(drawing.free | drawing.occupied))
     placed = [PictureText(t.text, (t.place[0] * zoom, t.place[1] * zoom), t.height * zoom, t.confidence) for t in texts or ()]
-    return TracedDrawing(drawing, known / zoom, tuple(placed), tuple(said))
+    return TracedDrawing(drawing, known / zoom, tuple(placed), tuple(warnings))
 
 
 def find_stated_scale(texts: Sequence[PictureText]) -> float | None:

@@ -67,7 +67,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
 
 
 def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """The same in this process, within no limits of time and memory.
+    """Yield the same in this process, within no limits of time and memory.
 
     Raises:
         InputError: it shows no room, or is a bomb.
@@ -75,7 +75,7 @@ def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
     content = collect_content(path)
     if not content.lines:
         raise InputError(f"{path}: its model space holds no lines that could be walls; export the plan itself, not its sheet")
-    unit, said = choose_unit(content, options)
+    unit, notes = choose_unit(content, options)
     factor = UNITS[unit] * options.scale  # m
     content, far = content.scale_to(factor)
     pixel, coarse = choose_pixel(path, content)
@@ -88,7 +88,7 @@ def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
     texts = [place_text(text, masks.corner, pixel, masks.free.shape[0]) for text in content.texts]
     corner = plan.origin[:2]
     marks = build_name_landmarks(texts, masks.free, plan.resolution, corner, NAME_HEIGHT / own, path.name)
-    warnings = tuple(f"{path.name}: {text}" for text in (*said, *far, *coarse, *masks.warnings))
+    warnings = tuple(f"{path.name}: {text}" for text in (*notes, *far, *coarse, *masks.warnings))
     yield Piece(np.empty((0, 3)), warnings=warnings, done=0.1, landmarks=marks)
     yield from extrude(path, masks.occupied, masks.free, plan, options)
 
@@ -121,10 +121,10 @@ class Content:
         centres = np.array([line.points.mean(axis=0) for line in lines])
         middle = np.median(centres, axis=0)
         near = [bool((np.abs(line.points - middle) <= FAR).all()) for line in lines]
-        said = [f"{near.count(False)} lines farther than {FAR:g} m from the middle are left out"] if not all(near) else []
+        warnings = [f"{near.count(False)} lines farther than {FAR:g} m from the middle are left out"] if not all(near) else []
         texts = [PictureText(t.text, (t.place[0] * factor, t.place[1] * factor), t.height * factor, 1.0) for t in self.texts]
         swings = [Swing(s.hinge * factor, s.ends * factor, s.named) for s in self.swings]
-        return Content([line for line, keep in zip(lines, near, strict=True) if keep], swings, texts, self.layers), said
+        return Content([line for line, keep in zip(lines, near, strict=True) if keep], swings, texts, self.layers), warnings
 
 
 def choose_unit(content: Content, options: ReadOptions) -> tuple[str, list[str]]:
@@ -157,11 +157,11 @@ def choose_pixel(path: Path, content: Content) -> tuple[float, list[str]]:
 def classify_name(name: str) -> str:
     """Return what the name of a layer or a block says: "other" (furniture, text ...), "window", "door", "wall" or ""."""
     plain = unicodedata.normalize("NFKD", name.casefold().replace("ß", "ss").replace("ø", "o").replace("æ", "ae"))
-    words = re.findall(r"[a-z]+", "".join(c for c in plain if not unicodedata.combining(c)))
+    tokens = re.findall(r"[a-z]+", "".join(c for c in plain if not unicodedata.combining(c)))
     for kind, parts in WORDS.items():
         for part in parts.split():
             begins, ends, core = part.startswith("^"), part.endswith("$"), part.strip("^$")
-            for word in words:
+            for word in tokens:
                 if core in word and (not begins or word.startswith(core)) and (not ends or word.endswith(core)):
                     return kind
     return ""

@@ -281,8 +281,8 @@ def _fill_floor(raster: _Raster, occupied: Array, seals: Array) -> PlanMasks:
     size[0] = 0.0
     free = (size >= SMALLEST_ROOM)[label]
     occupied &= ndimage.distance_transform_edt(~free) * pixel <= NEAR if free.any() else True
-    said = (f"its outer walls are open; openings up to {GAPS[chosen]:g} m were taken for closed",) if chosen else ()
-    return PlanMasks(occupied, free, raster.corner, said)
+    warnings = (f"its outer walls are open; openings up to {GAPS[chosen]:g} m were taken for closed",) if chosen else ()
+    return PlanMasks(occupied, free, raster.corner, warnings)
 
 
 def _find_inside(closed: Array, distance: Array, radius: float) -> Array:

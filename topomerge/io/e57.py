@@ -49,7 +49,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
 
 
 def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """The same in this process, which the library may end."""
+    """Yield the same in this process, which the library may end."""
     del options
     import pye57
 

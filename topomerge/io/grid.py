@@ -75,7 +75,7 @@ def check_outside_floor(occupied: Array, free: Array, resolution: float) -> list
 
 
 def measure_outside_share(occupied: Array, free: Array) -> float:
-    """Share of the floor from which at most `FEW_WALLS` of 8 directions meet a wall before the border of the picture.
+    """Return share of the floor from which at most `FEW_WALLS` of 8 directions meet a wall before the border of the picture.
 
     Args:
         occupied, free: (h, w) bool.
@@ -141,8 +141,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         yield from build_drawn_pieces(path, traced, options, options.page)
         return
     elif options.resolution is None:
-        beside = next((b for b in (path.with_suffix(".yaml"), path.with_suffix(".yml")) if b.is_file()), None)
-        hint = f", or read {beside.name} instead" if beside else ""
+        companion = next((b for b in (path.with_suffix(".yaml"), path.with_suffix(".yml")) if b.is_file()), None)
+        hint = f", or read {companion.name} instead" if companion else ""
         raise InputError(f"{path}: an image does not say how large a pixel is; give --resolution in metres a pixel{hint}")
     else:
         plan = Plan(path, options.resolution)
@@ -219,7 +219,7 @@ def read_yaml(path: Path) -> Plan:
     if not isinstance(values["image"], str) or not isinstance(values.get("mode", ""), str):
         shown = f"{_shorten_value(values['image'])}, {_shorten_value(values.get('mode'))}"
         raise InputError(f"{path}: image and mode are names, not {shown}; mend it")
-    image, said = _find_image(path, values["image"].strip())
+    image, notes = _find_image(path, values["image"].strip())
     resolution = _read_number(path, values, "resolution", None)
     origin = values.get("origin", [0.0, 0.0, 0.0])
     if not isinstance(origin, list) or len(origin) < 2:
@@ -227,8 +227,8 @@ def read_yaml(path: Path) -> Plan:
     x, y = (_read_number(path, {"origin": v}, "origin", None) for v in origin[:2])
     yaw = 0.0
     if len(origin) > 2 and _is_nan(origin[2]):  # map_saver writes that for a quaternion of zeros
-        said = (
-            *said,
+        notes = (
+            *notes,
             f"{path.name}: the yaw of its origin is {_shorten_value(origin[2])} and was read as 0; write 0 in its place",
         )
     elif len(origin) > 2:
@@ -240,7 +240,7 @@ def read_yaml(path: Path) -> Plan:
         raise InputError(f"{path}: {wrong} can't be used; mode is one of {', '.join(MODES)}, negate 0 or 1, resolution above 0")
     thresholds = (_read_number(path, values, *known) for known in (("occupied_thresh", 0.65), ("free_thresh", 0.196)))
     occupied, free = (min(max(value, -1.0), 2.0) for value in thresholds)  # beyond 0 to 1 all are alike
-    return Plan(image, resolution, (x, y, yaw), bool(negate), occupied, free, mode, said)
+    return Plan(image, resolution, (x, y, yaw), bool(negate), occupied, free, mode, notes)
 
 
 def _is_nan(value: object) -> bool:
@@ -272,9 +272,9 @@ def _find_image(path: Path, name: str) -> tuple[Path, tuple[str, ...]]:
     """The image a map_server file names: as written, else of that name beside the file, else of its stem or the yaml's."""
     base = PureWindowsPath(name).name if "\\" in name else PurePosixPath(name).name
     exact = path.parent / name
-    beside = path.parent / base
+    companion = path.parent / base
     others = [path.parent / (stem + s) for stem in (Path(base).stem, path.stem) for s in IMAGES]
-    for candidate in (exact, beside, *others):
+    for candidate in (exact, companion, *others):
         if base and candidate.is_file():
             if candidate == exact:
                 return candidate, ()
@@ -335,8 +335,8 @@ def read_pixels(path: Path, plan: Plan) -> tuple[Array, Array, tuple[str, ...]]:
         raise InputError(f"{path}: {wrong}; is free space white and are walls black? mend thresholds, negate or mode")
     doubts: list[str] = []
     if plan.mode == "trinary":
-        free, said = _remove_unknown(path, image, plan, occupied, free)
-        doubts += [said] if said else []
+        free, notes = _remove_unknown(path, image, plan, occupied, free)
+        doubts += [notes] if notes else []
     if is_inverted(occupied, free, plan.resolution):
         advice = (
             f"set negate: {1 - plan.negate}" if path != plan.image else "invert it, or give a yaml of map_server with negate: 1"
@@ -371,8 +371,8 @@ def _remove_unknown(path: Path, image: tuple[Array, Array], plan: Plan, occupied
         return known, ""
     what = "its grey of unknown" if is_floor else f"noise of {noise:.0%} of the floor around its grey of unknown"
     where = path.name if path != plan.image else "a map_server yaml"
-    said = f"{plan.image.name}: {what} ({grey.unknown}) counts as floor by free_thresh {plan.free:g} and was read as unknown"
-    return known, f"{said}; write free_thresh: {grey.threshold:.2g} into {where}"
+    text = f"{plan.image.name}: {what} ({grey.unknown}) counts as floor by free_thresh {plan.free:g} and was read as unknown"
+    return known, f"{text}; write free_thresh: {grey.threshold:.2g} into {where}"
 
 
 def classify(image: tuple[Array, Array], plan: Plan) -> tuple[Array, Array]:

@@ -111,7 +111,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
 
 
 def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """The same in this process."""
+    """Yield the same in this process."""
     import ifcopenshell
 
     try:
@@ -179,16 +179,16 @@ def read_elements(path: Path) -> list[ModelElement]:
         raise InputError(f"{path}: needs the Python package ifcopenshell: pip install 'topomerge[ifc]'")
     _check_ends(path)
     check_references(path)
-    words = [sys.executable, "-c", f"from {__name__} import write_elements; write_elements()", str(path)]
+    rows = [sys.executable, "-c", f"from {__name__} import write_elements; write_elements()", str(path)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    child = subprocess.run(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment, check=False)
+    child = subprocess.run(rows, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment, check=False)
     if child.returncode:
         raise build_damage_error(path, "an IFC model", "the library that reads it broke down")
     with np.load(io.BytesIO(child.stdout), allow_pickle=False) as data:
-        words, vertices, faces, ends = data["words"], data["vertices"], data["faces"], data["ends"]
-    if not np.isin(words[:, 1], list(ELEMENT_KINDS.values())).any():
+        rows, vertices, faces, ends = data["words"], data["vertices"], data["faces"], data["ends"]
+    if not np.isin(rows[:, 1], list(ELEMENT_KINDS.values())).any():
         raise InputError(f"{path}: has no walls, columns, slabs or doors with a shape; export it with its geometry")
-    spans = zip(words.tolist(), ends[:-1].tolist(), ends[1:].tolist(), strict=True)
+    spans = zip(rows.tolist(), ends[:-1].tolist(), ends[1:].tolist(), strict=True)
     return [ModelElement(guid, kind, name, vertices[v0:v1], faces[f0:f1]) for (guid, kind, name), (v0, f0), (v1, f1) in spans]
 
 
@@ -198,14 +198,14 @@ def write_elements() -> None:
 
     model = ifcopenshell.open(sys.argv[1])
     built = [p for p in model.by_type("IfcElement") if p.Representation and _is_built(p, doors=True)]
-    wanted = {p.id(): (p, next((kind for name, kind in ELEMENT_KINDS.items() if p.is_a(name)), "other")) for p in built}
-    shapes = sorted(_iter_shapes(model, [p for p, _ in wanted.values()]), key=lambda shape: shape[0])
-    words = [(str(wanted[k][0].GlobalId), wanted[k][1], str(wanted[k][0].Name or "")) for k, _, _ in shapes]
+    requested = {p.id(): (p, next((kind for name, kind in ELEMENT_KINDS.items() if p.is_a(name)), "other")) for p in built}
+    shapes = sorted(_iter_shapes(model, [p for p, _ in requested.values()]), key=lambda shape: shape[0])
+    parts = [(str(requested[k][0].GlobalId), requested[k][1], str(requested[k][0].Name or "")) for k, _, _ in shapes]
     ends = np.cumsum([(0, 0), *((len(v), len(f)) for _, v, f in shapes)], axis=0)
     vertices = np.concatenate([np.zeros((0, 3)), *(v for _, v, _ in shapes)])
     faces = np.concatenate([np.zeros((0, 3), np.int64), *(f for _, _, f in shapes)])
     archive = io.BytesIO()
-    np.savez(archive, words=np.array(words, str).reshape(-1, 3), vertices=vertices, faces=faces, ends=ends)
+    np.savez(archive, words=np.array(parts, str).reshape(-1, 3), vertices=vertices, faces=faces, ends=ends)
     sys.stdout.buffer.write(archive.getvalue())
 
 
@@ -290,8 +290,8 @@ def _sample_missing_floors(
             first += len(faces)
         added += len(spaces_of_level)
     if added:
-        said = f"the model has no floors under {added} of its spaces; the lower faces of the spaces were taken for floors"
-        yield Piece(np.empty((0, 3)), warnings=(said,), done=0.95)
+        text = f"the model has no floors under {added} of its spaces; the lower faces of the spaces were taken for floors"
+        yield Piece(np.empty((0, 3)), warnings=(text,), done=0.95)
 
 
 def _measure_level_areas(vertices: Array, faces: Array, which: Array) -> Array:

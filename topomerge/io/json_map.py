@@ -63,8 +63,8 @@ def _iter_place_pieces(path: Path, graph: Mapping[str, Any], options: ReadOption
             f"{path}: is a scene graph without a mesh, and without places that tell where its walls are; give "
             "dsg_with_mesh.json, which Hydra saves beside it"
         )
-    told = "has no mesh: its floor is what its places have free, and its walls are the outline of that"
-    yield Piece(np.empty((0, 3)), warnings=(f"{path}: {told}",), landmarks=find_graph_landmarks(path, graph), done=0.1)
+    text = "has no mesh: its floor is what its places have free, and its walls are the outline of that"
+    yield Piece(np.empty((0, 3)), warnings=(f"{path}: {text}",), landmarks=find_graph_landmarks(path, graph), done=0.1)
     order = np.argsort(places[:, 2], kind="stable")
     for rows in np.split(order, np.flatnonzero(np.diff(places[order, 2]) > STOREY_GAP) + 1):
         own = ways[np.isin(ways, rows).all(axis=1)]
@@ -135,8 +135,8 @@ def _read_node(node: Any, graph: Mapping[str, Any]) -> dict[str, Any] | None:
             classes = graph["metadata"]["labelspaces"][f"_l{layer}p0"]
             name = next(str(label) for number, label in classes if number == about["semantic_label"])
         if layer == OBJECT_LAYER:
-            said = (about.get("metadata") or {}).get("kind")
-            kind = said if said in LANDMARK_KINDS else "object"
+            node_kind = (about.get("metadata") or {}).get("kind")
+            kind = node_kind if node_kind in LANDMARK_KINDS else "object"
         x, y, z = (float(v) for v in about["position"])
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, StopIteration):
         return None

@@ -335,13 +335,13 @@ def read_karto_graph(path: Path) -> KartoGraph:
     Raises:
         InputError: one is missing, damaged, of a version that is not known, or they do not belong together.
     """
-    beside = path.with_suffix(".data")
-    if not beside.is_file():
+    companion = path.with_suffix(".data")
+    if not companion.is_file():
         raise InputError(
-            f"{path}: {beside.name} is not beside it, which knows the laser; copy both files that slam_toolbox saved"
+            f"{path}: {companion.name} is not beside it, which knows the laser; copy both files that slam_toolbox saved"
         )
     graph, _ = _read_archive(path, "Mapper")
-    data, dataset = _read_archive(beside, "Dataset")
+    data, dataset = _read_archive(companion, "Dataset")
     scans = {int(scan["id"]): scan for scan in graph.found[SCAN]}
     lasers = {_get_name(name): laser for name, laser in dataset["lasers"] if laser and laser["class"] == "LaserRangeFinder"}
     if len(scans) != len(graph.found[SCAN]) or not scans:
@@ -350,7 +350,7 @@ def read_karto_graph(path: Path) -> KartoGraph:
     for scan in scans.values():
         laser = lasers.get(_get_name(scan["sensor"]))
         if laser is None or laser["count"] != len(scan["ranges"]) or laser["count"] > MOST_READINGS:
-            raise InputError(f"{path}: {beside.name} does not know the laser of its scans; copy both files of one saving")
+            raise InputError(f"{path}: {companion.name} does not know the laser of its scans; copy both files of one saving")
         if not np.isfinite(get_pose(scan["pose"])).all():
             raise build_damage_error(path, KIND, "a pose that is none")
     return KartoGraph(dict(sorted(scans.items())), np.array(ends, np.int64).reshape(-1, 2), lasers, (graph, data))

@@ -59,7 +59,7 @@ def _convert_to_strict_json(value: Any) -> Any:
 
 
 def convert_map_to_json(map: TopometricMap) -> dict[str, Any]:
-    """The map as a dictionary of plain Python values that is valid JSON; see the top of this file for its fields."""
+    """Return the map as a dictionary of plain Python values that is valid JSON; see the top of this file for its fields."""
     names = find_room_names(map.landmarks, len(map.rooms))
     rooms = [
         {
@@ -123,12 +123,12 @@ def save_json(map: TopometricMap, path: str | Path) -> None:
     Raises:
         InputError: the path can't be written.
     """
-    with replace_on_success(path) as beside:
-        beside.write_text(format_json(convert_map_to_json(map)), encoding="utf-8", errors="replace")
+    with replace_on_success(path) as temporary:
+        temporary.write_text(format_json(convert_map_to_json(map)), encoding="utf-8", errors="replace")
 
 
 def format_columns(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Lines of a table: right-aligned, but for the last column."""
+    """Return lines of a table: right-aligned, but for the last column."""
     table = [list(header), *map(list, rows)]
     widths = [max(len(row[i]) for row in table) for i in range(len(header))]
     last = len(header) - 1
@@ -157,7 +157,7 @@ def _list_neighbours(map: TopometricMap) -> list[list[str]]:
 
 def _iter_room_rows(map: TopometricMap, names: Sequence[str]) -> Iterable[Sequence[str]]:
     doors = np.bincount(map.edges["rooms"].ravel(), minlength=len(map.rooms))
-    for i, (room, beside) in enumerate(zip(map.rooms, _list_neighbours(map), strict=True)):
+    for i, (room, neighbours) in enumerate(zip(map.rooms, _list_neighbours(map), strict=True)):
         yield (
             str(i),
             str(room["storey"]),
@@ -166,7 +166,7 @@ def _iter_room_rows(map: TopometricMap, names: Sequence[str]) -> Iterable[Sequen
             str(room["cells"]),
             str(doors[i]),
             *([names[i]] if any(names) else []),
-            "  ".join([", ".join(beside), *describe_room(room)]),
+            "  ".join([", ".join(neighbours), *describe_room(room)]),
         )
 
 

@@ -68,9 +68,9 @@ def require_sane_counts(heads: Mapping[str, ArrayHeader]) -> None:
         "landmarks": (MOST_LANDMARKS, ""),
     }
     for name, (limit, share) in limits.items():
-        words = share if limit < CONNECTION_LIMIT else ""
+        text = share if limit < CONNECTION_LIMIT else ""
         if name in heads and heads[name].size > limit:
-            raise ValueError(f"declares {heads[name].size:,} {name}, more than {limit:,}{words}")
+            raise ValueError(f"declares {heads[name].size:,} {name}, more than {limit:,}{text}")
     if rooms > cells:
         raise ValueError(f"declares {rooms:,} rooms and has only {cells:,} cells")
     if heads["about"].size * heads["about"].dtype.itemsize > ABOUT_LIMIT:

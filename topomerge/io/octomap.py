@@ -41,9 +41,9 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     if cells is None:
         raise InputError(f"{path}: has more than {most:,} occupied cells; store it at a coarser resolution")
     space = _split_leaves(keys[free], depths[free], most)
-    said = () if space is not None else (f"more than {most:,} free cells: free space is left out",)
+    warnings = () if space is not None else (f"more than {most:,} free cells: free space is left out",)
     grid = None if space is None else _build_grid(space, resolution)
-    yield Piece(np.empty((0, 3)), free=grid, warnings=said, done=0.8)
+    yield Piece(np.empty((0, 3)), free=grid, warnings=warnings, done=0.8)
     for start in range(0, len(cells), BLOCK_POINTS):
         yield Piece((cells[start : start + BLOCK_POINTS] - CENTRE + 0.5) * resolution, done=0.9)
 

@@ -367,8 +367,8 @@ def _draw_submaps(path: Path, submaps: Sequence[FlatSubmap]) -> tuple[Array, Arr
         first = np.maximum(np.floor((own.min(axis=0) - low) / size).astype(int), 0)
         last = np.minimum(np.ceil((own.max(axis=0) - low) / size).astype(int) + 1, (width, height))
         x, y = np.meshgrid(*(low[k] + (np.arange(first[k], last[k]) + 0.5) * size for k in (0, 1)))
-        there = transform_points(np.linalg.inv(submap.pose), np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]))
-        rows = np.floor((np.array(submap.corner) - there[:, :2]) / submap.resolution).astype(np.int64)  # along y, then along x
+        placed = transform_points(np.linalg.inv(submap.pose), np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]))
+        rows = np.floor((np.array(submap.corner) - placed[:, :2]) / submap.resolution).astype(np.int64)  # along y, then along x
         iy, ix = rows[:, 0], rows[:, 1]
         inside = (ix >= 0) & (iy >= 0) & (ix < submap.odds.shape[1]) & (iy < submap.odds.shape[0])
         odds = np.full(x.size, np.nan)

@@ -69,13 +69,13 @@ def read_header(path: Path) -> Header:
     if end is None or not re.search(rb"(?m)^(#.*PCD|VERSION|FIELDS)", head[: end.start()]):
         raise InputError(f"{path}: is not a PCD file, or its header is cut short; check the file's suffix or copy it again")
     lines = head[: end.end()].decode("latin-1").splitlines()
-    words = {w[0]: w[1:] for line in lines if (w := line.split()) and not line.startswith("#")}
+    fields = {w[0]: w[1:] for line in lines if (w := line.split()) and not line.startswith("#")}
     try:
-        names = words.get("FIELDS") or words["COLUMNS"]
-        sizes, kinds = [int(v) for v in words["SIZE"]], words["TYPE"]
-        counts = [int(v) for v in words.get("COUNT", ["1"] * len(names))]
-        total = int(words["POINTS"][0]) if "POINTS" in words else int(words["WIDTH"][0]) * int(words["HEIGHT"][0])
-        viewpoint = tuple(float(v) for v in words.get("VIEWPOINT", ["0", "0", "0", "1", "0", "0", "0"]))
+        names = fields.get("FIELDS") or fields["COLUMNS"]
+        sizes, kinds = [int(v) for v in fields["SIZE"]], fields["TYPE"]
+        counts = [int(v) for v in fields.get("COUNT", ["1"] * len(names))]
+        total = int(fields["POINTS"][0]) if "POINTS" in fields else int(fields["WIDTH"][0]) * int(fields["HEIGHT"][0])
+        viewpoint = tuple(float(v) for v in fields.get("VIEWPOINT", ["0", "0", "0", "1", "0", "0", "0"]))
         dtype = _build_dtype(names, sizes, kinds, counts)
     except (KeyError, ValueError, IndexError, TypeError) as error:
         raise build_damage_error(path, "a PCD file", f"header: {error}") from error

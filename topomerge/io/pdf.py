@@ -39,7 +39,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
 
 
 def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """The same in this process.
+    """Yield the same in this process.
 
     Raises:
         InputError: no page, or several, hold anything; as `trace_drawing`.
@@ -122,11 +122,11 @@ def find_page_texts(page: Any, dots: float) -> tuple[PictureText, ...]:
     found = []
     for index in range(min(content.count_rects(), MOST_TEXTS)):
         left, bottom, right, top = content.get_rect(index)
-        words = " ".join(content.get_text_bounded(left, bottom, right, top).split())
+        phrase = " ".join(content.get_text_bounded(left, bottom, right, top).split())
         column, row = c_int(), c_int()  # as the page is turned and cropped
         middle = (left + right) / 2, (bottom + top) / 2
         FPDF_PageToDevice(page, 0, 0, width, height, 0, *middle, byref(column), byref(row))
-        if words:
+        if phrase:
             size = min(top - bottom, right - left) * dots
-            found.append(PictureText(words, (float(column.value), float(row.value)), size, 1.0))
+            found.append(PictureText(phrase, (float(column.value), float(row.value)), size, 1.0))
     return tuple(found)

@@ -156,7 +156,7 @@ class PictureReader:
         return fuse_sightings(self.sightings, "pictures")
 
 
-def iter_frame_pieces(path: Path, frames: Iterable[Frame | None], said: list[str], options: ReadOptions) -> Iterator[Piece]:
+def iter_frame_pieces(path: Path, frames: Iterable[Frame | None], warnings: list[str], options: ReadOptions) -> Iterator[Piece]:
     """Yield the points of posed frames, and with the last piece the signs and tags on their colours.
 
     Args:
@@ -169,10 +169,10 @@ def iter_frame_pieces(path: Path, frames: Iterable[Frame | None], said: list[str
 
     def collect() -> Landmarks:
         landmarks = reader.collect()
-        said.extend(reader.warnings)
+        warnings.extend(reader.warnings)
         return landmarks
 
-    yield from iter_pieces(iter_posed_scans(path, frames, said, reader.read_frame), said, collect)
+    yield from iter_pieces(iter_posed_scans(path, frames, warnings, reader.read_frame), warnings, collect)
 
 
 def scale_camera(camera: Camera, shape: tuple[int, ...], other: tuple[int, ...]) -> Camera | None:

@@ -269,9 +269,11 @@ def read_in_subprocess(
         InputError: as the reader; or the child came to an end before it was done.
     """
     task = json.dumps([module, str(path), asdict(options), seconds, room])
-    words = [sys.executable, "-c", f"from {__name__} import main; main()", task]
+    arguments = [sys.executable, "-c", f"from {__name__} import main; main()", task]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    child = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL, env=environment)
+    child = subprocess.Popen(
+        arguments, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL, env=environment
+    )
     assert child.stdout is not None
     try:
         while (piece := _receive_piece(path, kind, child.stdout)) is not None:

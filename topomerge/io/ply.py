@@ -114,17 +114,17 @@ def read_header(path: Path) -> Header:
     lines = head[: end.end()].decode("latin-1").splitlines()
     order: str | None = None
     elements: list[Element] = []
-    for words in (line.split() for line in lines[1:-1]):
+    for fields in (line.split() for line in lines[1:-1]):
         try:
-            if words[:1] == ["format"]:
-                order = ORDERS[words[1]]
-            elif words[:1] == ["element"]:
-                elements.append(Element(words[1], int(words[2]), []))
-            elif words[:1] == ["property"]:
-                is_list = words[1] == "list"
-                elements[-1].properties.append((words[-1], None if is_list else PLY_TYPES[words[1]]))
+            if fields[:1] == ["format"]:
+                order = ORDERS[fields[1]]
+            elif fields[:1] == ["element"]:
+                elements.append(Element(fields[1], int(fields[2]), []))
+            elif fields[:1] == ["property"]:
+                is_list = fields[1] == "list"
+                elements[-1].properties.append((fields[-1], None if is_list else PLY_TYPES[fields[1]]))
         except (KeyError, IndexError, ValueError) as error:
-            raise build_damage_error(path, "a PLY file", f"header line {' '.join(words)!r}") from error
+            raise build_damage_error(path, "a PLY file", f"header line {' '.join(fields)!r}") from error
     if order is None or any(e.count < 0 or len({n for n, _ in e.properties}) < len(e.properties) for e in elements):
         raise build_damage_error(path, "a PLY file", "no format line, a negative count or a property named twice")
     return Header(order, elements, end.end(), len(lines))

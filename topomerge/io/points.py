@@ -129,7 +129,7 @@ def _check_up_axis(points: Array, low: Array, high: Array, up: str) -> list[str]
 
 
 def compute_flatness(points: Array, low: Array, high: Array) -> list[float]:
-    """Share of the surface that lies in the strongest slab across x, y and z; the surface is counted in occupied cells."""
+    """Return share of the surface that lies in the strongest slab across x, y and z; the surface is counted in occupied cells."""
     inside = points[((points >= low - SLAB_THICKNESS) & (points <= high + SLAB_THICKNESS)).all(axis=1)]
     cells = np.floor((inside - inside.min(axis=0)) / SLAB_THICKNESS).astype(np.int64)
     nx, ny, nz = (int(n) for n in cells.max(axis=0) + 1)
@@ -387,8 +387,8 @@ def read_chunks(
     up = None if file_format.fixed else reading.up or file_format.up
     gatherer = Gatherer(str(path), up, reading.factor, chunk, warnings)
     pieces = _iter_pieces(path, file_format, reading)
-    beside = [Piece(np.empty((0, 3)), landmarks=found) for found in read_tables_beside(path, reading.poses)]
-    pieces = itertools.chain(beside, pieces)
+    companions = [Piece(np.empty((0, 3)), landmarks=found) for found in read_tables_beside(path, reading.poses)]
+    pieces = itertools.chain(companions, pieces)
     return _iter_chunks(path, pieces, gatherer, progress)
 
 

@@ -98,16 +98,16 @@ def _read_rows(path: Path) -> list[tuple[float, str, float]]:
 def _parse_rows(path: Path, lines) -> list[tuple[float, str, float]]:  # type: ignore[no-untyped-def]
     where = [0, 1, 2]
     rows: list[tuple[float, str, float]] = []
-    for words in lines:
-        number, words = lines.line_num, [word.strip() for word in words]
-        if not any(words) or (words[0].startswith("#") and rows):
+    for fields in lines:
+        number, fields = lines.line_num, [word.strip() for word in fields]
+        if not any(fields) or (fields[0].startswith("#") and rows):
             continue
-        if not rows and (named := _find_columns(words)):
+        if not rows and (named := _find_columns(fields)):
             where = named
             continue
-        if len(words) <= max(where):
-            raise InputError(f"{path}: line {number} has {len(words)} columns; give time, address and dBm")
-        time, address, strength = (words[k] for k in where)
+        if len(fields) <= max(where):
+            raise InputError(f"{path}: line {number} has {len(fields)} columns; give time, address and dBm")
+        time, address, strength = (fields[k] for k in where)
         try:
             values = float(time), float(strength)
         except ValueError:

@@ -37,10 +37,10 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     trajectory = read_trajectory(source)
     if trajectory.times is None:
         raise InputError(f"{source}: has no times; give a trajectory in the format of TUM, with those of the images")
-    camera, said = _read_camera(path)
+    camera, warnings = _read_camera(path)
     depths = _read_image_list(path, "depth.txt")
     colors = _read_image_list(path, "rgb.txt") if (path / "rgb.txt").is_file() else []
-    yield from iter_frame_pieces(path, _iter_frames(path, depths, colors, trajectory, camera), said, options)
+    yield from iter_frame_pieces(path, _iter_frames(path, depths, colors, trajectory, camera), warnings, options)
 
 
 def _read_camera(path: Path) -> tuple[Camera, list[str]]:
@@ -71,11 +71,11 @@ def _read_image_list(path: Path, name: str) -> list[tuple[float, Path]]:
     """
     images: list[tuple[float, Path]] = []
     for number, line in enumerate((path / name).read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        words = line.split("#", 1)[0].split()
-        if not words:
+        fields = line.split("#", 1)[0].split()
+        if not fields:
             continue
         try:
-            time, file = float(words[0]), path / words[1]
+            time, file = float(fields[0]), path / fields[1]
         except (ValueError, IndexError) as error:
             raise InputError(f"{path / name}: line {number} is not a time and the name of an image; mend it") from error
         if not np.isfinite(time) or (images and time < images[-1][0]):

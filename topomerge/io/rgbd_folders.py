@@ -192,9 +192,9 @@ def _parse_arkit_time(file: Path) -> float:
 
 
 def _read_pincam(path: Path) -> Camera:
-    words = _read_text(path).split()
+    fields = _read_text(path).split()
     try:
-        width, height, fx, fy, cx, cy = map(float, words)
+        width, height, fx, fy, cx, cy = map(float, fields)
         return Camera((fx, fy), (cx, cy), MILLIMETRES, (int(height), int(width)), f"mend {path.name}")
     except (ValueError, OverflowError) as error:
         raise InputError(f"{path}: is not width height fx fy cx cy of a camera; copy it again") from error
@@ -215,9 +215,9 @@ def _read_pose(path: Path) -> Array | None:
 
 
 def _read_matrix(path: Path) -> Array:
-    words = NO_NUMBER.sub("nan", _read_text(path)).split()
+    fields = NO_NUMBER.sub("nan", _read_text(path)).split()
     try:
-        return np.array(words, float).reshape(4, 4)
+        return np.array(fields, float).reshape(4, 4)
     except ValueError as error:
         raise InputError(f"{path}: is not four rows of four numbers; copy it again") from error
 

@@ -113,6 +113,6 @@ def save_rooms_ply(map: TopometricMap, path: str | Path) -> None:
     properties = [f"property {types[vertices.dtype[name].str[1:]]} {name}" for name in vertices.dtype.names]
     head = ["ply", "format binary_little_endian 1.0", "comment topomerge rooms, metres, z up"]
     head += [f"element vertex {len(vertices)}", *properties, "end_header"]
-    with replace_on_success(path) as beside, beside.open("wb") as file:
+    with replace_on_success(path) as temporary, temporary.open("wb") as file:
         file.write(("\n".join(head) + "\n").encode("ascii"))
         file.write(vertices.tobytes())

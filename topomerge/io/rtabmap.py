@@ -208,7 +208,7 @@ Poses = dict[int, Array | None]  # (4, 4) of the robot, by node
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """Points in the frame of the map, node by node."""
+    """Yield points in the frame of the map, node by node."""
     refuse_open_database(path)
     try:
         with closing(sqlite3.connect(build_read_address(path), uri=True)) as base:
@@ -227,10 +227,10 @@ def refuse_open_database(path: Path) -> None:
     """
     read_head(path, RTABMAP_KIND, b"SQLite format 3\0", 100)
     for ending in ("-journal", "-wal"):
-        beside = path.with_name(path.name + ending)
-        if beside.is_file() and beside.stat().st_size:
+        companion = path.with_name(path.name + ending)
+        if companion.is_file() and companion.stat().st_size:
             raise InputError(
-                f"{path}: is being written, or was cut off ({beside.name} lies beside it); close RTAB-Map, or open it there once"
+                f"{path}: is being written, or was cut off ({companion.name} lies there); close RTAB-Map, or open it there once"
             )
 
 
@@ -241,13 +241,13 @@ def build_read_address(path: Path) -> str:
 
 def _iter_pieces(path: Path, base: sqlite3.Connection, options: ReadOptions) -> Iterator[Piece]:
     version = read_version(path, base)
-    said: list[str] = []
-    poses = read_poses(path, base, version, said)
+    warnings: list[str] = []
+    poses = read_poses(path, base, version, warnings)
     kind = _detect_kind(path, base, version)
     if kind == "depth":
-        yield from iter_frame_pieces(path, _iter_frames(path, base, version, poses), said, options)
+        yield from iter_frame_pieces(path, _iter_frames(path, base, version, poses), warnings, options)
     else:
-        yield from iter_pieces(_iter_scans(path, base, version, poses, kind == "flat", said), said)
+        yield from iter_pieces(_iter_scans(path, base, version, poses, kind == "flat", warnings), warnings)
         yield _read_pictures(path, base, version, poses, options)
     yield Piece(np.empty((0, 3)), landmarks=_read_landmarks(path, base, poses), done=1.0)
 
@@ -284,7 +284,7 @@ def read_version(path: Path, base: sqlite3.Connection) -> tuple[int, ...]:
     return version
 
 
-def read_poses(path: Path, base: sqlite3.Connection, version: tuple[int, ...], said: list[str]) -> Poses:
+def read_poses(path: Path, base: sqlite3.Connection, version: tuple[int, ...], warnings: list[str]) -> Poses:
     """Read the pose of the robot at each node: optimised ones, else those of the odometry.
 
     Raises:
@@ -308,7 +308,7 @@ def read_poses(path: Path, base: sqlite3.Connection, version: tuple[int, ...], s
         nodes = base.execute("SELECT id, pose FROM Node").fetchall()
         check_bytes(f"{path}: the poses", *(blob for _, blob in nodes))
         poses = {int(i): decode_pose(blob) for i, blob in nodes}
-        said.append("it has no optimised poses: those of the odometry are taken, which drift")
+        warnings.append("it has no optimised poses: those of the odometry are taken, which drift")
     for node, pose in poses.items():
         if pose is not None and node > 0 and len(find_invalid_rotations(pose[None])):
             raise InputError(
@@ -339,7 +339,7 @@ def _detect_kind(path: Path, base: sqlite3.Connection, version: tuple[int, ...])
 
 
 def _iter_scans(
-    path: Path, base: sqlite3.Connection, version: tuple[int, ...], poses: Poses, flat: bool, said: list[str]
+    path: Path, base: sqlite3.Connection, version: tuple[int, ...], poses: Poses, flat: bool, warnings: list[str]
 ) -> Iterator[PosedScan]:
     """The laser scans of all nodes that have a pose."""
     count, lost = base.execute("SELECT COUNT(*) FROM Data WHERE LENGTH(scan) > 4").fetchone()[0], 0
@@ -356,9 +356,9 @@ def _iter_scans(
     if lost == count:
         raise InputError(f"{path}: none of its {count:,} scans has a pose; optimise the graph in RTAB-Map, and save it")
     if lost:
-        said.append(f"{lost:,} of {count:,} scans have no pose and are left out")
+        warnings.append(f"{lost:,} of {count:,} scans have no pose and are left out")
     if flat:
-        said.append("its scans are slices: it has no depth images, nor scans in space")
+        warnings.append("its scans are slices: it has no depth images, nor scans in space")
 
 
 def _iter_frames(

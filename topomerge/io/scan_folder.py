@@ -49,8 +49,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         return
     numbers = [int(t) for scan in scans if _is_numbered(scan) and (t := parse_name_time(scan.stem)) is not None]
     trajectory = read_trajectory(trajectory_file, len(scans), min(max(numbers, default=0), LAST_SCAN))
-    poses, said = match_poses(path, scans, trajectory, trajectory_file)
-    yield from iter_pieces(_iter_posed_scans(scans, poses, options), said)
+    poses, warnings = match_poses(path, scans, trajectory, trajectory_file)
+    yield from iter_pieces(_iter_posed_scans(scans, poses, options), warnings)
 
 
 def find_scans(path: Path) -> list[Path]:
@@ -161,8 +161,8 @@ def _match_poses_by_time(
         )
     poses = [pose if ok else None for pose, ok in zip(trajectory.interpolate(times), near.tolist(), strict=True)]
     lost = int((~near).sum())
-    said = f"{lost:,} of {len(times):,} scans are more than {LONGEST_GAP:g} s from any pose of {source.name} and are left out"
-    return poses, [said] if lost else []
+    text = f"{lost:,} of {len(times):,} scans are more than {LONGEST_GAP:g} s from any pose of {source.name} and are left out"
+    return poses, [text] if lost else []
 
 
 def _iter_posed_scans(scans: list[Path], poses: list[Array | None], options: ReadOptions) -> Iterator[PosedScan]:

@@ -265,10 +265,10 @@ def _label_clusters(keys: Array) -> Array:
     order = np.argsort(codes, kind="stable")
     ends = []
     for step in HALF:
-        wanted = codes + step @ scale[1:]
-        at = np.minimum(np.searchsorted(codes, wanted, sorter=order), len(codes) - 1)
+        requested = codes + step @ scale[1:]
+        at = np.minimum(np.searchsorted(codes, requested, sorter=order), len(codes) - 1)
         found = order[at]
-        met = np.flatnonzero(codes[found] == wanted)
+        met = np.flatnonzero(codes[found] == requested)
         ends.append(np.stack([met, found[met]]))
     pairs = np.concatenate(ends, axis=1)
     graph = coo_matrix((np.ones(pairs.shape[1], bool), pairs), (len(keys), len(keys)))

@@ -148,7 +148,7 @@ def read_foxglove(address: str, topics: Collection[str], counts: StreamCounts) -
     Raises:
         InputError: nobody answers there.
     """
-    wanted: dict[int, tuple[str, str]] = {}
+    requested: dict[int, tuple[str, str]] = {}
     with _connect(address, (FOXGLOVE,)) as link:
         for received in _iter_received(link):
             if received is None:
@@ -159,17 +159,17 @@ def read_foxglove(address: str, topics: Collection[str], counts: StreamCounts) -
                     told = json.loads(received)
                     offered = told.get("channels", []) if told.get("op") == "advertise" else []
                     new = [
-                        c for c in offered if c["topic"] in topics and c.get("encoding") == "cdr" and len(wanted) < len(topics)
+                        c for c in offered if c["topic"] in topics and c.get("encoding") == "cdr" and len(requested) < len(topics)
                     ]
                     for channel in new:
-                        wanted[len(wanted) + 1] = channel["topic"], normalise_type(channel["schemaName"])
-                        subscription = {"id": len(wanted), "channelId": int(channel["id"])}
+                        requested[len(requested) + 1] = channel["topic"], normalise_type(channel["schemaName"])
+                        subscription = {"id": len(requested), "channelId": int(channel["id"])}
                         link.send(json.dumps({"op": "subscribe", "subscriptions": [subscription]}))
                     continue
                 code, number, nanoseconds = struct.unpack_from("<BIQ", received)
-                if code != 1 or number not in wanted:
+                if code != 1 or number not in requested:
                     continue
-                topic, kind = wanted[number]
+                topic, kind = requested[number]
                 message = Message(topic, counts.read + 1, nanoseconds * 1e-9, deserialise(bytes(received[13:]), kind))
             except MESSAGE_ERRORS:
                 counts.broken += 1

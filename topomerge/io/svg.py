@@ -40,7 +40,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
 
 
 def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """The same in this process.
+    """Yield the same in this process.
 
     Raises:
         InputError: it is no SVG, declares entities, or is too large; as `trace_drawing`.
@@ -191,11 +191,11 @@ def _find_lines(element: xml.Element, matrix: Array, height: float) -> Iterator[
     style = element.get("style", "") + f"text-anchor:{element.get('text-anchor', '')}"
     anchor = 0.0 if "anchor:middle" in style else -0.5 if "anchor:end" in style else 0.5
     for (x, y), text in lines:
-        words = " ".join(text.split())
-        middle = matrix @ [x + anchor * 0.55 * height * len(words), y - 0.35 * height, 1.0]
+        content = " ".join(text.split())
+        middle = matrix @ [x + anchor * 0.55 * height * len(content), y - 0.35 * height, 1.0]
         size = height * math.sqrt(abs(np.linalg.det(matrix[:2, :2])))
-        if words and np.isfinite(middle).all() and np.abs(middle).max() < 1e6 and math.isfinite(size):
-            yield PictureText(words, (float(middle[0]), float(middle[1])), float(size), 1.0)
+        if content and np.isfinite(middle).all() and np.abs(middle).max() < 1e6 and math.isfinite(size):
+            yield PictureText(content, (float(middle[0]), float(middle[1])), float(size), 1.0)
 
 
 def _read_place(element: xml.Element, default: list[float]) -> list[float]:

@@ -128,18 +128,18 @@ def iter_number_rows(path: Path, widths: Mapping[int, str]) -> Iterator[tuple[in
     width = 0
     with path.open(encoding="utf-8-sig", errors="replace") as stream:
         for number, line in enumerate(stream, 1):
-            words = line.split("#", 1)[0].replace(",", " ").split()
-            if not words:
+            fields = line.split("#", 1)[0].replace(",", " ").split()
+            if not fields:
                 continue
             try:
-                row = [float(word) for word in words]
+                row = [float(word) for word in fields]
             except ValueError as error:
                 shown = "" if is_outside_link(path) else f" ({line.strip()[:40]!r})"
                 raise InputError(f"{path}: line {number} is not a row of numbers{shown}; mend or remove it") from error
             width = width or len(row)
             if len(row) != width or width not in widths:
-                said = ", one of ".join(f"{name} has {count}" for count, name in widths.items())
-                raise InputError(f"{path}: line {number} has {len(row)} numbers; a line of {said}: give the trajectory like that")
+                text = ", one of ".join(f"{name} has {count}" for count, name in widths.items())
+                raise InputError(f"{path}: line {number} has {len(row)} numbers; a line of {text}: give the trajectory like that")
             if not (np.abs(row) < BEYOND).all():  # so of nan, too
                 wrong = f"line {number} holds a number that is not finite, or beyond {BEYOND:g}"
                 raise InputError(f"{path}: {wrong}; mend it, or remove it with its scan")

@@ -68,13 +68,15 @@ def save_transformed_points(
     """
     source, target = Path(source), Path(target)
     if choose_suffix(target) != ".ply":
-        with replace_on_success(target) as beside:
-            return _save_las(source, beside, move, _Frame(np.floor(np.asarray(near, np.float64)), same_frame), progress, options)
+        with replace_on_success(target) as temporary:
+            return _save_las(
+                source, temporary, move, _Frame(np.floor(np.asarray(near, np.float64)), same_frame), progress, options
+            )
     real = "f8" if np.abs(near).max() > FLOAT32_WITHIN else "f4"
-    with replace_on_success(target) as beside:
-        written = _save_ply(source, beside, move, (real, False), progress, options)
+    with replace_on_success(target) as temporary:
+        written = _save_ply(source, temporary, move, (real, False), progress, options)
         if written is None:  # rare: the first block had no colours, a later one has
-            written = _save_ply(source, beside, move, (real, True), progress, options)
+            written = _save_ply(source, temporary, move, (real, True), progress, options)
     assert written is not None
     return SavedPoints(written)
 

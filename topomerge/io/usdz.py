@@ -86,7 +86,7 @@ def check_package(path: Path) -> None:
 
 
 def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """The same in this process, which the library may end.
+    """Yield the same in this process, which the library may end.
 
     Raises:
         InputError: a layer names others outside of the file, or there are no meshes, or too many.

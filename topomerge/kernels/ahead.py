@@ -87,8 +87,8 @@ def _run_workers(count: int) -> bool:
     environment = {**os.environ, SWITCH: "0"}
     environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
     with tempfile.TemporaryDirectory(prefix="topomerge-") as folder:
-        words = [sys.executable, "-c", "import sys; from topomerge.kernels.ahead import work; work(sys.argv[1])", folder]
-        workers = [subprocess.Popen(words, env=environment, stderr=subprocess.DEVNULL) for _ in range(max(count, 1))]
+        arguments = [sys.executable, "-c", "import sys; from topomerge.kernels.ahead import work; work(sys.argv[1])", folder]
+        workers = [subprocess.Popen(arguments, env=environment, stderr=subprocess.DEVNULL) for _ in range(max(count, 1))]
         try:
             statuses = [worker.wait() for worker in workers]
             return not any(statuses)

@@ -340,7 +340,7 @@ def _measure_pose_evidence(first, last, poses, storeys, points, storey, is_wall,
 
 
 @njit(cache=True, error_model="numpy")
-def sum_votes(way, rise, room, chance, voted, voters, widths, level_gap):  # type: ignore[no-untyped-def]  # pragma: no cover
+def sum_votes(way, rise, room, probability, voted, voters, widths, level_gap):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Sums (len(voted), len(widths)) float64 of the chances of the voters whose way is near that of each pair, by how near it is:
     the weight of a voter falls from 1 to 0 at a width (biweight). None votes for a pair that shares a room with it.
 
@@ -363,7 +363,7 @@ def sum_votes(way, rise, room, chance, voted, voters, widths, level_gap):  # typ
             for k in range(len(widths)):
                 near = 1 - apart / widths[k] ** 2
                 if near > 0:
-                    out[i, k] += near * near * chance[q]
+                    out[i, k] += near * near * probability[q]
     return out
 
 

@@ -242,7 +242,7 @@ Run = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]  # codes (n,) uint64, asce
 
 
 def unite_runs(first: Run, second: Run) -> Run:
-    """Two runs of cells as one: of those in both, counts and sums are added."""
+    """Return two runs of cells as one: of those in both, counts and sums are added."""
     number = int(_count_in_either(first[0], second[0]))
     out = np.empty(number, np.uint64), np.empty(number, np.int64), np.empty((number, 3), np.int64)
     _unite(*first, *second, *out)

@@ -66,7 +66,7 @@ class Witness:
     verdict: str
 
     def inverse(self) -> Witness:
-        """The same with the maps the other way round."""
+        """Return the same with the maps the other way round."""
         return replace(self, values=self.values[::-1], rows=self.rows[::-1], at=self.at[::-1])
 
 
@@ -108,7 +108,7 @@ class LandmarkEvidence:
         return {name: w / total for name, w in weight.items()} if total > 0 else dict(posterior)
 
     def inverse(self) -> LandmarkEvidence:
-        """The same with the maps the other way round."""
+        """Return the same with the maps the other way round."""
         return replace(self, witnesses=tuple(w.inverse() for w in self.witnesses))
 
     def list_sentences(self) -> list[str]:
@@ -273,14 +273,14 @@ def _list_witnesses(
 ) -> list[Witness]:
     share, keys = compute_shares(a, b, met.pairs), [(a.keys[i], b.keys[j]) for i, j in met.pairs.tolist()]
     numbers = a.numbered[met.pairs[:, 0]] & b.numbered[met.pairs[:, 1]]
-    chance = np.clip(compute_chances(a, b, met.pairs, keys, numbers) / share, 1.0, rules.most)
+    probability = np.clip(compute_chances(a, b, met.pairs, keys, numbers) / share, 1.0, rules.most)
     out = []
     for k, (i, j) in enumerate(met.pairs.tolist()):
         times = sum(weight * score_pair(*keys[k], error, kind) / share[k] for error, weight in READERS)
         sure = max(a.sigma[i], b.sigma[j]) <= rules.surest
-        if met.turned[k] or (sure and times < chance[k] / 2):
+        if met.turned[k] or (sure and times < probability[k] / 2):
             out.append(_build_witness(a, b, i, j, kind, "contradicts"))
-        elif times > 2 * (1.0 if keys[k][0] == keys[k][1] else chance[k]):
+        elif times > 2 * (1.0 if keys[k][0] == keys[k][1] else probability[k]):
             out.append(_build_witness(a, b, i, j, kind, "agrees"))
     return out + [_build_witness(a, b, i, j, kind, "elsewhere") for i, j in far]
 

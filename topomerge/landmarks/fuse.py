@@ -51,16 +51,16 @@ class LandmarkSummary:
 
     def describe_contradictions(self, names: Sequence[str]) -> str:
         """Describe the first contradictions in a sentence; "" where there are none."""
-        words = []
+        parts = []
         for c in self.contradictions[:3]:
             (one, other), (a, b) = c["values"], (names[k] for k in c["maps"])
             if c["what"] == "tag":
-                words.append(f"tag {one} is {c['apart_m']:.1f} m apart in {a} and {b}")
+                parts.append(f"tag {one} is {c['apart_m']:.1f} m apart in {a} and {b}")
             else:
-                words.append(f"room {c['room']} is {one} in {a} and {other} in {b}")
-        if self.contradicting > len(words):
-            words.append(f"and {self.contradicting - len(words)} more")
-        return f"{CONTRADICTING}: {'; '.join(words)}" if words else ""
+                parts.append(f"room {c['room']} is {one} in {a} and {other} in {b}")
+        if self.contradicting > len(parts):
+            parts.append(f"and {self.contradicting - len(parts)} more")
+        return f"{CONTRADICTING}: {'; '.join(parts)}" if parts else ""
 
 
 def describe_listed(listed: Any, names: Sequence[str]) -> str:

@@ -204,13 +204,13 @@ def compute_factors(a: Sightings, b: Sightings, met: Associated, rules: Kind, ki
     for error, weight in READERS:
         same = read([score_pair(s, t, error, kind) for s, t in keys])
         moved = [read([score_shifted(s, t, shift, error) for s, t in keys]) for shift in shifts]
-        chance = {name: float(np.log(1 - near + near * np.maximum(alike, equal)).sum()) for name, near in NEAR.items()}
-        kept = [np.log1p(-RENEWED) + same, np.log(RENEWED / 2) + chance["wing"]]
+        probability = {name: float(np.log(1 - near + near * np.maximum(alike, equal)).sum()) for name, near in NEAR.items()}
+        kept = [np.log1p(-RENEWED) + same, np.log(RENEWED / 2) + probability["wing"]]
         kept += [np.log(RENEWED / 2 * OTHERWISE) + m for m in moved]
         parts["here"].append(np.log(weight) + float(np.logaddexp.reduce(kept)))
         for name in ALTERNATIVES[1:]:
             repeats, shifted = rules.repeats[name], SHIFTED[name] if shifts else 0.0
-            terms = [np.log(1 - repeats - shifted * (1 - repeats)) + chance[name], np.log(repeats) + same]
+            terms = [np.log(1 - repeats - shifted * (1 - repeats)) + probability[name], np.log(repeats) + same]
             ways = [(LEADING if is_leading(s) else COUNTED if s[0] == "count" else {}).get(name, OTHERWISE) for s in shifts]
             terms += [np.log(shifted * (1 - repeats) * way) + m for way, m in zip(ways, moved, strict=True)]
             parts[name].append(np.log(weight) + float(np.logaddexp.reduce(terms)))

@@ -67,13 +67,13 @@ def list_strings(map: TopometricMap) -> list[tuple[str, str]]:
 def build_landmark_index(maps: Iterable[TopometricMap | None]) -> LandmarkIndex:
     """Build the index of maps, of which those without landmarks may be None."""
     strings: dict[tuple[str, str], tuple[int, ...]] = {}
-    heard = []
+    readings = []
     for k, map in enumerate(maps):
         if map is None or not len(map.landmarks):
             continue
         for entry in list_strings(map):
             strings[entry] = (*strings.get(entry, ()), k)
         if map.landmarks.is_kind("radio").any():
-            heard.append((k, map))
-    radio = build_radio_index([map for _, map in heard]) if heard else None
-    return LandmarkIndex(strings, radio, tuple(k for k, _ in heard))
+            readings.append((k, map))
+    radio = build_radio_index([map for _, map in readings]) if readings else None
+    return LandmarkIndex(strings, radio, tuple(k for k, _ in readings))

@@ -146,9 +146,9 @@ class Likeness:
     def find_suspects(self, near: Array) -> list[int]:
         """Find the addresses that say the most of pairs (n, m) of scans that a pose puts near each other."""
         lengths = [np.sqrt(np.maximum(s, 1e-9))[:, None] for s in self.square]
-        said = ((self.a / lengths[0]) * (near.astype(np.float32) @ (self.b / lengths[1]))).sum(axis=0)
-        order = np.argsort(-said, kind="stable")[:SUSPECTS]
-        return [int(k) for k in order if said[k] > 0]
+        total = ((self.a / lengths[0]) * (near.astype(np.float32) @ (self.b / lengths[1]))).sum(axis=0)
+        order = np.argsort(-total, kind="stable")[:SUSPECTS]
+        return [int(k) for k in order if total[k] > 0]
 
 
 def compare_scans(a: RadioScans, b: RadioScans) -> Likeness:
@@ -159,10 +159,10 @@ def compare_scans(a: RadioScans, b: RadioScans) -> Likeness:
     weights = [_compute_address_weights(scans) for scans in (a, b)]
     both = np.sqrt(weights[0][left] * weights[1][right])
     weights[0][left] = weights[1][right] = both
-    said = [weight * np.asarray(scans.power.sum(axis=0)).ravel() for scans, weight in zip((a, b), weights, strict=True)]
-    most = np.sort(np.argsort(-np.minimum(said[0][left], said[1][right]), kind="stable")[:MOST_ADDRESSES])
+    totals = [weight * np.asarray(scans.power.sum(axis=0)).ravel() for scans, weight in zip((a, b), weights, strict=True)]
+    most = np.sort(np.argsort(-np.minimum(totals[0][left], totals[1][right]), kind="stable")[:MOST_ADDRESSES])
     parts, squares = [], []
-    for scans, weight, own, total in zip((a, b), weights, (left[most], right[most]), said, strict=True):
+    for scans, weight, own, total in zip((a, b), weights, (left[most], right[most]), totals, strict=True):
         rest = np.setdiff1d(np.argsort(-total, kind="stable")[: 2 * MOST_ADDRESSES], own)[:MOST_ADDRESSES]
         pooled = [
             (_build_pooling(scans.position) @ (scans.power[:, at].multiply(weight[None, at]).toarray())).astype(np.float32)

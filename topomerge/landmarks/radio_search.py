@@ -125,9 +125,9 @@ def _find_height(likeness: Array, a: Array, b: Array) -> float:
 def _build_pose(at: Array, middle: Array, height: float) -> Sim3:
     """The pose that turns b about the middle of its scans and lays that at (x, y)."""
     x, y, yaw = at.tolist()
-    there = Sim3(yaw).apply(middle[None])[0]
+    placed = Sim3(yaw).apply(middle[None])[0]
     yaw = (yaw + np.pi) % (2 * np.pi) - np.pi
-    return Sim3(float(yaw), (float(x - there[0]), float(y - there[1]), float(height)))
+    return Sim3(float(yaw), (float(x - placed[0]), float(y - placed[1]), float(height)))
 
 
 def _turn(yaw: float) -> Array:
@@ -338,11 +338,13 @@ def rank_maps(index: RadioIndex, landmarks: Landmarks) -> list[RadioRank]:
         scores[:, k] = np.sort(some, axis=1)[:, -BEST_PLACES:].mean(axis=1)
     mean_score = scores.mean(axis=0)
     odds = RANK_SHARPNESS * min(len(scans), RANK_MOST) * mean_score
-    chance = np.exp(odds - odds.max())
-    chance /= chance.sum()
+    probability = np.exp(odds - odds.max())
+    probability /= probability.sum()
     order = np.argsort(-mean_score, kind="stable")
     return [
-        RadioRank(int(keys[k, 0]), int(keys[k, 1]), float(mean_score[k]), float(chance[k])) for k in order if mean_score[k] > 0
+        RadioRank(int(keys[k, 0]), int(keys[k, 1]), float(mean_score[k]), float(probability[k]))
+        for k in order
+        if mean_score[k] > 0
     ]
 
 

@@ -57,7 +57,7 @@ class Observation:
     cost: float
 
     def inverse(self) -> Observation:
-        """The same with the maps the other way round."""
+        """Return the same with the maps the other way round."""
         return replace(self, map=1 - self.map)
 
     def describe(self, names: Sequence[str]) -> str:
@@ -91,11 +91,11 @@ def find_observations(
     trees = [cKDTree(_sample(m.grid.compute_centroids())) if len(m.grid) else None for m in maps]
     for own in (0, 1):
         into = pose.inverse() if own == 0 else pose  # of places of this map into the other one
-        told = {w.rows[own] for w in witnesses if w.verdict != "elsewhere"}
+        text = {w.rows[own] for w in witnesses if w.verdict != "elsewhere"}
         other = trees[1 - own]
         if other is None:
             continue
-        found += _list_signs(maps[own], into, other, 1 - own, told, posterior)
+        found += _list_signs(maps[own], into, other, 1 - own, text, posterior)
         found += _list_rooms(maps[own], into, other, 1 - own, posterior)
     found += _list_doors(maps, pose, trees[1], posterior, witnesses)
     found = [replace(o, room=_find_room(maps[o.map], o.at)) if o.action != "visit" else o for o in found]
@@ -178,11 +178,11 @@ def _list_doors(
     kind = KINDS["text"]
     agrees = {n: READ**2 * (kind.repeats[n] if n != "here" else 1 - kind.changed) for n in ALTERNATIVES}
     change = compute_expected_change(posterior, agrees)
-    there = pose.apply(b.edges["centre"])
+    placed = pose.apply(b.edges["centre"])
     known = np.array([w.at[0][:2] for w in witnesses if w.kind in ("text", "name")], float).reshape(-1, 2)
     out = []
     for x, y, z in doors.tolist():
-        same = np.linalg.norm(there - (x, y, z), axis=1).min() < SEEN_WITHIN
+        same = np.linalg.norm(placed - (x, y, z), axis=1).min() < SEEN_WITHIN
         if same and not (np.hypot(*(known - (x, y)).T) < SEEN_WITHIN).any():
             out.append(Observation("read both", 0, -1, (x, y, z), "", change, COSTS["read both"]))
     return out

@@ -106,8 +106,8 @@ def build_sightings(map: TopometricMap, kinds: Sequence[str]) -> Sightings:
     if len(rows) > MOST_ROWS:
         rows = np.sort(rows[np.argsort(-confidence, kind="stable")[:MOST_ROWS]])
     position, sigma = locate_landmarks(map, table[rows])
-    there = np.isfinite(sigma)
-    rows, position, sigma = rows[there], position[there], sigma[there]
+    finite = np.isfinite(sigma)
+    rows, position, sigma = rows[finite], position[finite], sigma[finite]
     values = map.landmarks.get_values()[rows].tolist()
     texts = np.isin(table["kind"][rows], [LANDMARK_KINDS.index(kind) for kind in ("text", "name")]).tolist()
     keys = [fold_text(v) if text else v.strip().casefold() for v, text in zip(values, texts, strict=True)]

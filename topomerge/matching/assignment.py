@@ -138,9 +138,9 @@ def grow(a: TopometricMap, b: TopometricMap, cost: Array, c_max: float | None = 
     if not cost.size:
         return []
     limit = float(np.median(cost)) if c_max is None else c_max
-    beside = [[set(n.tolist()) - {i} for i, n in enumerate(find_neighbours(m))] for m in (a, b)]
+    neighbours = [[set(n.tolist()) - {i} for i, n in enumerate(find_neighbours(m))] for m in (a, b)]
     centroids = (a.rooms["centroid"], b.rooms["centroid"])
-    hypotheses = {_grow_from_seed((i, j), cost, beside, centroids, limit, de_max) for i, j in assign(cost).tolist()}
+    hypotheses = {_grow_from_seed((i, j), cost, neighbours, centroids, limit, de_max) for i, j in assign(cost).tolist()}
     return sorted(hypotheses, key=lambda pairs: (-len(pairs), sum(cost[p] for p in pairs), pairs))
 
 

@@ -115,7 +115,7 @@ def collect_doors(map: TopometricMap, plan: RoomPlans) -> Doors:
 def propose_door_poses(
     a: TopometricMap, b: TopometricMap, plans: tuple[RoomPlans, RoomPlans], pairs: Array, weight: Array
 ) -> PoseArrays:
-    """One pose for each two doors of each pair of rooms (P, 2), at the scale 1."""
+    """Return one pose for each two doors of each pair of rooms (P, 2), at the scale 1."""
     of = [collect_doors(m, p) for m, p in zip((a, b), plans, strict=True)]
     p, q, w = _pair_doors(of[0], of[1], pairs, weight)
     yaw = snap_yaws(of[0].into[p] - of[1].into[q], plans)
@@ -334,7 +334,7 @@ def propose_candidate_poses(
 
 
 def find_voted_pose(a: TopometricMap, b: TopometricMap, certain: Array, scale: float | None = None) -> Sim3 | None:
-    """The pose T_ab that most doors and middles of matched rooms vote for, with no look at walls; None where none match.
+    """Return the pose T_ab that most doors and middles of matched rooms vote for, with no look at walls; None where none match.
 
     Args:
         certain: (R_a, R_b) how sure each match is; each votes with that.
@@ -405,13 +405,13 @@ def rank(poses: PoseArrays, evidence: Array, plans: tuple[RoomPlans, RoomPlans])
     agree = evidence[:, 1] + FLOOR * evidence[:, 3]
     short = agree >= CONSISTENCY.shortlist * agree.max()
     order = np.lexsort((-evidence[:, 0], ~short))
-    chance = compute_hypothesis_probability(evidence[:, 1:])
+    probability = compute_hypothesis_probability(evidence[:, 1:])
     ranked = []
     for h in order.tolist():
         pose = poses.get_transform(h)
         rooms, fit = find_matches(pose, plans)
         features = dict(zip(("agree_m", "conflict_m", "floor_m2"), evidence[h, 1:].round(3).tolist(), strict=True))
-        ranked.append(PoseHypothesis(pose, float(evidence[h, 0]), float(chance[h]), features, True, rooms, fit))
+        ranked.append(PoseHypothesis(pose, float(evidence[h, 0]), float(probability[h]), features, True, rooms, fit))
     return tuple(ranked)
 
 

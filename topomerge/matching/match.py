@@ -237,8 +237,8 @@ def select_marginal_matches(a: TopometricMap, b: TopometricMap, ranked: tuple[Po
     """
     total: dict[tuple[int, int], float] = {}
     for h in ranked:
-        chance = compute_match_probability(a, b, h.rooms, h.fit)
-        for (i, j), p in zip(h.rooms.tolist(), chance.tolist(), strict=True):
+        probability = compute_match_probability(a, b, h.rooms, h.fit)
+        for (i, j), p in zip(h.rooms.tolist(), probability.tolist(), strict=True):
             total[i, j] = total.get((i, j), 0.0) + h.probability * p
     best = {(i, j) for i, j in ranked[0].rooms.tolist()} if ranked else set()
     taken = ({i for i, _ in best}, {j for _, j in best})
@@ -266,7 +266,7 @@ MATCHING_FORMAT = 1
 
 
 def serialise_matching(matching: Matching, a: TopometricMap, b: TopometricMap) -> dict[str, Any]:
-    """Rooms with their probabilities and all hypotheses; matrices are row-major and map points of the file of b into
+    """Return rooms with their probabilities and all hypotheses; matrices are row-major and map points of the file of b into
     the frame of that of a."""
     rows = zip(matching.rooms.tolist(), matching.probability.tolist(), strict=True)
     listing = {

@@ -77,7 +77,7 @@ class PoseArrays:
         return PoseArrays(self.yaw[rows], self.shift[rows], self.scale[rows], self.weight[rows])
 
     def get_transform(self, row: int) -> Sim3:
-        """One of the poses, its yaw in [-pi, pi)."""
+        """Return one of the poses, its yaw in [-pi, pi)."""
         x, y, z = self.shift[row].tolist()
         return Sim3(wrap_yaw(float(self.yaw[row])), (x, y, z), float(self.scale[row]))
 

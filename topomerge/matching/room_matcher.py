@@ -212,8 +212,8 @@ def compute_agreement(likely: Array, a: RoomsSeen, b: RoomsSeen) -> Array:
     order = np.argsort(-likely, axis=None, kind="stable")
     voters, voted = order[: min(VOTERS * (n + m), MOST_VOTERS)], np.sort(order[:MOST_VOTED])
     room = np.stack(np.divmod(np.arange(n * m), m), axis=1)
-    chance = likely.ravel().astype(np.float64)
-    out[voted] = np.log1p(VOTE_UNIT * sum_votes(way, rise, room, chance, voted, voters, np.array(AGREEMENT), LEVEL_GAP))
+    probability = likely.ravel().astype(np.float64)
+    out[voted] = np.log1p(VOTE_UNIT * sum_votes(way, rise, room, probability, voted, voters, np.array(AGREEMENT), LEVEL_GAP))
     return out.reshape(n, m, len(AGREEMENT))
 
 

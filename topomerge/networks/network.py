@@ -141,7 +141,7 @@ def load_shipped_network(name: str, signature: Signature) -> Network:
 
 
 def card_of(path: Path) -> Path:
-    """The card beside a file of weights."""
+    """Return the card beside a file of weights."""
     return path.with_name(f"{path.stem}{CARD}")
 
 
@@ -167,8 +167,8 @@ def write_card(path: Path, values: Mapping[str, Any]) -> Path:
     """Write the card of a file of weights beside it, with its digest; the same values give the same bytes."""
     card = card_of(path)
     known = {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
-    with replace_on_success(card) as beside:
-        beside.write_text(json.dumps(convert_to_plain({**values, **known}), indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    with replace_on_success(card) as temporary:
+        temporary.write_text(json.dumps(convert_to_plain({**values, **known}), indent=1, sort_keys=True) + "\n", encoding="utf-8")
     return card
 
 

@@ -184,7 +184,7 @@ class Side:
 
 def _features(t: Array, level: float) -> dict[str, float]:
     both = t.sum(axis=0)
-    chance = both[9] / max(both[8], 1e-6)  # of a free column to meet clutter
+    by_chance = both[9] / max(both[8], 1e-6)  # of a free column to meet clutter
     met = both[7] / max(both[6], 1e-6)
     return {
         "walls": both[1] / 2,
@@ -196,8 +196,8 @@ def _features(t: Array, level: float) -> dict[str, float]:
         "free": both[5] / 2,
         "clutter": both[6] / 2,
         "met": met,
-        "chance": chance,
-        "clutter_lift": met - chance,
+        "chance": by_chance,
+        "clutter_lift": met - by_chance,
         "share": max(t[k, 1] / max(t[k, 10], 1e-6) for k in (0, 1)),
         "level": level,
     }

@@ -133,11 +133,11 @@ def build_candidates(
         closely += [k for k in select_testified(ranked, scorer) if k not in closely]
     near = [ranked[k] for k in closely]
     bent |= {id(h): build_candidate(a, b, h, scaled, scorer) for h in near if id(h) not in bent}
-    looked = sorted((bent[id(h)] for h in near), key=lambda c: -c.odds)
-    looked[0].features["repeats"] = float(count_repeats(ranked))  # asked of the best one only
-    moved = [replace(c.hypothesis, transform=c.bend.transform) for c in looked]
+    examined = sorted((bent[id(h)] for h in near), key=lambda c: -c.odds)
+    examined[0].features["repeats"] = float(count_repeats(ranked))  # asked of the best one only
+    moved = [replace(c.hypothesis, transform=c.bend.transform) for c in examined]
     single = {id(h) for h in select_distinct_hypotheses(moved, np.append(b.storeys[0].middle, 0.0), BASIN)}
-    return [c for c, h in zip(looked, moved, strict=True) if id(h) in single]
+    return [c for c, h in zip(examined, moved, strict=True) if id(h) in single]
 
 
 @dataclass(frozen=True)
@@ -231,8 +231,8 @@ def register(
         pair.search([*first, *pair.propose_by_landmarks()])
     else:
         pair.add(first)
-    chance = pair.score_candidates(same)
-    if fallback is not None and chance < fallback.below:
+    probability = pair.score_candidates(same)
+    if fallback is not None and probability < fallback.below:
         tell_step(0.6, "match rooms")
         pair.add(fallback.make())
         pair.score_candidates(same)
@@ -294,12 +294,12 @@ class _Pair:
         self.clock.lap("bend")
         return self.verdict.each[0]
 
-    def build_registration(self, said: Verdict, rigid: bool) -> Registration:
+    def build_registration(self, verdict: Verdict, rigid: bool) -> Registration:
         """Return the best hypothesis, finely registered, with what was said of it."""
         tell_step(0.8, "refine the pose")
         bent, rmse = _refine_candidate(self.a, self.b, self.looked[0], self.scaled, rigid)
         self.clock.lap("refine")
-        believed = _build_registration(self.ranked, self.looked, said)
+        believed = _build_registration(self.ranked, self.looked, verdict)
         features = {**believed.features, "rmse": rmse}
         return replace(believed, transform=bent.transform, features=features, bend=None if rigid else bent)
 
@@ -322,27 +322,27 @@ def _refine_candidate(a: Prepared, b: Prepared, best: Candidate, scaled: bool, r
     return replace(bent, transform=replace(pose, translation=(*pose.translation[:2], height))), best.features["rmse"]
 
 
-def _build_registration(ranked: Sequence[PoseHypothesis], looked: Sequence[Candidate], said: Verdict) -> Registration:
+def _build_registration(ranked: Sequence[PoseHypothesis], examined: Sequence[Candidate], verdict: Verdict) -> Registration:
     """The best of the candidates, with its probability and the reason in words."""
-    best, chance = looked[0], said.each[0]
-    margin = min(best.odds - looked[1].odds, MARGIN_CAP) if len(looked) > 1 else MARGIN_CAP
-    features = {**said.features, "rigid_conflict_share": best.hypothesis.features["conflict_share"], "margin": margin}
-    accepted = chance >= load_model()["threshold"]
+    best, probability = examined[0], verdict.each[0]
+    margin = min(best.odds - examined[1].odds, MARGIN_CAP) if len(examined) > 1 else MARGIN_CAP
+    features = {**verdict.features, "rigid_conflict_share": best.hypothesis.features["conflict_share"], "margin": margin}
+    accepted = probability >= load_model()["threshold"]
     share = 100 * features["conflict_share"]
     reason = (
         f"{'believed' if accepted else 'not believed'}: {features['walls']:.0f} m2 of walls agree, {features['free']:.0f} m2 of "
         f"free floor seen by both, {share:.1f} % of the walls stand on free floor of the other map"
     )
-    closely = {id(c.hypothesis) for c in looked}
-    others = [replace(c.hypothesis, score=c.odds, probability=p) for c, p in zip(looked, said.each, strict=True)]
+    closely = {id(c.hypothesis) for c in examined}
+    others = [replace(c.hypothesis, score=c.odds, probability=p) for c, p in zip(examined, verdict.each, strict=True)]
     last = others[-1].score  # of those that were not looked at closely, the lag behind the best one is all that is known
     for h in ranked:
         if id(h) not in closely:
             lag = max(ranked[0].score - h.score, best.odds - last)
-            others.append(replace(h, score=best.odds - lag, probability=float(chance * np.exp(-lag))))
+            others.append(replace(h, score=best.odds - lag, probability=float(probability * np.exp(-lag))))
     pose, alternatives = best.bend.transform, tuple(others[:ALTERNATIVES])
-    told = {"posterior": said.posterior, "landmarks": best.landmarks, "walls": said.walls}
-    return Registration(pose, chance, accepted, features, alternatives, reason, places=best.places, **told)  # type: ignore[arg-type]
+    told = {"posterior": verdict.posterior, "landmarks": best.landmarks, "walls": verdict.walls}
+    return Registration(pose, probability, accepted, features, alternatives, reason, places=best.places, **told)  # type: ignore[arg-type]
 
 
 def refine_by_surfaces(a: Prepared, b: Prepared, start: Sim3, scaled: bool = False) -> tuple[Sim3, float]:

@@ -237,13 +237,13 @@ def _build_plan(rasters: tuple[Array, ...], origin: Array, cell: float, levels: 
     """
     occupied, crossed, floor, ceiling = rasters
     filled = build_band_stack(occupied, HEIGHT_BANDS, BODY_BANDS)
-    looked = is_observed_band(filled)
+    examined = is_observed_band(filled)
     masks = [HEIGHT_BANDS.build_mask(low, high) for low, high in pairwise(BODY_BANDS)]
-    observed = sum(mask for mask, seen in zip(masks, looked.tolist(), strict=True) if seen)
-    wall = detect_wall_columns(filled[1:][looked[1:]], WALL_RULE)
+    observed = sum(mask for mask, seen in zip(masks, examined.tolist(), strict=True) if seen)
+    wall = detect_wall_columns(filled[1:][examined[1:]], WALL_RULE)
     standing = filled.any(axis=0)
     shut = (occupied & ~np.uint32(HEIGHT_BANDS.build_mask(*BODY_HEIGHTS))) > 0
-    rays = np.bitwise_count(crossed & np.uint32(HEIGHT_BANDS.build_mask(*BODY_HEIGHTS))) >= max(int(looked.sum()) // 2, 1)
+    rays = np.bitwise_count(crossed & np.uint32(HEIGHT_BANDS.build_mask(*BODY_HEIGHTS))) >= max(int(examined.sum()) // 2, 1)
     if sliced:
         wall = _find_straight_runs(wall, cell)
     inside = ~wall & (standing | rays | (shut & (not sliced)))

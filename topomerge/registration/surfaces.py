@@ -187,7 +187,7 @@ Room = tuple[Surface, Features]
 
 
 def estimate_room_poses(a: TopometricMap, b: TopometricMap, rooms: Array, weights: Array) -> list[tuple[Sim3, float]]:
-    """Poses T_ab of clusters of pairs of rooms, with their weight, heaviest first; none where no pair can be aligned.
+    """Return poses T_ab of clusters of pairs of rooms, with their weight, heaviest first; none where no pair can be aligned.
 
     Args:
         rooms: (M, 2) matched rooms of a and b.
@@ -206,7 +206,7 @@ def estimate_room_poses(a: TopometricMap, b: TopometricMap, rooms: Array, weight
 
 
 def described(map: TopometricMap, room: int) -> Room | None:
-    """The surface of a room, and features of some of its points; None of a room that has hardly any."""
+    """Return the surface of a room, and features of some of its points; None of a room that has hardly any."""
     cells = map.grid.cells[map.room == room]
     if len(cells) < ROOM_LEAST_POINTS:
         return None

@@ -157,10 +157,10 @@ def compute_verdict(
     if not any(e.factors for e in landmarks):
         return Verdict(every, (every["here"] * shares).tolist(), dict(winner), every["here"])
     others = [(float(share / max(shares[1:].sum(), 1e-12)), e) for share, e in zip(shares[1:], landmarks[1:], strict=True)]
-    told = update_posterior(every, load_model()["threshold"], landmarks[0], others)
+    posterior = update_posterior(every, load_model()["threshold"], landmarks[0], others)
     ahead = np.array([e.support - landmarks[0].support for e in landmarks])
-    each = told["here"] * np.minimum(shares * np.exp(np.minimum(ahead, 30.0)), 1.0)
-    return Verdict(told, each.tolist(), dict(winner), every["here"])
+    each = posterior["here"] * np.minimum(shares * np.exp(np.minimum(ahead, 30.0)), 1.0)
+    return Verdict(posterior, each.tolist(), dict(winner), every["here"])
 
 
 def compute_belief_vector(bent: Array, leads: Sequence[float], winner: Features) -> Array:
@@ -221,9 +221,9 @@ def compute_furniture_log_odds(f: Features) -> float:
     """
     n = INDEPENDENT_PIECES * f["pieces"]
     met = min(INDEPENDENT_PIECES * f["in_place"], n)
-    chance = float(np.clip(f["by_chance"] / max(f["pieces"], 1e-6), 0.0, MOST_BY_CHANCE))
+    by_chance = float(np.clip(f["by_chance"] / max(f["pieces"], 1e-6), 0.0, MOST_BY_CHANCE))
     factor, more = OTHER_FURNITURE
-    a, c = CERTAINTY * (chance + (1 - chance) * FURNITURE_STAYS), CERTAINTY * (factor * chance + more)
+    a, c = CERTAINTY * (by_chance + (1 - by_chance) * FURNITURE_STAYS), CERTAINTY * (factor * by_chance + more)
     b, d = CERTAINTY - a, CERTAINTY - c
     return float(betaln(a + met, b + n - met) - betaln(a, b) - betaln(c + met, d + n - met) + betaln(c, d))
 

@@ -29,7 +29,7 @@ UNSEEN_HEIGHT = 2.5  # m: of a room whose ceiling nobody saw
 
 
 def build_floor_polygons(map: TopometricMap) -> list[shapely.MultiPolygon]:
-    """The floor of each room in the input's frame, m, exteriors counter-clockwise; rooms of a storey do not overlap.
+    """Return the floor of each room in the input's frame, m, exteriors counter-clockwise; rooms of a storey do not overlap.
 
     Navigable cells end short of the walls. All outlines are moved outwards by the distance at which their areas are those in the
     table of rooms, in the median. A room without navigable cells has its bounding box; it is empty where that is flat.

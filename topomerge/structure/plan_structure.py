@@ -106,10 +106,10 @@ def _find_carrier_wall(edge: Array, rooms: Array, walls: Array, table: Array) ->
     place = (apart * along).sum(axis=1)
     off = np.abs(apart[:, 0] * along[:, 1] - apart[:, 1] * along[:, 0])
     past = np.maximum(np.maximum(-place, place - length), 0.0)
-    beside = np.isin(walls["rooms"], inner).sum(axis=1)
+    adjoining = np.isin(walls["rooms"], inner).sum(axis=1)
     two = (np.sort(walls["rooms"], axis=1) == np.sort(rooms)).all(axis=1)
     cost = np.hypot(off, past) + np.where(two, 0.0, STRANGE)
-    fits = np.isin(walls["storey"], table["storey"][inner]) & (beside > 0) & (off <= CARRIER_REACH)
+    fits = np.isin(walls["storey"], table["storey"][inner]) & (adjoining > 0) & (off <= CARRIER_REACH)
     fits &= past <= (0.5 - LEAST_SHARE) * edge["width"] + 0.1
     return int(np.flatnonzero(fits)[cost[fits].argmin()]) if fits.any() else -1
 
@@ -179,8 +179,8 @@ def find_unseen_edges(floor: shapely.MultiPolygon, lines: list[Line]) -> list[Li
 
 def _is_along(line: Line, edge: Line) -> bool:
     t = float((edge.middle - line.middle) @ line.along)
-    beside = line.start - REACH_ON < t < line.end + REACH_ON and abs(line.along @ edge.along) > SAME_TURN
-    return beside and abs(float((edge.middle - line.middle) @ line.across)) < SAME_LINE
+    near = line.start - REACH_ON < t < line.end + REACH_ON and abs(line.along @ edge.along) > SAME_TURN
+    return near and abs(float((edge.middle - line.middle) @ line.across)) < SAME_LINE
 
 
 def _label_pieces(pieces: Array, floor: shapely.MultiPolygon, seen: shapely.Geometry) -> Array:

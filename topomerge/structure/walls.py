@@ -34,11 +34,11 @@ def add_wall_heights(map: TopometricMap, walls: Array, points: FacePoints) -> Ar
     tree = shapely.STRtree(shapely.points(points.at))
     furniture = np.zeros(len(walls), bool)
     for k, wall in enumerate(walls):
-        beside = wall["rooms"][wall["rooms"] >= 0]
-        wall["low"], wall["high"] = levels[beside, 0].min(), levels[beside, 1].max()
-        beside = beside[seen[beside]]
-        if len(beside):
-            top = _measure_own_top(wall, points, tree, float((levels[beside, 1] - levels[beside, 0]).min()))
+        adjoining = wall["rooms"][wall["rooms"] >= 0]
+        wall["low"], wall["high"] = levels[adjoining, 0].min(), levels[adjoining, 1].max()
+        adjoining = adjoining[seen[adjoining]]
+        if len(adjoining):
+            top = _measure_own_top(wall, points, tree, float((levels[adjoining, 1] - levels[adjoining, 0]).min()))
             if np.isfinite(top):
                 wall["high"], furniture[k] = wall["low"] + top, wall["faces"] == 1 and not _is_near_door(wall, map)
     return walls[~furniture]

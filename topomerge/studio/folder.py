@@ -191,17 +191,17 @@ def _describe_entry(path: Path, stamp: tuple[int, int]) -> dict[str, Any] | None
             return {"kind": "map", **about, "error": str(error)}
     if suffix in (".html", ".htm"):
         return {"kind": "page", **about}
-    beside = suffix in TABLES or (suffix in PICTURES and path.with_suffix(".yaml").exists())
-    return {"kind": "scan", **about} if suffix in list_suffixes() and not beside else None
+    companion = suffix in TABLES or (suffix in PICTURES and path.with_suffix(".yaml").exists())
+    return {"kind": "scan", **about} if suffix in list_suffixes() and not companion else None
 
 
 def _describe_folder(path: Path, about: dict[str, Any]) -> dict[str, Any] | None:
     for name, kind in (("merge.json", "merge"), ("atlas.json", "atlas")):
         if (path / name).is_file():
             listing = read_listing(path / name)
-            words = {key: listing.get(key) for key in ("status", "probability", "reason")}
+            listed = {key: listing.get(key) for key in ("status", "probability", "reason")}
             maps = [str(one.get("source", "")) for one in listing.get("maps", []) if isinstance(one, dict)]
-            return {"kind": kind, **about, **words, "maps": [Path(m).name for m in maps]}
+            return {"kind": kind, **about, **listed, "maps": [Path(m).name for m in maps]}
     if (path / DIFF_PAGE).is_file():
         return {"kind": "page", **about, "page": DIFF_PAGE}
     try:

@@ -149,8 +149,8 @@ class JobQueue:
         """Keep what a job says; was it anything?"""
         if line.startswith(PROGRESS_MARK):
             with suppress(ValueError, TypeError, KeyError):
-                told = json.loads(line.removeprefix(PROGRESS_MARK))
-                job.steps[str(told["task"])[:80]] = [float(told["share"]), str(told["text"])[:200]]
+                message = json.loads(line.removeprefix(PROGRESS_MARK))
+                job.steps[str(message["task"])[:80]] = [float(message["share"]), str(message["text"])[:200]]
                 return True
         elif line:
             job.lines = [*job.lines, line[:LONGEST_LINE].removeprefix("topomerge: ")][-MOST_LINES:]

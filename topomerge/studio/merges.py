@@ -83,7 +83,7 @@ def _describe(folder: StudioFolder, maps: OpenMaps, path: Path, listing: Mapping
         entry["bent"] = _draw_bent((listing.get("bend") or {}).get(str(k)), held)
         described.append(entry)
     probability = listing.get("probability")
-    facts = [
+    properties = [
         ("Probability", format_probability(float(probability)) if isinstance(probability, int | float) else "–"),
         ("Matched rooms", str(len(listing.get("matches") or []))),
         ("Maps in it", f"{len(transforms) + 1 if transforms else 0} of {len(described)}"),
@@ -94,7 +94,7 @@ def _describe(folder: StudioFolder, maps: OpenMaps, path: Path, listing: Mapping
     return {
         "status": str(listing.get("status", "damaged")),
         "reason": str(listing.get("reason", "")),
-        "facts": facts,
+        "facts": properties,
         "maps": described,
         "proposed": bool(transforms),
         "alternatives": _list_alternatives(listing.get("alternatives") or {}),
@@ -208,12 +208,12 @@ def place_pair(maps: OpenMaps, paths: Sequence[Path], wish: Mapping[str, Any]) -
     a, b = _load_two(maps, paths)
     start = _parse_pose(wish["matrix"]) if "matrix" in wish else _parse_rooms(wish.get("rooms"), a, b)
     placed = place_by_hand(prepare(a), prepare(b), start)
-    words = ["The walls near it moved it there." if placed.snapped else "There are no walls near it that it could snap to."]
+    parts = ["The walls near it moved it there." if placed.snapped else "There are no walls near it that it could snap to."]
     if placed.registration is not None:
-        words.append(placed.registration.reason)
-    words.append(f"Probability, by what the maps show: {format_probability(placed.probability)}")
-    words += [f"Surfaces are {100 * placed.rmse:.1f} cm apart."] if np.isfinite(placed.rmse) else []
-    return {"matrix": placed.pose.matrix.tolist(), "words": words, "probability": placed.probability}
+        parts.append(placed.registration.reason)
+    parts.append(f"Probability, by what the maps show: {format_probability(placed.probability)}")
+    parts += [f"Surfaces are {100 * placed.rmse:.1f} cm apart."] if np.isfinite(placed.rmse) else []
+    return {"matrix": placed.pose.matrix.tolist(), "words": parts, "probability": placed.probability}
 
 
 def _load_two(maps: OpenMaps, paths: Sequence[Path]) -> tuple[TopometricMap, TopometricMap]:

@@ -192,13 +192,13 @@ def assign_colours(rooms: int, pairs: Array, old: Mapping[int, int]) -> Array:
 def _describe_rooms(map: TopometricMap, colours: Array) -> list[dict[str, Any]]:
     """What is known of each room, without its outline."""
     names = find_room_names(map.landmarks, len(map.rooms))
-    words = {kind: _find_room_words(map, kind) for kind in ("use", "area") if kind in LANDMARK_KINDS}
+    texts = {kind: _find_room_words(map, kind) for kind in ("use", "area") if kind in LANDMARK_KINDS}
     described = []
     for i, room in enumerate(map.rooms):
         about = {"i": i, "colour": format_hex_colour(colours[i]), "area": round(float(room["area"]), 2), "name": names[i]}
         about |= {"height": round(float(room["height"]), 2), "looked": bool(room["glimpsed"])}
         about |= {"outside": bool(room["outside"] >= 0.5), "sure": round(float(room["confidence"]), 2)}
-        described.append({**about, "kind": words.get("use", {}).get(i, ""), "group": words.get("area", {}).get(i, "")})
+        described.append({**about, "kind": texts.get("use", {}).get(i, ""), "group": texts.get("area", {}).get(i, "")})
     return described
 
 

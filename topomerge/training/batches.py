@@ -99,8 +99,8 @@ def warp_planes(
     moved = []
     for place in places:
         flat = place.reshape(-1, 2).astype(np.float64)
-        there = np.isfinite(flat).all(axis=1)
-        flat[there] = (flat[there] + interpolate_drifts(knots, flat[there] / BEND_STEP)) @ turn.T - low
+        finite = np.isfinite(flat).all(axis=1)
+        flat[finite] = (flat[finite] + interpolate_drifts(knots, flat[finite] / BEND_STEP)) @ turn.T - low
         moved.append(flat.reshape(place.shape).astype(place.dtype))
     return planes, room, tuple(moved)
 

@@ -181,7 +181,7 @@ def label_error(err: Sequence[float] | None, sensors: Any) -> int:
 
 
 def is_distinguishable(row: dict[str, Any]) -> bool:
-    """Pairs that anybody could tell: no twin wings that are the same where both maps look, and no drawings of a storey
+    """Return pairs that anybody could tell: no twin wings that are the same where both maps look, and no drawings of a storey
     with the same walls. A drawing of a map's own building of which the map shows nothing has a wrong truth: the generator gave
     a twin's frame."""
     differs = row.get("differs")
@@ -249,11 +249,11 @@ def is_training_row(row: Row) -> bool:
     return bool(row["tellable"] or row["repeats"])
 
 
-def score_lookalikes(rows: Sequence[Row], believed: Array, true: Array, threshold: float) -> dict[str, float]:
+def score_lookalikes(rows: Sequence[Row], accepted: Array, true: Array, threshold: float) -> dict[str, float]:
     """Shares of look-alikes that are wrong and believed, of those that somebody can tell apart (``tellable``) and of the others
     (``untellable``), and their numbers. Ordinary pairs are passed over; pairs that fit in no one pose are not wrong."""
     out: dict[str, float] = {}
-    wrong = (np.asarray(true) == 0) & (np.asarray(believed) >= threshold)
+    wrong = (np.asarray(true) == 0) & (np.asarray(accepted) >= threshold)
     for name, tellable in (("tellable", True), ("untellable", False)):
         chosen = np.array([row.get("tellable") is tellable for row in rows], bool)
         if chosen.any():

@@ -51,8 +51,8 @@ def run_fit(settings: Settings, make: Callable[[Settings, LogFn], FitResult], lo
         log.append_row(row)
         log.close()
         best.parent.mkdir(parents=True, exist_ok=True)
-        with replace_on_success(best) as beside:
-            beside.write_text(json.dumps(fitted.weights, indent=1) + "\n", encoding="utf-8")
+        with replace_on_success(best) as temporary:
+            temporary.write_text(json.dumps(fitted.weights, indent=1) + "\n", encoding="utf-8")
         write_card(best, asdict(settings), fitted.origin, scores)
         log_line(", ".join(f"{name} {value:.3f}" for name, value in fitted.metrics.items()))
     if settings.export:

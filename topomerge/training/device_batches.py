@@ -193,8 +193,8 @@ class DevicePairs:
         match_pair = np.repeat(np.arange(len(numbers)), np.diff(self.first_match)[numbers])
         map_first = np.cumsum(self.rooms[maps]) - self.rooms[maps]
         ends = self.matches[match_rows].T + np.stack([map_first[2 * match_pair], map_first[2 * match_pair + 1]])
-        there = keep[ends].all(axis=0)
-        ends, match_pair = ends[:, there], match_pair[there]
+        present = keep[ends].all(axis=0)
+        ends, match_pair = ends[:, present], match_pair[present]
         parts = np.stack([copies * match_pair, copies * match_pair + 1])
         match_index = number[ends] - start[np.stack([2 * match_pair, 2 * match_pair + 1])] + part_start[parts]
 
@@ -383,15 +383,15 @@ class DevicePairs:
         """Return (n, m) int64, eight bytes a pixel, at places (n, m, 2) of the storeys as they were."""
         x, y = place.floor().unbind(dim=-1)
         size = views.size[part].float()
-        there = (x >= 0) & (y >= 0) & (x < size[:, :1]) & (y < size[:, 1:])
+        present = (x >= 0) & (y >= 0) & (x < size[:, :1]) & (y < size[:, 1:])
         if views.patches is not None:
             low_x, low_y, high_x, high_y = views.patches[part][:, None].unbind(dim=2)
             at_x, at_y = x[..., None], y[..., None]
-            there &= ~((at_x >= low_x) & (at_y >= low_y) & (at_x < high_x) & (at_y < high_y)).any(dim=-1)
-        at = torch.where(there, views.first[part][:, None] + x.long() * views.size[part][:, 1:] + y.long(), 0)
+            present &= ~((at_x >= low_x) & (at_y >= low_y) & (at_x < high_x) & (at_y < high_y)).any(dim=-1)
+        at = torch.where(present, views.first[part][:, None] + x.long() * views.size[part][:, 1:] + y.long(), 0)
         pixels = self.pixels[at] if views.mask is None else self.pixels[at] & views.mask[part][:, None]
         pixels = pixels | torch.where(self.pixel_rooms[at] == number[:, None], ROOM_BYTE, 0)
-        return torch.where(there, pixels, 0)
+        return torch.where(present, pixels, 0)
 
 
 @dataclass(frozen=True)

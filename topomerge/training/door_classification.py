@@ -94,22 +94,22 @@ def compute_scan_doors(path: Path, plan_networks: str) -> dict[str, Array]:
     """
     parts = []
     for e in load_examples(path):
-        chance = compute_column_probabilities(e.plan, load_weights(raised=e.source.startswith("drawn/")))
-        parts.append(compute_region_pairs(e.plan, chance, e.room, set(e.visited.tolist())))
+        probability = compute_column_probabilities(e.plan, load_weights(raised=e.source.startswith("drawn/")))
+        parts.append(compute_region_pairs(e.plan, probability, e.room, set(e.visited.tolist())))
     x = np.array([row for rows, _ in parts for row in rows], float).reshape(-1, len(DOOR_FEATURES))
     return {"x": x, "y": np.array([answer for _, answers in parts for answer in answers], bool)}
 
 
-def compute_region_pairs(plan: StoreyPlan, chance: Array, truth: Array, visited: set[int]) -> tuple[list[Array], list[bool]]:
+def compute_region_pairs(plan: StoreyPlan, probability: Array, truth: Array, visited: set[int]) -> tuple[list[Array], list[bool]]:
     """Compute features and answers for the neighbouring regions of one plan, before and while those of one room are merged."""
-    plan = remove_furniture(plan, chance)
+    plan = remove_furniture(plan, probability)
     clearance = compute_clearance(plan)
-    region = segment_regions(plan, chance)
+    region = segment_regions(plan, probability)
     room, area = _assign_regions_to_rooms(region, truth, plan.edge)
     peak = np.zeros(len(room))
     inside = region >= 0
     np.maximum.at(peak, region[inside], clearance[inside])
-    links = dict(find_passages(plan, clearance, region, chance))
+    links = dict(find_passages(plan, clearance, region, probability))
     x: list[Array] = []
     y: list[bool] = []
 
@@ -233,8 +233,8 @@ class DoorJob(NetworkJob):
 
     def write_weights(self, path: Path) -> None:
         """Write a table as JSON."""
-        with replace_on_success(path) as beside:
-            beside.write_text(json.dumps(self.export_weights()), encoding="utf-8")
+        with replace_on_success(path) as temporary:
+            temporary.write_text(json.dumps(self.export_weights()), encoding="utf-8")
 
 
 def predict_probabilities(x: Array, weights: dict[str, Any]) -> Array:
@@ -245,17 +245,17 @@ def predict_probabilities(x: Array, weights: dict[str, Any]) -> Array:
 
 def score_doors(p: Array, y: Array, threshold: float = 0.5) -> dict[str, float]:
     """Precision and recall of doors from a probability on, area under the ROC curve, log loss and the share that is right."""
-    said, y = p > threshold, np.asarray(y, bool)
+    predicted, y = p > threshold, np.asarray(y, bool)
     order = np.unique(p, return_inverse=True)[1]
     ranks = (np.cumsum(np.bincount(order)) - (np.bincount(order) - 1) / 2)[order]
     positive, negative = int(y.sum()), int((~y).sum())
     auc = (ranks[y].sum() - positive * (positive + 1) / 2) / max(positive * negative, 1)
     return {
-        "precision": float((said & y).sum() / max(said.sum(), 1)),
-        "recall": float((said & y).sum() / max(positive, 1)),
+        "precision": float((predicted & y).sum() / max(predicted.sum(), 1)),
+        "recall": float((predicted & y).sum() / max(positive, 1)),
         "auc": float(auc),
         "log_loss": float(-np.mean(np.log(np.where(y, p, 1 - p) + 1e-6))),
-        "accuracy": float((said == y).mean()),
+        "accuracy": float((predicted == y).mean()),
         "doors": float(y.mean()),
     }
 

@@ -163,7 +163,7 @@ class DrawingJob(ExportedJob):
         return len(batch[1])
 
     def exported(self) -> Exported:
-        """The network with probabilities for scores."""
+        """Return the network with probabilities for scores."""
         assert isinstance(self.network, DrawingUNet)
         return Exported(DrawingProbabilities(self.network), DRAWING_SIGNATURE, [torch.rand(2, 3, 96, 64)])
 
@@ -188,9 +188,9 @@ def score_pages(pages: Sequence[Page], network: Run) -> dict[str, float]:
     right, true, predicted = np.diag(table), table.sum(axis=1), table.sum(axis=0)
     iou = right / np.maximum(true + predicted - right, 1)
     scores = {f"iou_{name}": float(value) for name, value in zip(DRAWING_CLASSES, iou, strict=True)}
-    there = true > 0
+    present = true > 0
     pixels = max(int(table.sum()), 1)
-    return {**scores, "mean_iou": float(iou[there].mean()), "accuracy": float(right.sum() / pixels), "loss": loss / pixels}
+    return {**scores, "mean_iou": float(iou[present].mean()), "accuracy": float(right.sum() / pixels), "loss": loss / pixels}
 
 
 def judge(settings: DrawingSegmentation, file: Path, log_line: LogFn) -> dict[str, Any]:

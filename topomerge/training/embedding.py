@@ -334,8 +334,8 @@ def adopt_network(settings: Training) -> Training:
     given = compare_settings(asdict(Network()), asked)
     differing = {key: values for key, values in compare_settings(there, asked).items() if key in given and key != "dropout"}
     if differing:
-        said = ", ".join(f"{key} ({was!r} there, {now!r} asked for)" for key, (was, now) in differing.items())
-        raise InputError(f"init_from={settings.init_from}: is another network: {said}; leave out what differs")
+        text = ", ".join(f"{key} ({was!r} there, {now!r} asked for)" for key, (was, now) in differing.items())
+        raise InputError(f"init_from={settings.init_from}: is another network: {text}; leave out what differs")
     dropout = settings.network.dropout if "dropout" in given else there["dropout"]
     return replace(settings, network=build_network({**there, "dropout": dropout}))
 

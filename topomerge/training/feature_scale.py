@@ -49,7 +49,7 @@ def fit(settings: FeatureScale, log_line: LogFn) -> dict[str, float]:
 
 
 def fit_scale(settings: FeatureScale, log_line: LogFn) -> FitResult:
-    """The scale from all pairs, and how well rooms of buildings are found by the scale of the others."""
+    """Return the scale from all pairs, and how well rooms of buildings are found by the scale of the others."""
     pairs = build_pair_features(settings.data, settings, log_line)
     names = sorted({p.building for p in pairs})
     parts = np.array_split(np.random.default_rng(0).permutation(len(names)), min(FOLDS, len(names)))

@@ -65,12 +65,12 @@ class Verdict:
         of = f"{self.pairs} pairs left out, {self.rooms} rooms; {over}"
         change = f"the mean of recall@1 and F1 changed by {write(self.overall, '+')}"
         if self.helped:
-            said = "it helped"
+            text = "it helped"
         elif few:
-            said = f"too few captures to tell whether it helped: {self.units} left out, at least {FEWEST_GROUPS} are needed"
+            text = f"too few captures to tell whether it helped: {self.units} left out, at least {FEWEST_GROUPS} are needed"
         else:
-            said = "it did not help: the interval is not above zero"
-        return [*rows, of, f"{said}; {change}"]
+            text = "it did not help: the interval is not above zero"
+        return [*rows, of, f"{text}; {change}"]
 
 
 def _format(value: tuple[float, float, float], sign: str = "") -> str:

@@ -130,7 +130,7 @@ def find_anomaly() -> Iterator[None]:
     Raises:
         InputError: such an operation.
     """
-    with warnings.catch_warnings(record=True) as told, torch.autograd.detect_anomaly(check_nan=True):
+    with warnings.catch_warnings(record=True) as warned, torch.autograd.detect_anomaly(check_nan=True):
         warnings.simplefilter("always")
         try:
             yield
@@ -138,7 +138,7 @@ def find_anomaly() -> Iterator[None]:
             found = re.match(r"Function '(\w+)' returned nan values", str(error))
             if not found:
                 raise
-            text = "\n".join(str(one.message) for one in told)
+            text = "\n".join(str(one.message) for one in warned)
             own = [where for where in re.findall(r'File "([^"]+)", line (\d+)', text) if "site-packages" not in where[0]]
             where = f", computed in {Path(own[-1][0]).name}:{own[-1][1]}," if own else ""
             raise InputError(f"anomaly: the gradient of {found[1].removesuffix('0')}{where} is no number") from error

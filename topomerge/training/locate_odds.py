@@ -44,12 +44,12 @@ def build_rows(split: str, count: int, folder: Path, log_line: LogFn) -> list[Lo
     """Make an atlas of so many maps, and judge poses of scans of each building and of as many without a map."""
     folder.mkdir(parents=True, exist_ok=True)
     with limit_threads():
-        made = [load_located_map(make_located_map(split, k, folder)) for k in range(count)]
-        index, rows = PlaceIndex.from_maps({m.path.stem: load_map(m.path) for m in made}), []
+        maps = [load_located_map(make_located_map(split, k, folder)) for k in range(count)]
+        index, rows = PlaceIndex.from_maps({m.path.stem: load_map(m.path) for m in maps}), []
         for k in range(count):
             for n, kind in enumerate(SCANS):
                 rows += [
-                    build_row(index, made[k], split, k, kind, stranger) for stranger in ([False, True][: 1 + ((k + n) % 3 == 0)])
+                    build_row(index, maps[k], split, k, kind, negative) for negative in ([False, True][: 1 + ((k + n) % 3 == 0)])
                 ]
             log_line(f"{k + 1} of {count} buildings")
     return [row for row in rows if row is not None]
@@ -64,12 +64,12 @@ def build_row(index: PlaceIndex, own: Any, split: str, number: int, kind: str, s
         return None
     pose, moved = own.place_scan(scan)
     at = query.place[None]
-    there = (pose.apply(at) + moved)[0, :2]
+    placed = (pose.apply(at) + moved)[0, :2]
     judged = find_places(index, query, LOCATE)
     right = [
         not stranger
         and index.storeys[j.storey].map == number
-        and float(np.hypot(*(j.pose.apply(at)[0, :2] - there))) < RIGHT[0]
+        and float(np.hypot(*(j.pose.apply(at)[0, :2] - placed))) < RIGHT[0]
         and abs(wrap_yaw(j.pose.yaw - pose.yaw)) < RIGHT[1]
         for j in judged
     ]

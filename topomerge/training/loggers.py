@@ -83,7 +83,7 @@ class CsvLogger(Logger):
         """Write the file with one more line."""
         self.rows.append({"epoch": step, **metrics})
         columns = list(dict.fromkeys(name for row in self.rows for name in row))
-        with replace_on_success(self.path) as beside, beside.open("w", encoding="utf-8", newline="") as file:
+        with replace_on_success(self.path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
             writer = csv.DictWriter(file, columns)
             writer.writeheader()
             writer.writerows(self.rows)

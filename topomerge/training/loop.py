@@ -99,7 +99,7 @@ class Job(Protocol):
         """Yield the batches of the state's epoch, from its step on."""
 
     def train_step(self, batch: Any, state: State) -> Mapping[str, Any]:
-        """One step of the optimizer; the losses, `loss` among them: numbers, or tensors of one that may be on a device."""
+        """Return one step of the optimizer; the losses, `loss` among them: numbers, or tensors of one that may be on a device."""
 
     def count_items(self, batch: Any) -> int:
         """Count the rooms, columns or examples of a batch."""
@@ -332,10 +332,10 @@ def descend_gradient(optimizer: torch.optim.Optimizer, loss: torch.Tensor, state
 
 def prefetch_batches(batches: Iterator[T]) -> Generator[T, None, None]:
     """Prefetch the same batches, each made by a thread while the one before it is worked on."""
-    with ThreadPoolExecutor(1) as beside:
-        coming = beside.submit(next, batches, None)
+    with ThreadPoolExecutor(1) as temporary:
+        coming = temporary.submit(next, batches, None)
         while (batch := coming.result()) is not None:
-            coming = beside.submit(next, batches, None)
+            coming = temporary.submit(next, batches, None)
             yield batch
 
 
@@ -458,7 +458,7 @@ class ExportedJob(NetworkJob):
         """The network as the package runs it."""
 
     def run(self) -> Run:
-        """The network as it is, for those who call what is exported."""
+        """Return the network as it is, for those who call what is exported."""
         module, signature, _ = self.exported()
         return run_with_torch(module, signature)
 

@@ -125,7 +125,7 @@ def weight_by_prior(truth: Array, weight: Array) -> Array:
     return scaled
 
 
-def compute_risk_curve(believed: Array, true: Array, truth: Array, weight: Array) -> list[list[float]]:
+def compute_risk_curve(accepted: Array, true: Array, truth: Array, weight: Array) -> list[list[float]]:
     """(threshold, false merges in a thousand pairs) for rising thresholds: of pairs drawn by `PRIORS`, by what left-out pairs
     show; kinds of which there are none count nothing.
 
@@ -141,7 +141,7 @@ def compute_risk_curve(believed: Array, true: Array, truth: Array, weight: Array
         false = 0.0
         for kind, mine in kinds.items():
             if mine.any():
-                false += 1000 * PRIORS[kind] * float(np.average(believed[mine] >= threshold, weights=weight[mine]))
+                false += 1000 * PRIORS[kind] * float(np.average(accepted[mine] >= threshold, weights=weight[mine]))
         false = max(false, least)  # less than one pair of a kind was not measured
         curve.append([threshold, min(false, curve[-1][1]) if curve else false])
     return curve
@@ -155,10 +155,12 @@ def fit_multinomial(x: Array, truth: Array, weight: Array, strength: float) -> d
 
     def loss(flat: Array) -> tuple[float, Array]:
         w = flat.reshape(len(KINDS), -1)
-        chance = softmax(z @ w.T)
+        probability = softmax(z @ w.T)
         pull = np.pad(w[:, :-1], ((0, 0), (0, 1))) / strength
-        value = -(weight * np.log(np.maximum((chance * one).sum(axis=1), 1e-12))).sum() + (w[:, :-1] ** 2).sum() / (2 * strength)
-        return float(value), ((weight[:, None] * (chance - one)).T @ z + pull).ravel()
+        value = -(weight * np.log(np.maximum((probability * one).sum(axis=1), 1e-12))).sum() + (w[:, :-1] ** 2).sum() / (
+            2 * strength
+        )
+        return float(value), ((weight[:, None] * (probability - one)).T @ z + pull).ravel()
 
     w = minimize(loss, np.zeros(len(KINDS) * z.shape[1]), jac=True, method="L-BFGS-B").x.reshape(len(KINDS), -1)
     return {"mean": mean.tolist(), "scale": scale.tolist(), "weight": w[:, :-1].tolist(), "bias": w[:, -1].tolist()}
@@ -194,8 +196,8 @@ def fit_belief(settings: MergeBelief, log_line: LogFn) -> FitResult:
         chosen = rows if flat else [row for row in rows if "drawing" not in row["sensors"]]
         weights[name], parts[name] = fit_models(chosen, flat, settings)
     rows_scored = [row for part in parts.values() for row in part[0]]
-    believed, true = (np.concatenate([part[k] for part in parts.values()]) for k in (1, 2))
-    weights["risk"] = compute_left_out_risk(rows_scored, believed, true)
+    accepted, true = (np.concatenate([part[k] for part in parts.values()]) for k in (1, 2))
+    weights["risk"] = compute_left_out_risk(rows_scored, accepted, true)
     least = weights["risk"][-1][1]
     weights["threshold"] = threshold = find_threshold(max(settings.risk, least, 1e-9), weights["risk"])
     metrics = {
@@ -203,22 +205,22 @@ def fit_belief(settings: MergeBelief, log_line: LogFn) -> FitResult:
         for name, part in parts.items()
         for key, v in score_beliefs(*select_scored_rows(*part), threshold).items()
     }
-    metrics |= score_beliefs(*select_scored_rows(rows_scored, believed, true), threshold)
-    metrics |= score_lookalikes(rows_scored, believed, true, threshold)
-    log_line(format_beliefs_by_kind(rows_scored, believed, true, threshold))
+    metrics |= score_beliefs(*select_scored_rows(rows_scored, accepted, true), threshold)
+    metrics |= score_lookalikes(rows_scored, accepted, true, threshold)
+    log_line(format_beliefs_by_kind(rows_scored, accepted, true, threshold))
     trained = sum(not row.get("judged_only") for row in rows)
     origin = {"set": settings.data.name, "split": settings.data.split, "pairs": trained, "lookalikes": settings.lookalikes}
     return FitResult(weights=_round_values(weights), metrics=metrics | {"threshold": threshold}, origin=origin)
 
 
-def compute_left_out_risk(rows: Sequence[dict[str, Any]], believed: Array, true: Array) -> list[list[float]]:
+def compute_left_out_risk(rows: Sequence[dict[str, Any]], accepted: Array, true: Array) -> list[list[float]]:
     """`compute_risk_curve` of pairs that were left out, but for what nobody can tell apart, what trains nothing, and the
     floor."""
     no = [row.get("tellable") is False or row.get("judged_only") or row.get("real") for row in rows]
     chosen = ~np.array(no, bool)
     truth = np.array([classify_truth(row, int(t)) for row, t in zip(rows, true, strict=True)])
     weight = np.array([row.get("weight", 1.0) for row in rows])
-    return compute_risk_curve(believed[chosen], true[chosen], truth[chosen], weight[chosen])
+    return compute_risk_curve(accepted[chosen], true[chosen], truth[chosen], weight[chosen])
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,7 +363,7 @@ def collect_best_hypotheses(t: Table, scores: Array, bent: dict[str, Any], setti
 
 
 def fit_verdict(w: BestHypotheses, flat: bool, ordinary: int, settings: MergeBelief) -> tuple[dict[str, Any], Array]:
-    """The models of the verdict, and (n,) what those of other buildings believe.
+    """Return the models of the verdict, and (n,) what those of other buildings believe.
 
     Places of one plan (`is_same_plan`) train the model that tells them by furniture (``plan``) and no other one: they are an
     alternative with a likelihood of its own, and how much walls agree is no evidence against it.
@@ -393,11 +395,11 @@ def fit_verdict(w: BestHypotheses, flat: bool, ordinary: int, settings: MergeBel
     return {"winner": fit_place(every), "kinds": kinds, "plan": fit_plan(every)}, believed
 
 
-def score_beliefs(rows: Sequence[dict[str, Any]], believed: Array, true: Array, threshold: float) -> dict[str, float]:
+def score_beliefs(rows: Sequence[dict[str, Any]], accepted: Array, true: Array, threshold: float) -> dict[str, float]:
     """Score pairs: log loss, calibration error of the belief, shares right first, right and believed, and wrong and
     believed. Pairs that fit in no one pose (`label` -1) count as neither right nor wrong."""
     sure = true >= 0
-    p, y = np.clip(believed[sure], 1e-6, 1 - 1e-6), true[sure] == 1
+    p, y = np.clip(accepted[sure], 1e-6, 1 - 1e-6), true[sure] == 1
     if not len(y):
         return {}
     return {
@@ -410,16 +412,16 @@ def score_beliefs(rows: Sequence[dict[str, Any]], believed: Array, true: Array, 
     }
 
 
-def select_scored_rows(rows: Sequence[dict[str, Any]], believed: Array, true: Array) -> tuple[list[dict[str, Any]], Array, Array]:
+def select_scored_rows(rows: Sequence[dict[str, Any]], accepted: Array, true: Array) -> tuple[list[dict[str, Any]], Array, Array]:
     """Select the scored rows, without look-alikes and the development floor, which would change the shares of all others."""
     chosen = np.array(["lookalike" not in row and not row.get("real") for row in rows], bool)
-    return [row for row, so in zip(rows, chosen, strict=True) if so], np.asarray(believed)[chosen], np.asarray(true)[chosen]
+    return [row for row, so in zip(rows, chosen, strict=True) if so], np.asarray(accepted)[chosen], np.asarray(true)[chosen]
 
 
-def format_beliefs_by_kind(rows: Sequence[dict[str, Any]], believed: Array, true: Array, threshold: float) -> str:
+def format_beliefs_by_kind(rows: Sequence[dict[str, Any]], accepted: Array, true: Array, threshold: float) -> str:
     """Return a line: of each bin of area in common how many pairs there are, are right first, rightly and falsely believed."""
     bins: dict[str, list[int]] = {}
-    for row, p, t in zip(rows, believed, true, strict=True):
+    for row, p, t in zip(rows, accepted, true, strict=True):
         tally = bins.setdefault(classify_pair(row), [0, 0, 0, 0])
         for k, hit in enumerate((True, t == 1, p >= threshold and t == 1, p >= threshold and t == 0)):
             tally[k] += int(hit)
@@ -432,7 +434,7 @@ def judge(settings: MergeBelief, file: Path, log_line: LogFn) -> dict[str, Any]:
     weights = json.loads(file.read_text(encoding="utf-8"))
     rows = [row for row in build_belief_rows(settings.heldout, settings, log_line) if row["hyps"] and is_distinguishable(row)]
     rows += [row for row in build_lookalike_rows(settings.alike_heldout, settings, log_line) if row["hyps"]]
-    scored_rows, believed, true = [], [], []
+    scored_rows, accepted, true = [], [], []
     for name, flat in (("solid", False), ("flat", True)):
         of = [row for row in rows if is_flat(row) == flat]
         if not of:
@@ -444,14 +446,14 @@ def judge(settings: MergeBelief, file: Path, log_line: LogFn) -> dict[str, Any]:
                 odds = float(compute_logits(models["winner"], first[1][None])[0])
                 by_plan = float(compute_plan_odds(models["plan"], first[3][None])[0])
                 scored_rows.append(row)
-                believed.append(min(1 / (1 + np.exp(-odds) + by_plan), first[2]))
+                accepted.append(min(1 / (1 + np.exp(-odds) + by_plan), first[2]))
                 true.append(t.y[first[0]])
     if not scored_rows:
         raise InputError(f"{settings.heldout.name}: no pair has a hypothesis that can be judged")
     threshold = float(weights["threshold"])
-    log_line(format_beliefs_by_kind(scored_rows, np.array(believed), np.array(true), threshold))
-    judged = score_beliefs(*select_scored_rows(scored_rows, np.array(believed), np.array(true)), threshold)
-    return judged | score_lookalikes(scored_rows, np.array(believed), np.array(true), threshold)
+    log_line(format_beliefs_by_kind(scored_rows, np.array(accepted), np.array(true), threshold))
+    judged = score_beliefs(*select_scored_rows(scored_rows, np.array(accepted), np.array(true)), threshold)
+    return judged | score_lookalikes(scored_rows, np.array(accepted), np.array(true), threshold)
 
 
 def is_flat(row: dict[str, Any]) -> bool:

@@ -68,8 +68,8 @@ def write_model_page(runs: str | Path, page: str | Path) -> Path:
     lines += format_table(gathered, ["experiment", *(name for name in SHOWN if any(name in row for row in gathered))])
     if missing := [name for name in list_experiments() if name not in rows]:
         lines += ["", f"Not trained yet: {', '.join(missing)}."]
-    with replace_on_success(page) as beside:
-        beside.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    with replace_on_success(page) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return page
 
 

@@ -259,7 +259,7 @@ def _compute_extra(name: str, arrays: dict[str, Array], packed_file: Path, log_l
 
 
 def convert_to_metres(points: Array) -> Array:
-    """Points in millimetres as float32 in metres."""
+    """Return points in millimetres as float32 in metres."""
     return points.astype(np.float32) * np.float32(0.001)
 
 
@@ -295,7 +295,7 @@ def mark_watched(buildings: Sequence[str], every: int) -> Array:
 
 
 def read_scan_building(path: Path) -> str:
-    """The physical building of a cached scan (`pairs.scan_items`); each procedural one has a seed of its own.
+    """Return the physical building of a cached scan (`pairs.scan_items`); each procedural one has a seed of its own.
 
     Raises:
         InputError: the file is damaged.
@@ -305,5 +305,5 @@ def read_scan_building(path: Path) -> str:
 
 
 def name_building(row: Mapping[str, Any]) -> str:
-    """The physical building of what is known about a pair of maps; of two buildings that of the first map."""
+    """Return the physical building of what is known about a pair of maps; of two buildings that of the first map."""
     return find_physical_building(str(row.get("source", "procedural")), str(row["building"]))

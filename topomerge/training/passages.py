@@ -49,7 +49,7 @@ def fit_passages(settings: Passages, log_line: LogFn) -> FitResult:
 
 
 def read_scans(recipe: PlanRecipe, settings: Passages, log_line: LogFn) -> list[PassageExamples]:
-    """The passages of each scan of a set that shows any.
+    """Return the passages of each scan of a set that shows any.
 
     Raises:
         InputError: too few scans.

@@ -143,7 +143,7 @@ class PlaceJob(ExportedJob):
         return len(batch[0])
 
     def exported(self) -> Exported:
-        """The network with probabilities for scores."""
+        """Return the network with probabilities for scores."""
         assert isinstance(self.network, PlaceNetwork)
         return Exported(PlaceLogOdds(self.network), PLACE_SIGNATURE, build_sample(PLACE_SIGNATURE))
 

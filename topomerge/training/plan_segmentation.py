@@ -163,8 +163,8 @@ class PlanJob(ExportedJob):
         super().__init__(settings, PlanUNet(settings.widths), origin)
         self.options, self.watched = settings, watched
         self.plans = [build_plan_tensors(e, settings.loss) for e in learned]
-        chance = np.sqrt([float(e.room.size) for e in learned])
-        self.chance = chance / chance.sum()
+        probability = np.sqrt([float(e.room.size) for e in learned])
+        self.chance = probability / probability.sum()
 
     def iter_batches(self, state: State) -> Generator[tuple[torch.Tensor, ...], None, None]:
         """Yield crops."""
@@ -194,7 +194,7 @@ class PlanJob(ExportedJob):
         return len(batch[0])
 
     def exported(self) -> Exported:
-        """The network with probabilities for scores."""
+        """Return the network with probabilities for scores."""
         assert isinstance(self.network, PlanUNet)
         return Exported(PlanProbabilities(self.network), PLAN_SIGNATURE, [torch.rand(2, EVIDENCE_CHANNELS, 64, 48)])
 
@@ -268,13 +268,13 @@ def compute_log_loss(probability: Array, truth: Array) -> float:
 
 def score_classes(table: Array) -> dict[str, float]:
     """Compute IoU and F1 of each class, their means over the classes that there are, and the share of columns that are right."""
-    right, true, said = np.diag(table), table.sum(axis=1), table.sum(axis=0)
-    iou = right / np.maximum(true + said - right, 1)
-    f1 = 2 * right / np.maximum(true + said, 1)
+    right, true, predicted = np.diag(table), table.sum(axis=1), table.sum(axis=0)
+    iou = right / np.maximum(true + predicted - right, 1)
+    f1 = 2 * right / np.maximum(true + predicted, 1)
     scores = {f"iou_{name}": float(v) for name, v in zip(COLUMN_CLASSES, iou, strict=True)}
     scores |= {f"f1_{name}": float(v) for name, v in zip(COLUMN_CLASSES, f1, strict=True)}
-    there = true > 0
-    means = {f"mean_{what}": float(v[there].mean()) if there.any() else 0.0 for what, v in (("iou", iou), ("f1", f1))}
+    present = true > 0
+    means = {f"mean_{what}": float(v[present].mean()) if present.any() else 0.0 for what, v in (("iou", iou), ("f1", f1))}
     return {**scores, **means, "accuracy": float(right.sum() / max(table.sum(), 1))}
 
 

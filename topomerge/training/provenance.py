@@ -113,8 +113,8 @@ def record_start(folder: Path, settings: Mapping[str, Any], data: Mapping[str, A
         "changed": {key: values for key, values in changes.items() if key not in UNTOLD},
     }
     record = {"format": RUN_FORMAT, "data": earlier.get("data") or dict(data), "starts": [*earlier.get("starts", []), start]}
-    with replace_on_success(folder / RUN_FILE) as beside:
-        beside.write_text(json.dumps(convert_to_plain(record), indent=1) + "\n", encoding="utf-8")
+    with replace_on_success(folder / RUN_FILE) as temporary:
+        temporary.write_text(json.dumps(convert_to_plain(record), indent=1) + "\n", encoding="utf-8")
 
 
 def _version(package: str) -> str:

@@ -166,7 +166,7 @@ def read_storeys() -> dict[str, WifiStorey]:
 
 
 def fit_radio(settings: RadioLawFit, log_line: LogFn) -> FitResult:
-    """The law of all storeys, and the log loss of each storey by the law of the others."""
+    """Return the law of all storeys, and the log loss of each storey by the law of the others."""
     storeys = read_storeys()
     counts = count_pairs(storeys)
     cases = {name: draw_cases(storeys, [name], settings.seed + FIT_SEED) for name in WIFI_STOREYS}

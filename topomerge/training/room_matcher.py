@@ -86,16 +86,16 @@ def build_examples(
     pairs: Sequence[GraphPair], network: Embedder, number: int, log_line: LogFn = lambda text: None
 ) -> list[MatcherExample]:
     """Build pairs with so many changed views of each of their maps beside the first one; a map of several pairs is seen once."""
-    made: dict[tuple[str, str], list[MatcherView]] = {}
+    views: dict[tuple[str, str], list[MatcherView]] = {}
     out = []
     for pair in pairs:
         sides = [(str(pair.about["file"]), side) for side in pair.about["sides"]]
         for key, graph in zip(sides, (pair.a, pair.b), strict=True):
-            if key not in made:
-                made[key] = [build_view(graph, network, k, derive_seed(len(made), k)) for k in range(number + 1)]
-                if not len(made) % 100:
-                    log_line(f"{len(made)} maps seen")
-        out.append(MatcherExample(made[sides[0]], made[sides[1]], pair, compute_quarter_turns(pair)))
+            if key not in views:
+                views[key] = [build_view(graph, network, k, derive_seed(len(views), k)) for k in range(number + 1)]
+                if not len(views) % 100:
+                    log_line(f"{len(views)} maps seen")
+        out.append(MatcherExample(views[sides[0]], views[sides[1]], pair, compute_quarter_turns(pair)))
     return out
 
 
@@ -112,8 +112,8 @@ def build_view(graph: Graph, network: Embedder, number: int, seed: int) -> Match
         tensors, present = augment_graph(tensors, len(places), augment, generator)
     rows, dustbin = (part.numpy() for part in network.embed_rotations(tensors))
     chosen = present.numpy()
-    facts = compute_room_features(graph["x"].numpy()[chosen], dustbin, graph["pos"].numpy()[chosen, 2])
-    return MatcherView(TurnedRows(rows.astype(np.float32), places[chosen], "", facts), chosen)
+    features = compute_room_features(graph["x"].numpy()[chosen], dustbin, graph["pos"].numpy()[chosen, 2])
+    return MatcherView(TurnedRows(rows.astype(np.float32), places[chosen], "", features), chosen)
 
 
 class MatcherJob(ExportedJob):
@@ -193,9 +193,9 @@ def compute_deep_loss(layers: Sequence[Partners], links: Tensor) -> Tensor:
     total = torch.zeros(())
     for k, layer in enumerate(layers):
         weight = 1.0 if k == len(layers) - 1 else 0.3
-        for chance, true in ((layer.rows, links), (layer.columns, links.T)):
+        for probability, true in ((layer.rows, links), (layer.columns, links.T)):
             right = torch.cat([true, ~true.any(dim=1, keepdim=True)], dim=1)
-            total = total - weight * chance.masked_fill(~right, NEVER_LOGIT).logsumexp(dim=1).mean()
+            total = total - weight * probability.masked_fill(~right, NEVER_LOGIT).logsumexp(dim=1).mean()
     return total
 
 
@@ -213,9 +213,9 @@ def score_matcher(watched: Sequence[MatcherExample], matcher: Matcher) -> dict[s
         counts += [count_pairs(assign_certain(odds.certainty, least), matches) for least in LEAST_CERTAINTIES]
         if len(matches) and example.quarters is not None:
             turns.append(odds.quarters == example.quarters)
-        for chance, truth, other in ((odds.rows, matches, example.pair.b), (odds.columns, matches[:, ::-1], example.pair.a)):
-            losses.append(compute_room_losses(chance, truth))
-            rooms, rank = rank_partners(chance[:, :-1], truth)
+        for probability, truth, other in ((odds.rows, matches, example.pair.b), (odds.columns, matches[:, ::-1], example.pair.a)):
+            losses.append(compute_room_losses(probability, truth))
+            rooms, rank = rank_partners(probability[:, :-1], truth)
             ranks.append(rank)
             twins.append(has_twin(other["x"][:, SIZE_COLUMNS].numpy(), truth, rooms))
     every = np.concatenate(ranks)

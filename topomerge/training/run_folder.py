@@ -48,8 +48,8 @@ def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
 
     texts = {"config.json": json.dumps(settings, indent=1) + "\n", "config.yaml": yaml.safe_dump(dict(settings), sort_keys=False)}
     for name, text in texts.items():
-        with replace_on_success(folder / name) as beside:
-            beside.write_text(text, encoding="utf-8")
+        with replace_on_success(folder / name) as temporary:
+            temporary.write_text(text, encoding="utf-8")
 
 
 def write_card(
@@ -101,8 +101,8 @@ def export_files(best: Path, target: str, package: str) -> list[Path]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for path in files:
-            with replace_on_success(folder / path.name) as beside:
-                shutil.copyfile(path, beside)
+            with replace_on_success(folder / path.name) as temporary:
+                shutil.copyfile(path, temporary)
     except OSError as error:
         raise InputError(f"export={target}: can't be written ({error.strerror or error})") from error
     return [folder / path.name for path in files]
@@ -143,8 +143,8 @@ class MetricsLog:
             logger.save()
 
     def _write(self) -> None:
-        with replace_on_success(self.path) as beside:
-            beside.write_text("".join(json.dumps(row) + "\n" for row in self.rows), encoding="utf-8")
+        with replace_on_success(self.path) as temporary:
+            temporary.write_text("".join(json.dumps(row) + "\n" for row in self.rows), encoding="utf-8")
 
     def close(self, status: str = "success") -> None:
         """Tell the loggers how the run ended."""

@@ -216,8 +216,8 @@ def _begin(plan: Plan, settings: Any) -> None:
         for name in (JOURNAL, TABLE_FILE, SPACE_FILE):
             (plan.folder / name).unlink(missing_ok=True)
     write_settings(plan.folder, {**asdict(settings), "resume": False, "overwrite": False})
-    with replace_on_success(path) as beside:
-        beside.write_text(json.dumps(plan.search.space) + "\n", encoding="utf-8")
+    with replace_on_success(path) as temporary:
+        temporary.write_text(json.dumps(plan.search.space) + "\n", encoding="utf-8")
 
 
 @contextmanager
@@ -320,7 +320,7 @@ def _write_result(plan: Plan, study: Any) -> SearchResult:
         for trial in [*ended, *rest]
     ]
     table = plan.folder / TABLE_FILE
-    with replace_on_success(table) as beside:
-        beside.write_text("\n".join(format_table(rows, list(rows[0]))) + "\n", encoding="utf-8")
+    with replace_on_success(table) as temporary:
+        temporary.write_text("\n".join(format_table(rows, list(rows[0]))) + "\n", encoding="utf-8")
     best = ended[0]
     return SearchResult(plan.folder / f"trial_{best.number:03d}", plan.watch, float(best.value), dict(best.params), table)

@@ -57,8 +57,8 @@ def write_table(folder: str | Path) -> Path:
             "",
             *format_table(gathered, ["seeds" if n == "seed" else n for n in columns]),
         ]
-    with replace_on_success(folder / "table.md") as beside:
-        beside.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    with replace_on_success(folder / "table.md") as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return folder / "table.md"
 
 
@@ -93,7 +93,7 @@ def _format_cell(value: Any) -> str:
 
 
 def read_best_epoch(run: Path) -> dict[str, Any] | None:
-    """The best epoch of a run; None where there is none yet."""
+    """Return the best epoch of a run; None where there is none yet."""
     config = json.loads((run / "config.json").read_text(encoding="utf-8"))
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
     if not rows:

@@ -234,6 +234,6 @@ def evaluate_task(task: str, words: Sequence[str], log_line: LogFn) -> Evaluatio
     summary = "\n".join([f"{head}\n", "| score | value |", "|---|---|", *rows])
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in (("scores.json", json.dumps(record, indent=1)), ("report.md", f"# {summary}")):
-        with replace_on_success(folder / name) as beside:
-            beside.write_text(text + "\n", encoding="utf-8")
+        with replace_on_success(folder / name) as temporary:
+            temporary.write_text(text + "\n", encoding="utf-8")
     return EvaluationResult(scores, summary, folder)

@@ -64,7 +64,7 @@ def fit_doors(settings: WallDoors, log_line: LogFn) -> FitResult:
 
 
 def build_candidates(recipe: PlanRecipe, settings: WallDoors, log_line: LogFn) -> list[tuple[str, Candidates]]:
-    """The building of each scan of a set, and its candidates, by the network of elevations that ships.
+    """Return the building of each scan of a set, and its candidates, by the network of elevations that ships.
 
     Raises:
         InputError: too few scans.
@@ -85,7 +85,7 @@ def build_candidates(recipe: PlanRecipe, settings: WallDoors, log_line: LogFn) -
 def find_candidates_of_map(
     map: TopometricMap, storeys: Sequence[ClassifiedStorey], elevations: Elevations | None, classes: Array | None = None
 ) -> DoorCandidates:
-    """The candidates of a map, by the network of elevations that ships.
+    """Return the candidates of a map, by the network of elevations that ships.
 
     Args:
         storeys: what probably stands in the columns of its plans.
@@ -123,11 +123,11 @@ def fit_doors_model(scans: Sequence[Candidates], pull: float) -> dict[str, list[
 def score_doors(scans: Sequence[tuple[Array, Array]]) -> dict[str, float]:
     """Compute calibration error, precision and recall of the candidates at .5."""
     p, y = (np.concatenate(arrays) for arrays in zip(*scans, strict=True))
-    said = p >= 0.5
+    predicted = p >= 0.5
     return {
         "calibration_error": compute_calibration_error(p, y),
-        "precision": float(y[said].mean()) if said.any() else 0.0,
-        "recall": float(said[y].mean()) if y.any() else 0.0,
+        "precision": float(y[predicted].mean()) if predicted.any() else 0.0,
+        "recall": float(predicted[y].mean()) if y.any() else 0.0,
         "candidates": float(len(y)),
     }
 

@@ -62,7 +62,7 @@ def fit(settings: WallSegmentation, log_line: LogFn) -> dict[str, float]:
 def split_train_val(
     scans: Sequence[ScanT], buildings: Sequence[str], settings: WallSegmentation
 ) -> tuple[list[ScanT], list[ScanT]]:
-    """The scans to train on, and those of every n-th building, which are watched.
+    """Return the scans to train on, and those of every n-th building, which are watched.
 
     Raises:
         InputError: too few for both.
@@ -110,7 +110,7 @@ class WallJob(ExportedJob):
         return len(batch[0])
 
     def exported(self) -> Exported:
-        """The network with probabilities for scores."""
+        """Return the network with probabilities for scores."""
         assert isinstance(self.network, WallNetwork)
         return Exported(WallProbabilities(self.network), WALL_SIGNATURE, [torch.rand(2, 8, DEPTHS, STRIP_CHANNELS)])
 
@@ -121,8 +121,8 @@ class WallJob(ExportedJob):
 
 def downsample_truth(truth: Array, strips: Array) -> tuple[Array, Array]:
     """Return the (n / 2,) class of each answer, that of its first element, and (n / 2,) bool, whether anything was seen."""
-    there: Array = np.asarray(strips.reshape(len(strips) // PLACES, -1).any(axis=1))
-    return truth[::PLACES].astype(np.int64), there
+    present: Array = np.asarray(strips.reshape(len(strips) // PLACES, -1).any(axis=1))
+    return truth[::PLACES].astype(np.int64), present
 
 
 def sample_stretch(scan: WallExample, middle: int, options: WallSegmentation, rng: np.random.Generator) -> Stretch:

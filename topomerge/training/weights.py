@@ -64,8 +64,8 @@ def make_task(task: str, runs: Path, shared: Sequence[str]) -> None:
         training_words = [word for word in shared if not word.startswith(("jobs=", "cluster=", "part="))]
     resume = "resume=true" if (runs / task / "last").exists() else "overwrite=true"
     exported = [] if any(word.startswith("export=") for word in shared) else ["export=package"]
-    words = [f"task={task}", *TASKS[task].words, f"runs={runs}", f"name={task}", resume, *exported, *training_words]
-    train(compose_settings(words), _print_progress)
+    arguments = [f"task={task}", *TASKS[task].words, f"runs={runs}", f"name={task}", resume, *exported, *training_words]
+    train(compose_settings(arguments), _print_progress)
 
 
 def _print_progress(text: str) -> None:
@@ -84,8 +84,8 @@ def _read_seconds(runs: Path) -> dict[str, float]:
 
 
 def _record_seconds(runs: Path, task: str, seconds: float) -> None:
-    with replace_on_success(runs / "seconds.json") as beside:
-        beside.write_text(json.dumps({**_read_seconds(runs), task: seconds, f"{task} ended": time.time()}, indent=1) + "\n")
+    with replace_on_success(runs / "seconds.json") as temporary:
+        temporary.write_text(json.dumps({**_read_seconds(runs), task: seconds, f"{task} ended": time.time()}, indent=1) + "\n")
 
 
 def _format_duration(seconds: Mapping[str, float], tasks: Sequence[str]) -> str:

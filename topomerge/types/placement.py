@@ -45,7 +45,7 @@ class ShiftField:
         return out
 
     def apply(self, points: Array) -> Array:
-        """The points (n, 2), moved."""
+        """Return the points (n, 2), moved."""
         return np.asarray(points, np.float64) + self.at(points)
 
     @property
@@ -109,7 +109,7 @@ class Deformation:
         return out
 
     def apply(self, points: Array) -> Array:
-        """The points (n, 3), bent."""
+        """Return the points (n, 3), bent."""
         points = np.asarray(points, np.float64)
         if not len(self) or not len(points):
             return points.copy()
@@ -135,7 +135,7 @@ class Deformation:
         return shifts
 
     def undo(self, points: Array) -> Array:
-        """The places (n, 3) that are bent to the given points (n, 3)."""
+        """Return the places (n, 3) that are bent to the given points (n, 3)."""
         points = np.asarray(points, np.float64)
         places = points.copy()
         for _ in range(INVERSE_ROUNDS):
@@ -156,7 +156,7 @@ class Deformation:
         return min((f.growth[0] for f in self.fields if f is not None), default=1.0)
 
     def weakened(self, share: float) -> Deformation:
-        """The same with only a share of each move."""
+        """Return the same with only a share of each move."""
         return replace(self, moves=share * self.moves)
 
     def to_json(self) -> dict[str, Any]:

@@ -315,7 +315,7 @@ def select_rooms(map: TopometricMap, stays: Array) -> TopometricMap:
 
 
 def filter_confident(map: TopometricMap, least: float) -> TopometricMap:
-    """The map without the rooms, doors, stairs and windows that are less likely than `least`; as `select_rooms` has it.
+    """Return the map without the rooms, doors, stairs and windows that are less likely than `least`; as `select_rooms` has it.
 
     Args:
         map: any map.

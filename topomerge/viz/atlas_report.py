@@ -101,8 +101,8 @@ def _render_tile(n: int, map: TopometricMap, parts: Sequence[Array], tile: int) 
     )
     sections = [render_section(f"Tile {tile} of {len(parts)}", view, f"tile-{tile}")]
     home = {room: k for k, of in enumerate(parts) for room in of.tolist()}
-    ways = [(a, b) if home[a] == tile else (b, a) for a, b in part.edges["rooms"].tolist()]
-    beyond = sorted({(a, b) for a, b in ways if home[b] != tile})
+    connections = [(a, b) if home[a] == tile else (b, a) for a, b in part.edges["rooms"].tolist()]
+    beyond = sorted({(a, b) for a, b in connections if home[b] != tile})
     if beyond:
         rows = [(str(a), str(b), _render_link(f"tile {home[b]}", get_page_name(n, home[b]))) for a, b in beyond]
         sections.append(
@@ -118,8 +118,8 @@ def _render_tiles_index(n: int, map: TopometricMap, parts: Sequence[Array]) -> M
         storeys = np.unique(map.rooms["storey"][rooms]).tolist()
         area = f"{float(map.rooms['area'][rooms].sum()):.0f} m²"
         rows.append((_render_link(f"tile {k}", get_page_name(n, k)), str(len(rooms)), area, ", ".join(str(s) for s in storeys)))
-    words = build_element("p", "Each tile shows all of its cells in 3D.", class_="note")
-    return render_section("Tiles", join([words, _render_text_table(("page", "rooms", "floor area", "storeys"), rows)]), "tiles")
+    element = build_element("p", "Each tile shows all of its cells in 3D.", class_="note")
+    return render_section("Tiles", join([element, _render_text_table(("page", "rooms", "floor area", "storeys"), rows)]), "tiles")
 
 
 def _render_joined_map(result: AtlasResult, n: int, map: TopometricMap, in_space: bool) -> tuple[list[Markup], dict[str, Any]]:
@@ -158,8 +158,8 @@ def _render_link(words: str, file: str | None) -> str:
 
 def _render_verdict(result: AtlasResult, parts: Iterable[str]) -> Markup:
     head = {"merged": "All maps are connected", "parted": "Some maps are connected", "abstained": "No maps are connected"}
-    words = [build_element("b", head[result.status]), build_element("ul", *(build_element("li", part) for part in parts))]
-    return build_element("div", *words, class_="verdict" if result.status != "abstained" else "verdict refused")
+    element = [build_element("b", head[result.status]), build_element("ul", *(build_element("li", part) for part in parts))]
+    return build_element("div", *element, class_="verdict" if result.status != "abstained" else "verdict refused")
 
 
 def _format_counts(result: AtlasResult) -> list[str]:
@@ -199,9 +199,9 @@ def _render_links(result: AtlasResult, within: Sequence[int] | None = None) -> M
             (*_get_pair_names(result, x.maps), format_probability(x.hypothesis.probability), format_probability(x.probability))
             for x in links
         ]
-        words = "Each link is also checked by all other pairs of maps that it places over each other."
+        text = "Each link is also checked by all other pairs of maps that it places over each other."
         parts += [
-            build_element("p", words, class_="note"),
+            build_element("p", text, class_="note"),
             _render_text_table(("map", "map", "alone", "with all evidence"), rows),
         ]
     if rejected:
@@ -216,16 +216,16 @@ def _render_links(result: AtlasResult, within: Sequence[int] | None = None) -> M
         parts += [build_element("h3", "Thrown out"), _render_text_table(("map", "map", "alone", "contradicted by"), out)]
     differing = [c for c in result.contradictions if within is None or {*c.maps} & {*within}]
     if differing:
-        words = "Walls of one map stand on free floor of the other. Both versions are kept, with their source."
+        text = "Walls of one map stand on free floor of the other. Both versions are kept, with their source."
         rooms = [tuple(", ".join(map(str, of)) or "none" for of in c.rooms) for c in differing]
-        told: list[tuple[str, ...]] = [
+        entries: list[tuple[str, ...]] = [
             (*_get_pair_names(result, c.maps), *of, f"{c.area:.1f} m²") for c, of in zip(differing, rooms, strict=True)
         ]
         heads = ("map", "map", "rooms of the first", "rooms of the second", "walls")
         parts += [
             build_element("h3", "Contradictions"),
-            build_element("p", words, class_="note"),
-            _render_text_table(heads, told),
+            build_element("p", text, class_="note"),
+            _render_text_table(heads, entries),
         ]
     tried = f"{result.registered[0]} of {result.registered[1]} pairs were registered, in {result.seconds:.1f} s."
     if within is None:
@@ -264,6 +264,6 @@ def _render_space(map: TopometricMap) -> Markup:
         for k in (1, 2, 3, 0)
         if share[k]
     ]
-    words = build_element("p", "Colour by “map” shows how many maps saw each cell.", class_="note")
+    element = build_element("p", "Colour by “map” shows how many maps saw each cell.", class_="note")
     legend = build_element("ul", *items, class_="legend")
-    return render_section("3D view", join([words, render_scene_view("scene-data"), legend]), "space")
+    return render_section("3D view", join([element, render_scene_view("scene-data"), legend]), "space")

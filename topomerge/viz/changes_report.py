@@ -40,8 +40,8 @@ def save_changes_report(changes: Changes, path: str | Path) -> None:
         InputError: the path can't be written.
     """
     text = render_changes_html(changes)
-    with replace_on_success(path) as beside:
-        beside.write_text(text, encoding="utf-8", errors="replace", newline="\n")
+    with replace_on_success(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", errors="replace", newline="\n")
 
 
 def render_changes_html(changes: Changes) -> str:
@@ -50,14 +50,14 @@ def render_changes_html(changes: Changes) -> str:
     sections.append(render_section("List", render_scroller(_render_list(changes)), "list"))
     if changes.elements:
         sections.append(render_section("Elements of the model", render_scroller(_render_elements(changes)), "elements"))
-    facts = {
+    properties = {
         "old": changes.old.source or "–",
         "new": changes.new.source or "–",
         "off by less is no change": f"{100 * changes.slack:.0f} cm",
         "seen by both": ", ".join(f"storey {k}: {v:.0f} m²" for k, v in sorted(changes.compared.items())),
         "new map turned by": f"{np.degrees(changes.placement.pose.yaw):.2f}°",
     }
-    sections.append(render_section("How it was made", render_properties(facts, "Comparison"), "made"))
+    sections.append(render_section("How it was made", render_properties(properties, "Comparison"), "made"))
     names = f"{changes.old.title} → {changes.new.title}"
     return render_page(names, "What has changed", sections, {})
 
@@ -103,7 +103,7 @@ def _render_view(changes: Changes) -> Markup:
         for name in ELEMENTS
         if any(c.element == name for c in changes.changes)
     ]
-    signs = [build_element("li", build_element("i", class_=f"sign-{tone}"), words) for tone, words in WORDS.items()]
+    signs = [build_element("li", build_element("i", class_=f"sign-{tone}"), element) for tone, element in WORDS.items()]
     note = (
         "The first slider fades between the maps; the second one wipes: old to its left, new to its right. Click a row to zoom."
     )

@@ -73,9 +73,9 @@ def save_figure(map: TopometricMap, path: str | Path) -> None:
     kind = Path(path).suffix.lower().removeprefix(".") or "png"
     # No date and no program's name, so that the same map gives the same file.
     undated = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
-    with mpl.rc_context({"svg.hashsalt": "topomerge"}), replace_on_success(path) as beside, warnings.catch_warnings():
+    with mpl.rc_context({"svg.hashsalt": "topomerge"}), replace_on_success(path) as temporary, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph")  # a sign in the scan's name that the font lacks is drawn as a box
-        figure.savefig(beside, format=kind, dpi=DPI, metadata=undated.get(kind))
+        figure.savefig(temporary, format=kind, dpi=DPI, metadata=undated.get(kind))
 
 
 def _arrange(panels: int, frame: Frame, named: list[dict[int, Place]]) -> tuple[int, float]:

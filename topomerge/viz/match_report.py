@@ -39,12 +39,12 @@ def save_match_report(matching: Matching, a: TopometricMap, b: TopometricMap, pa
         InputError: the path can't be written.
     """
     text = render_match_html(matching, a, b)
-    with replace_on_success(path) as beside:
-        beside.write_text(text, encoding="utf-8", errors="replace", newline="\n")
+    with replace_on_success(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", errors="replace", newline="\n")
 
 
 def render_match_html(matching: Matching, a: TopometricMap, b: TopometricMap) -> str:
-    """The report as HTML: the plans, a line for each match, and for each match what stands around both rooms."""
+    """Return the report as HTML: the plans, a line for each match, and for each match what stands around both rooms."""
     matches = [
         RoomMatch((0, 1), (i, j), float(p)) for (i, j), p in zip(matching.rooms.tolist(), matching.probability, strict=True)
     ]
@@ -54,9 +54,9 @@ def render_match_html(matching: Matching, a: TopometricMap, b: TopometricMap) ->
     for name, m, (sheet, plans), colours in zip("ab", (a, b), drawn, shades, strict=True):
         head = build_element("h3", f"{name}: {m.title} ", build_element("small", f"{len(m.rooms)} rooms"))
         views.append(build_element("div", head, render_plan_view(m, sheet, plans, colours)))
-    words = "Green rooms have a match (greener: more probable), grey ones none. Click a room to compare the surroundings."
+    text = "Green rooms have a match (greener: more probable), grey ones none. Click a room to compare the surroundings."
     compared = [
-        build_element("p", words, class_="note"),
+        build_element("p", text, class_="note"),
         build_element("div", *views, class_="pair"),
         build_element("div", *_render_pairs(matches, a, b), class_="places"),
     ]
@@ -114,8 +114,8 @@ def _render_pairs(matches: Sequence[RoomMatch], a: TopometricMap, b: TopometricM
             )
             for name, r, crop in (("a", i, around_a[i]), ("b", j, turned[j]))
         ]
-        words = f"{CROP * SHEET_PIXEL:g} m around room {i} of a and room {j} of b, turned alike"
-        cards = build_element("div", build_element("figure", *images, build_element("figcaption", words)), class_="cards")
+        text = f"{CROP * SHEET_PIXEL:g} m around room {i} of a and room {j} of b, turned alike"
+        cards = build_element("div", build_element("figure", *images, build_element("figcaption", text)), class_="cards")
         head = build_element(
             "summary", render_room_link("a", i), " matches ", render_room_link("b", j), f", probability {match.probability:.2f}"
         )

@@ -75,12 +75,12 @@ def render_arrows(name: str, shifts: PieceShifts, storey: int, sheet: Sheet, fac
     parts = []
     for k, (x, y), (u, v) in zip(rows.tolist(), start.tolist(), end.tolist(), strict=True):
         room = f", room {shifts.room[k]}" if shifts.room[k] >= 0 else ""
-        words = f"{name}{room}: moved by {format_centimetres(shifts.length[k])}, turned by {np.degrees(shifts.turn[k]):.2f}°"
+        text = f"{name}{room}: moved by {format_centimetres(shifts.length[k])}, turned by {np.degrees(shifts.turn[k]):.2f}°"
         shaft = build_element("path", class_="shaft", d=_format_arrow(x, y, u, v))
         dot = build_element("circle", cx=x, cy=y)
         parts.append(
             build_element(
-                "g", build_element("title", words), build_element("path", class_="near", d=f"M{x} {y}L{u} {v}"), dot, shaft
+                "g", build_element("title", text), build_element("path", class_="near", d=f"M{x} {y}L{u} {v}"), dot, shaft
             )
         )
     return build_element("g", *parts, class_="bend-arrows")
@@ -131,8 +131,8 @@ def _format_closed_path(places: Array) -> str:
 
 def render_deformation_controls() -> Markup:
     """Render the slider from rigid to bent, and the switch of the arrows."""
-    words = "From rigid to bent"
-    slider = build_element("input", type="range", min="0", max="1", step="0.01", value="1", data_bend=True, aria_label=words)
+    text = "From rigid to bent"
+    slider = build_element("input", type="range", min="0", max="1", step="0.01", value="1", data_bend=True, aria_label=text)
     bar = build_element("div", "rigid", slider, "bent", class_="blend bend")
     box = build_element("label", build_element("input", type="checkbox", checked=True, data_layer="bends"), " arrows")
     return join([bar, build_element("div", box, class_="layers")])
@@ -252,20 +252,20 @@ def render_blend_view(
         *([build_element("div", *choices, class_="choices")] if choices else []),
     ]
     controls = build_element("div", *groups, build_element("div", *render_zoom_buttons(), class_="zoom"), class_="controls")
-    told = "Point at a change." if overlay else "Walls of one map on walls of the other support the merge."
-    hint = build_element("p", told, class_="told", aria_live="polite")
-    words = [build_element("p", describe_deformation(len(bent), factor), class_="note")] if bent and factor else []
+    text = "Point at a change." if overlay else "Walls of one map on walls of the other support the merge."
+    hint = build_element("p", text, class_="told", aria_live="polite")
+    description = [build_element("p", describe_deformation(len(bent), factor), class_="note")] if bent and factor else []
     return build_element(
-        "div", controls, build_element("div", *figures, class_="sheet", tabindex=0), hint, *words, class_="plan-view"
+        "div", controls, build_element("div", *figures, class_="sheet", tabindex=0), hint, *description, class_="plan-view"
     )
 
 
 def _render_sliders(maps: Sequence[TopometricMap], names: tuple[str, str], swipes: bool) -> Markup:
     """The slider that fades from one map to the other, and the one that wipes."""
     common = {"type": "range", "min": "0", "max": "1", "step": "0.01", "value": "0.5"}
-    words = f"rom {names[0]} to {names[1]}"
-    sliders = [build_element("input", **common, data_blend=True, aria_label=f"F{words}")]
-    sliders += [build_element("input", **common, data_swipe=True, aria_label=f"Swipe f{words}")] if swipes else []
+    text = f"rom {names[0]} to {names[1]}"
+    sliders = [build_element("input", **common, data_blend=True, aria_label=f"F{text}")]
+    sliders += [build_element("input", **common, data_swipe=True, aria_label=f"Swipe f{text}")] if swipes else []
     first, second = (_render_source(sign, name, m) for sign, name, m in zip("ab", names, maps, strict=True))
     return build_element("div", first, *sliders, second, class_="blend")
 
@@ -386,9 +386,9 @@ def render_lines(
     unit = max(width / LINES_WIDTH, height / 600)
     margin = round(20 * unit)
     view = f"{-margin} {-margin} {width + 2 * margin} {height + 2 * margin}"
-    words = f"{len(matches)} matched room pairs, each joined by a line"
+    text = f"{len(matches)} matched room pairs, each joined by a line"
     style = f"--unit:{unit:.3f}"
-    return build_element("svg", *parts, class_="plan lines", viewBox=view, style=style, role="img", aria_label=words)
+    return build_element("svg", *parts, class_="plan lines", viewBox=view, style=style, role="img", aria_label=text)
 
 
 def _render_storey(map: TopometricMap, sheet: Sheet, plan: StoreyPlan, colours: Array | None) -> list[Markup]:

@@ -63,14 +63,14 @@ def render_places(a: TopometricMap, drawn: Drawn, places: Places) -> Markup:
     rooms = assign_places_to_rooms(a, places)
     odds = compute_room_log_odds(places, rooms, len(a.rooms))
     sheet, plans = drawn
-    words = "Green rooms look the same in both maps, red ones more like another room; grey ones give no evidence."
+    text = "Green rooms look the same in both maps, red ones more like another room; grey ones give no evidence."
     view = render_plan_view(a, sheet, plans, compute_room_shades(odds))
     order = np.argsort(-np.abs(places.log_odds), kind="stable")[:MOST_SHOWN]
     by_room = sorted({int(rooms[k]) for k in order}, key=lambda i: odds[i] if i >= 0 and np.isfinite(odds[i]) else 0.0)
     groups = [_render_room(i, [int(k) for k in order if rooms[k] == i], odds, places) for i in by_room]
     note = "Click a room to see what was compared there, map a left, map b right; rooms with evidence against come first."
     parts = [
-        build_element("p", words, class_="note"),
+        build_element("p", text, class_="note"),
         view,
         build_element("p", note, class_="note"),
         build_element("div", *groups, class_="places"),
@@ -106,10 +106,10 @@ def compute_room_shades(odds: Array) -> Array:
 def _render_room(room: int, shown: Sequence[int], odds: Array, places: Places) -> Markup:
     """A room's places, folded."""
     name = render_room_link("a", room) if room >= 0 else Markup("outside rooms")
-    words = f" {describe_log_odds(float(odds[room]))}, {len(shown)} shown" if room >= 0 else f" {len(shown)} shown"
+    text = f" {describe_log_odds(float(odds[room]))}, {len(shown)} shown" if room >= 0 else f" {len(shown)} shown"
     cards = [_render_card(k, places) for k in shown]
     return build_element(
-        "details", build_element("summary", name, words), build_element("div", *cards, class_="cards"), data_room_of_a=room
+        "details", build_element("summary", name, text), build_element("div", *cards, class_="cards"), data_room_of_a=room
     )
 
 
@@ -200,12 +200,12 @@ def _write(text: str, path: Path) -> None:
 
 
 def render_merge_html(result: MergeResult) -> str:
-    """The report as HTML. A result that is not believed shows its best hypothesis, and says so."""
+    """Return the report as HTML. A result that is not believed shows its best hypothesis, and says so."""
     if result.atlas is not None:
         names = " + ".join(m.title for m in result.maps)
         joined = {} if result.map is None else {result.atlas.find_component(0): result.map}
-        told = replace(result.atlas, warnings=result.warnings)
-        return render_atlas_html(told, joined, names, _render_deformations(result))
+        atlas = replace(result.atlas, warnings=result.warnings)
+        return render_atlas_html(atlas, joined, names, _render_deformations(result))
     a, b = result.maps
     registration = result.registration
     pose = registration.transform if registration else None
@@ -251,8 +251,8 @@ def _render_verdict(result: MergeResult) -> Markup:
     head = "Merged" if result.merged else "Joined by force (not believed)" if result.transforms else "Not merged (not believed)"
     parts = result.reason.replace(" m2 ", " m² ").split(": ", 1)[-1].split("; ")
     items = build_element("ul", *(build_element("li", part) for part in parts))
-    words = build_element("b", f"{head} · probability {format_probability(result.probability)}")
-    block = build_element("div", words, items, class_="verdict" if result.merged else "verdict refused")
+    element = build_element("b", f"{head} · probability {format_probability(result.probability)}")
+    block = build_element("div", element, items, class_="verdict" if result.merged else "verdict refused")
     return join([block, *_render_observations(result), _render_figures(result)])
 
 
@@ -293,8 +293,8 @@ def _render_maps(result: MergeResult, drawn: tuple[Drawn, Drawn]) -> Markup:
         views.append(build_element("div", head, render_plan_view(m, sheet, plans, shades)))
     parts: list[Markup] = []
     if result.map is not None:
-        words = "Matched rooms share a colour; grey rooms are in one map only. Point at a room to highlight its match."
-        parts.append(build_element("p", words, class_="note"))
+        text = "Matched rooms share a colour; grey rooms are in one map only. Point at a room to highlight its match."
+        parts.append(build_element("p", text, class_="note"))
     parts.append(build_element("div", *views, class_="pair"))
     if result.matches:
         figure = build_element("div", render_lines(result.maps, drawn, result.matches, colours), class_="sheet")
@@ -369,10 +369,10 @@ def _render_matches(result: MergeResult) -> Markup:
 
 def _render_overlay(result: MergeResult, drawn: tuple[Drawn, Drawn], pose: Sim3) -> Markup:
     a, b = result.maps
-    words = "Map b over map a. Move the slider to fade from one to the other."
+    text = "Map b over map a. Move the slider to fade from one to the other."
     if not result.merged:
-        words = "The best pose found for map b; it is not believed. " + words
-    parts = [build_element("p", words, class_="note"), render_blend_view(a, b, drawn, pose, result.bends)]
+        text = "The best pose found for map b; it is not believed. " + text
+    parts = [build_element("p", text, class_="note"), render_blend_view(a, b, drawn, pose, result.bends)]
     if result.bends:
         where = list(build_placements({1: pose}, result.bends).values())
         parts.append(
@@ -409,8 +409,8 @@ def _render_space(result: MergeResult) -> Markup:
             sign = build_element("i", style=f"background:{SEEN_OF_COLOURS[k]}")
             items.append(build_element("li", sign, f"{name}: {100 * share[k] / share.sum():.0f} %"))
     legend = build_element("ul", *items, class_="legend")
-    words = build_element("p", "Colour by “map” shows which map saw each cell.", class_="note")
-    return render_section("3D view", join([words, render_scene_view("scene-data"), legend]), "space")
+    element = build_element("p", "Colour by “map” shows which map saw each cell.", class_="note")
+    return render_section("3D view", join([element, render_scene_view("scene-data"), legend]), "space")
 
 
 def _render_evidence(result: MergeResult, registration: Registration) -> Markup:
@@ -420,15 +420,15 @@ def _render_evidence(result: MergeResult, registration: Registration) -> Markup:
         return render_section(title, build_element("p", result.reason), "why")
     parts = []
     if registration.posterior:
-        words = "What the best pose may show, under the stated priors (docs/method.md)"
-        parts.append(_render_text_table(("alternative", "probability"), list_posterior(registration), words))
+        text = "What the best pose may show, under the stated priors (docs/method.md)"
+        parts.append(_render_text_table(("alternative", "probability"), list_posterior(registration), text))
     parts.append(_render_text_table(("evidence", "value", "meaning"), rows, "Evidence for the best hypothesis"))
     if len(registration.alternatives) > 1:
         best, middle = registration.alternatives[0], result.maps[1].grid.compute_centroids().mean(axis=0)
         others = [format_hypothesis(k, other, best, middle) for k, other in enumerate(registration.alternatives[:HYPOTHESES])]
         heads = ("pose", "rotation °", "distance to best m", "odds", "walls m²", "free floor m²", "walls on free floor")
-        words = "Odds are relative to the best pose, each judged alone; 1 means equally good."
-        more = [build_element("h3", "Other poses that were tried"), build_element("p", words, class_="note")]
+        text = "Odds are relative to the best pose, each judged alone; 1 means equally good."
+        more = [build_element("h3", "Other poses that were tried"), build_element("p", text, class_="note")]
         parts.append(build_element("div", *more, _render_text_table(heads, others, "Other poses"), class_="more"))
     return render_section(title, join(parts), "why")
 

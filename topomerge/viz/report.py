@@ -48,8 +48,8 @@ def save_report(map: TopometricMap, path: str | Path) -> None:
         InputError: the path can't be written.
     """
     text = render_report_html(map)
-    with replace_on_success(path) as beside:
-        beside.write_text(text, encoding="utf-8", errors="replace", newline="\n")
+    with replace_on_success(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", errors="replace", newline="\n")
 
 
 def render_report_html(map: TopometricMap) -> str:
@@ -164,8 +164,8 @@ def list_storey_names(map: TopometricMap) -> list[tuple[str, str]]:
     for i, storey in enumerate(map.storeys):
         rooms = int((map.rooms["storey"] == i).sum())
         area = float(map.rooms["area"][map.rooms["storey"] == i].sum())
-        words = [f"floor at {storey['floor']:.2f} m", f"{rooms} room{'' if rooms == 1 else 's'}", f"{area:.0f} m²"]
-        names.append((f"Storey {i}", " · ".join(words)))
+        parts = [f"floor at {storey['floor']:.2f} m", f"{rooms} room{'' if rooms == 1 else 's'}", f"{area:.0f} m²"]
+        names.append((f"Storey {i}", " · ".join(parts)))
     return names or [("Plan", "no storeys were found")]
 
 
@@ -230,14 +230,14 @@ def render_legend(map: TopometricMap) -> Markup:
         ("wall", "wall, cut at 1 to 1.9 m", True),
         ("seen", "seen, not a room", True),
     ]
-    items = [build_element("li", build_element("i", class_=f"sign-{sign}"), words) for sign, words, there in entries if there]
+    items = [build_element("li", build_element("i", class_=f"sign-{sign}"), text) for sign, text, there in entries if there]
     return build_element("ul", *items, class_="legend")
 
 
 def render_scene_view(data: str) -> Markup:
     """Render the place of a 3D view of the cells whose `build_scene_data` the page carries under the id `data`."""
-    words = "The 3D view needs JavaScript and WebGL 2, which this browser does not offer. The plans above show the same rooms."
-    return build_element("div", build_element("p", words, class_="missing"), class_="scene", data_scene=data)
+    text = "The 3D view needs JavaScript and WebGL 2, which this browser does not offer. The plans above show the same rooms."
+    return build_element("div", build_element("p", text, class_="missing"), class_="scene", data_scene=data)
 
 
 HOME = "127.0.0.1"

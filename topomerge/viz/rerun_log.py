@@ -93,8 +93,8 @@ class RerunLog:
         )
         self._stream.log(f"{entity}/rooms", boxes)
         middles = map.rooms["centroid"]
-        ways = [pose.apply(np.array([middles[e["rooms"][0]], e["centre"], middles[e["rooms"][1]]])) for e in map.edges]
-        self._stream.log(f"{entity}/graph", rr.LineStrips3D(ways, radii=0.03))
+        connections = [pose.apply(np.array([middles[e["rooms"][0]], e["centre"], middles[e["rooms"][1]]])) for e in map.edges]
+        self._stream.log(f"{entity}/graph", rr.LineStrips3D(connections, radii=0.03))
 
     def _log_links(self, entity: str, result: AtlasResult, members: tuple[int, ...]) -> None:
         """Where each map of a component begins, and the links between maps."""

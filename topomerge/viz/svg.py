@@ -312,9 +312,9 @@ def _render_axes(sheet: Sheet, margin: int, unit: float) -> Markup:
 def _render_room(map: TopometricMap, sheet: Sheet, room: int, path: str, colour: str) -> Markup:
     about = map.rooms[room]
     kind = "room glimpsed" if about["glimpsed"] else "room"
-    words = f"Room {room}, {about['area']:.1f} m²"
+    text = f"Room {room}, {about['area']:.1f} m²"
     drawn = {"d": path, "fill_rule": "evenodd", "data_sure": format_room_confidence(about)}
-    shape = build_element("path", class_=kind, **drawn, fill=colour, data_room=sheet.format_room_id(room), aria_label=words)
+    shape = build_element("path", class_=kind, **drawn, fill=colour, data_room=sheet.format_room_id(room), aria_label=text)
     if not about["glimpsed"]:
         return shape
     return Markup(shape + build_element("path", class_="over", **drawn))
@@ -329,13 +329,13 @@ def _render_landmarks(map: TopometricMap, sheet: Sheet, storey: int) -> list[Mar
     parts = []
     for row, (x, y) in zip(table[rows], sheet.convert_to_cm(table["position"][rows]).tolist(), strict=True):
         value, kind = map.landmarks.values[row["value"]], LANDMARK_KINDS[row["kind"]]
-        words = build_element("title", f"{kind}: {value}")
+        element = build_element("title", f"{kind}: {value}")
         dot, text = build_element("circle", r=1), build_element("text", shorten(value))
         about = {
             "data_room": sheet.format_room_id(int(row["room"])) if row["room"] >= 0 else None,
             "data_words": fold_words([value]),
         }
-        parts.append(build_element("g", words, dot, text, class_=f"landmark {kind}", transform=f"translate({x} {y})", **about))
+        parts.append(build_element("g", element, dot, text, class_=f"landmark {kind}", transform=f"translate({x} {y})", **about))
     return parts
 
 
@@ -395,12 +395,12 @@ def _render_stairs(map: TopometricMap, sheet: Sheet, storey: int, i: int, labell
             sheet.locate(edge["lower"]), sheet.locate(edge["upper"]), float(edge["width"]), edge["kind"] == "stairs"
         )
         spot = (edge["lower"] + edge["upper"]) / 2
-    words = [] if parts else [build_element("path", class_="sign", d="M-6 5L0 -6L6 5z")]
+    element = [] if parts else [build_element("path", class_="sign", d="M-6 5L0 -6L6 5z")]
     if other not in labelled:
         labelled.add(other)
-        words.append(build_element("text", f"{'up ' if level > storey else 'down ' if level < storey else ''}to {other}"))
+        element.append(build_element("text", f"{'up ' if level > storey else 'down ' if level < storey else ''}to {other}"))
     x, y = sheet.locate(spot)
-    place = build_element("g", *words, class_="to", transform=f"translate({x} {y})")
+    place = build_element("g", *element, class_="to", transform=f"translate({x} {y})")
     return build_element("g", *parts, place, class_=f"door {edge['kind']}", **_build_edge_attributes(map, sheet, i))
 
 

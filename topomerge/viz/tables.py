@@ -40,16 +40,16 @@ def build_element(name: str, *content: str, **attributes: Any) -> Markup:
         attributes: values are escaped. An underscore stands for a hyphen, one at the end is dropped (`class_`); None and
             False leave the attribute out, True gives it without a value.
     """
-    words = [name]
+    parts = [name]
     for key, value in attributes.items():
         if value is None or value is False:
             continue
         key = key.rstrip("_").replace("_", "-")
-        words.append(key if value is True else f'{key}="{_escape(str(value))}"')
+        parts.append(key if value is True else f'{key}="{_escape(str(value))}"')
     inside = "".join(part if isinstance(part, Markup) else _escape(part) for part in content)
     if name in VOID:
-        return Markup(f"<{' '.join(words)}>")
-    return Markup(f"<{' '.join(words)}>{inside}</{name}>")
+        return Markup(f"<{' '.join(parts)}>")
+    return Markup(f"<{' '.join(parts)}>{inside}</{name}>")
 
 
 def join(parts: Iterable[str], between: str = "") -> Markup:
@@ -59,7 +59,7 @@ def join(parts: Iterable[str], between: str = "") -> Markup:
 
 
 def embed_json(value: Any, id: str) -> Markup:
-    """A value for the page's script, in an element that is not run; it can't end that element before its time."""
+    """Return a value for the page's script, in an element that is not run; it can't end that element before its time."""
     text = json.dumps(value, allow_nan=False, ensure_ascii=True, separators=(",", ":"))
     for sign in "<>&":
         text = text.replace(sign, f"\\u{ord(sign):04x}")
@@ -113,7 +113,7 @@ def render_cell(content: str, value: float | None = None, kind: str = "number", 
 
 
 def measure(value: float, digits: int, measured: bool = True) -> Markup:
-    """A cell with a number, or a dash where it is not known."""
+    """Return a cell with a number, or a dash where it is not known."""
     if not measured or not math.isfinite(value):
         return render_cell("–", -1.0)
     return render_cell(f"{value:.{digits}f}", float(value))
@@ -174,9 +174,9 @@ def render_landmarks(map: TopometricMap, key: str = "") -> list[Markup]:
         ]
         lines.append(build_element("tr", *cells, data_words=fold_words([value])))
     listed = render_table([*names, ("confidence", "number"), ("source", "text")], lines, "Landmarks")
-    words = f"{describe_landmarks(map.landmarks)}{f', the surest {MOST_LISTED}' if len(rows) > MOST_LISTED else ''}"
+    text = f"{describe_landmarks(map.landmarks)}{f', the surest {MOST_LISTED}' if len(rows) > MOST_LISTED else ''}"
     frame = build_element("div", listed, class_="scroller", tabindex=0)
-    return [build_element("details", build_element("summary", words), frame, class_="more")]
+    return [build_element("details", build_element("summary", text), frame, class_="more")]
 
 
 def render_rooms_table(map: TopometricMap, key: str = "", only: Iterable[int] | None = None) -> Markup:
@@ -195,8 +195,8 @@ def render_rooms_table(map: TopometricMap, key: str = "", only: Iterable[int] | 
         swatch = build_element("span", class_="swatch glimpsed" if room["glimpsed"] else "swatch",
                          style=f"background-color:{format_hex_colour(colours[i])}")  # fmt: skip
         seen = render_share_bar(room["completeness"])
-        words = [build_element("em", word, title=ROOM_WORDS[word]) for word in describe_room(room)]
-        leads = join([*words, *(render_room_link(key, other) for other in beside)], " ")
+        text = [build_element("em", word, title=ROOM_WORDS[word]) for word in describe_room(room)]
+        leads = join([*text, *(render_room_link(key, other) for other in beside)], " ")
         cells = [
             render_cell(join([swatch, str(i)]), i),
             *([render_cell(str(room["storey"]), int(room["storey"]))] if several_storeys else []),
@@ -219,11 +219,11 @@ def _join_shown(values: Sequence[str]) -> str:
 
 
 def _list_neighbours(map: TopometricMap) -> list[list[int]]:
-    beside: list[set[int]] = [set() for _ in map.rooms]
+    neighbours: list[set[int]] = [set() for _ in map.rooms]
     for a, b in map.edges["rooms"].tolist():
-        beside[a].add(b)
-        beside[b].add(a)
-    return [sorted(rooms) for rooms in beside]
+        neighbours[a].add(b)
+        neighbours[b].add(a)
+    return [sorted(rooms) for rooms in neighbours]
 
 
 def render_doors_table(map: TopometricMap, key: str = "") -> Markup:

@@ -129,21 +129,21 @@ def _find_most_common(rooms: Array, otherwise: int) -> int:
     return otherwise if counts[otherwise] == counts.max() else int(counts.argmax())
 
 
-def merge_openings(ways: Array) -> tuple[Array, Array]:
+def merge_openings(doorways: Array) -> tuple[Array, Array]:
     """Doorways (D,) DOORWAY_DTYPE without those that are parts of one wide opening, and the width (D,) m of the surest part.
 
     Of an opening wider than doors are, a wall shows where it begins and where it ends: two doorways of the same two rooms that
     meet end to end.
     """
-    rooms = np.sort(ways["rooms"], axis=1)
-    along = np.column_stack([-ways["out"][:, 1], ways["out"][:, 0]])
-    apart = ways["centre"][None] - ways["centre"][:, None]
-    gap = np.abs((apart[..., :2] * along[:, None]).sum(axis=2)) - (ways["width"][:, None] + ways["width"]) / 2
-    off = np.abs((apart[..., :2] * ways["out"][:, None]).sum(axis=2))
+    rooms = np.sort(doorways["rooms"], axis=1)
+    along = np.column_stack([-doorways["out"][:, 1], doorways["out"][:, 0]])
+    apart = doorways["centre"][None] - doorways["centre"][:, None]
+    gap = np.abs((apart[..., :2] * along[:, None]).sum(axis=2)) - (doorways["width"][:, None] + doorways["width"]) / 2
+    off = np.abs((apart[..., :2] * doorways["out"][:, None]).sum(axis=2))
     meet = (gap < SAME_DOORWAY) & (off < SAME_DOORWAY) & (np.abs(along @ along.T) > STRAIGHT)
     meet &= (rooms[:, None] == rooms).all(axis=2) & (np.abs(apart[..., 2]) < DOORWAY_LEVEL)
     count, part = connected_components(meet, directed=False)
-    whole = [ways[part == k] for k in range(count)]
+    whole = [doorways[part == k] for k in range(count)]
     out = np.array([tuple(_join_parts(parts)) for parts in whole], DOORWAY_DTYPE)
     return out, np.array([parts["width"][parts["probability"].argmax()] for parts in whole], float)
 
@@ -160,11 +160,11 @@ def _join_parts(parts: Array) -> Array:
     return out
 
 
-def _iter_runs(chance: Array) -> Iterator[tuple[int, int]]:
+def _iter_runs(probability: Array) -> Iterator[tuple[int, int]]:
     """First place and that after the last one of every stretch that is probably a door."""
-    likely = np.flatnonzero(np.diff(np.concatenate([[0], chance > DOOR_CHANCE, [0]]).astype(np.int8)))
+    likely = np.flatnonzero(np.diff(np.concatenate([[0], probability > DOOR_CHANCE, [0]]).astype(np.int8)))
     for start, stop in likely.reshape(-1, 2).tolist():
-        if (stop - start) * PLACES * ALONG >= LEAST_WIDTH and chance[start:stop].max() >= LIKELY_DOOR:
+        if (stop - start) * PLACES * ALONG >= LEAST_WIDTH and probability[start:stop].max() >= LIKELY_DOOR:
             yield start, stop
 
 
@@ -187,13 +187,13 @@ def _is_thick(strip: Array, start: int, stop: int) -> bool:
 def _build_doorway(face: Array, room: int, doors: Array, start: int, stop: int) -> tuple[object, ...]:
     """Row of DOORWAY_DTYPE of one stretch of a face, with the room before it."""
     step = PLACES * ALONG
-    chance = doors[start:stop].sum(axis=1)
-    at = (np.average(np.arange(start, stop), weights=chance) + 0.5) * step
+    probability = doors[start:stop].sum(axis=1)
+    at = (np.average(np.arange(start, stop), weights=probability) + 0.5) * step
     middle = face["start"] + at * face["along"] + HALF_WALL * face["out"]
-    width = float(chance.sum()) * step
-    wide, _, half = (doors[start:stop].sum(axis=0) / chance.sum()).tolist()
+    width = float(probability.sum()) * step
+    wide, _, half = (doors[start:stop].sum(axis=0) / probability.sum()).tolist()
     place = (*middle.tolist(), float(face["floor"]))
-    return (room, -1), place, face["out"], width, float(chance.max()), float(chance.mean()), wide + half, half, 1
+    return (room, -1), place, face["out"], width, float(probability.max()), float(probability.mean()), wide + half, half, 1
 
 
 def _merge_faces(rows: Array) -> Array:

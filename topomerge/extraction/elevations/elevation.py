@@ -110,16 +110,16 @@ def measure_crossed_places(crossed: VoxelGrid | None, faces: Array, sizes: Array
 
 
 def build_face_rows(room: int, lines: Sequence[Line], floor: Array, level: float) -> list[tuple[object, ...]]:
-    """Rows of FACE_DTYPE along lines; those with no floor (n, 2) m of the room beside them are left out."""
+    """Return rows of FACE_DTYPE along lines; those with no floor (n, 2) m of the room beside them are left out."""
     rows: list[tuple[object, ...]] = []
     for line in lines:
         at = floor - line.middle
         t, off = at @ line.along, at @ line.across
-        beside = (t > line.start) & (t < line.end) & (np.abs(off) > SIDE_REACH[0]) & (np.abs(off) < SIDE_REACH[1])
-        left = int((off[beside] > 0).sum())
-        if not beside.any():
+        near = (t > line.start) & (t < line.end) & (np.abs(off) > SIDE_REACH[0]) & (np.abs(off) < SIDE_REACH[1])
+        left = int((off[near] > 0).sum())
+        if not near.any():
             continue
-        out = -line.across if 2 * left > beside.sum() else line.across
+        out = -line.across if 2 * left > near.sum() else line.across
         start = line.middle + (line.start - PAST_ENDS) * line.along
         rows.append((room, start, line.along, out, line.length + 2 * PAST_ENDS, level))
     return rows

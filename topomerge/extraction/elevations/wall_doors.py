@@ -62,7 +62,7 @@ class DoorCandidates:
 
 
 def add_wall_doors(map: TopometricMap, storeys: Sequence[ClassifiedStorey], walls: StoreyWalls | None) -> TopometricMap:
-    """The map with the doors that its plans and walls show.
+    """Return the map with the doors that its plans and walls show.
 
     Args:
         storeys: what probably stands in the columns of its plans.
@@ -70,10 +70,12 @@ def add_wall_doors(map: TopometricMap, storeys: Sequence[ClassifiedStorey], wall
     """
     level = np.isin(map.edges["kind"], ("door", "opening"))
     candidates = build_door_candidates(map.edges[level], map.rooms["completeness"], storeys, walls)
-    chance = compute_door_probability(candidates)
+    probability = compute_door_probability(candidates)
     edges = candidates.edges.copy()
-    edges["confidence"] = chance
-    edges = np.concatenate([edges[(chance >= 0.5) | _is_only_way(candidates, chance, len(map.rooms))], map.edges[~level]])
+    edges["confidence"] = probability
+    edges = np.concatenate(
+        [edges[(probability >= 0.5) | _is_only_way(candidates, probability, len(map.rooms))], map.edges[~level]]
+    )
     order = np.lexsort((*edges["centre"].T[::-1], edges["rooms"][:, 1], edges["rooms"][:, 0]))
     return replace(map, edges=edges[order])
 
@@ -91,10 +93,10 @@ def compute_door_probability(candidates: DoorCandidates, models: Mapping[str, Se
     models = read_weights_json("topomerge.extraction.elevations", WALL_DOORS_FILE) if models is None else models
     table = np.array([models.get(name, ()) for name in SOURCES], float)
     weights = table[candidates.source]
-    chance = sigmoid((weights[:, 1:] * candidates.features).sum(axis=1) + weights[:, 0])
+    probability = sigmoid((weights[:, 1:] * candidates.features).sum(axis=1) + weights[:, 0])
     plan, wide = (WALL_DOOR_FEATURES.index(name) for name in ("plan", "wide"))
     opening = (candidates.source == SOURCES.index("plan")) & (candidates.features[:, wide] > 0)
-    return np.where(opening, candidates.features[:, plan], chance)
+    return np.where(opening, candidates.features[:, plan], probability)
 
 
 def build_door_candidates(
@@ -110,14 +112,14 @@ def build_door_candidates(
     """
     if walls is None:
         return _build_flat_candidates(complete, storeys, edges)
-    ways, shown = merge_openings(walls.doorways)
-    whole = _match_openings(edges, ways)
-    partner = _match_doorways(edges, ways, whole)
+    doorways, shown = merge_openings(walls.doorways)
+    whole = _match_openings(edges, doorways)
+    partner = _match_doorways(edges, doorways, whole)
     rows, features, source = [], [], []
     for edge, i in zip(edges, partner, strict=True):
         less = float(complete[edge["rooms"]].min())
         if i >= 0:
-            way = ways[i]
+            way = doorways[i]
             part = whole[i] >= 0
             apart = 0.0 if part else float(np.hypot(*(way["centre"] - edge["centre"])[:2]))
             rows.append(edge if part else _move_door(edge, way))
@@ -131,8 +133,8 @@ def build_door_candidates(
                 [0, 0, 0, 0, float(edge["confidence"]), near, covered, *_compute_size_features(edge["width"], less, 0)]
             )
         source.append(SOURCES.index("both" if i >= 0 else "plan"))
-    for i in np.setdiff1d(np.arange(len(ways)), partner).tolist():
-        way = ways[i]
+    for i in np.setdiff1d(np.arange(len(doorways)), partner).tolist():
+        way = doorways[i]
         if way["rooms"][1] >= 0 and whole[i] < 0:
             rows.append(_build_edge(way))
             features.append(
@@ -151,11 +153,11 @@ def build_door_candidates(
     return _build_candidates(table, features, fill, storeys, np.array(source, np.int8))
 
 
-def _is_only_way(candidates: DoorCandidates, chance: Array, rooms: int) -> Array:
+def _is_only_way(candidates: DoorCandidates, probability: Array, rooms: int) -> Array:
     """(n,) bool: passages of a map without walls by which alone one walks from some rooms to others, the likeliest: what parts a
     room wrongly must not part the graph."""
-    ways, group = np.zeros(len(chance), bool), np.arange(rooms)
-    for k in np.argsort(-chance, kind="stable").tolist():
+    ways, group = np.zeros(len(probability), bool), np.arange(rooms)
+    for k in np.argsort(-probability, kind="stable").tolist():
         a, b = group[candidates.edges["rooms"][k]].tolist()
         if a != b and candidates.source[k] == SOURCES.index("flat"):
             ways[k] = True
@@ -193,31 +195,31 @@ def _compute_size_features(width: float, complete: float, apart: float) -> tuple
     return odd, complete, apart, float(width > DOOR_MOST_WIDTH)
 
 
-def _match_openings(edges: Array, ways: Array) -> Array:
+def _match_openings(edges: Array, doorways: Array) -> Array:
     """(W,) the opening of the plan, wider than doors are, of which each doorway is a part, -1 none: walls show where it begins
     and where it ends. A doorway on one side only may be a door in a wall that the plan lacks, of glass for example."""
-    out = np.full(len(ways), -1)
+    out = np.full(len(doorways), -1)
     for k in np.flatnonzero(edges["width"] > DOOR_MOST_WIDTH).tolist():
         edge = edges[k]
         normal = np.array([np.cos(edge["direction"]), np.sin(edge["direction"])])
-        apart = ways["centre"] - edge["centre"]
+        apart = doorways["centre"] - edge["centre"]
         along, off = apart[:, :2] @ (-normal[1], normal[0]), np.abs(apart[:, :2] @ normal)
-        inside = (np.abs(along) < edge["width"] / 2) & (off < PART_OFF) & (ways["width"] < edge["width"])
-        inside &= (np.abs(ways["out"] @ normal) > STRAIGHT) & (np.abs(apart[:, 2]) < WALL_DOOR_REACH)
-        inside &= np.isin(ways["rooms"], edge["rooms"]).any(axis=1)
+        inside = (np.abs(along) < edge["width"] / 2) & (off < PART_OFF) & (doorways["width"] < edge["width"])
+        inside &= (np.abs(doorways["out"] @ normal) > STRAIGHT) & (np.abs(apart[:, 2]) < WALL_DOOR_REACH)
+        inside &= np.isin(doorways["rooms"], edge["rooms"]).any(axis=1)
         if along[inside].min(initial=0) < 0 < along[inside].max(initial=0):
             out[inside] = k
     return out
 
 
-def _match_doorways(edges: Array, ways: Array, whole: Array) -> Array:
+def _match_doorways(edges: Array, doorways: Array, whole: Array) -> Array:
     """(E,) the doorway that each door of the plan is, -1 none: the nearest first, each once. A part of an opening is no other."""
     partner = np.full(len(edges), -1)
-    if not len(edges) or not len(ways):
+    if not len(edges) or not len(doorways):
         return partner
-    apart = np.linalg.norm(edges["centre"][:, None, :2] - ways["centre"][None, :, :2], axis=2)
-    level = np.abs(edges["centre"][:, None, 2] - ways["centre"][None, :, 2]) < WALL_DOOR_REACH
-    first, second = ways["rooms"].T
+    apart = np.linalg.norm(edges["centre"][:, None, :2] - doorways["centre"][None, :, :2], axis=2)
+    level = np.abs(edges["centre"][:, None, 2] - doorways["centre"][None, :, 2]) < WALL_DOOR_REACH
+    first, second = doorways["rooms"].T
     pair = edges["rooms"][:, None]
     fits = (pair == first[:, None]).any(axis=2) & ((second < 0) | (pair == second[:, None]).any(axis=2))
     apart = np.where(fits & level & ((whole < 0) | (whole == np.arange(len(edges))[:, None])), apart, np.inf)
@@ -264,8 +266,8 @@ def _measure_near_doors(walls: Elevations, doors: Array, edge: Array) -> tuple[f
     t = (at * walls.faces["along"]).sum(axis=1)
     off = (at * walls.faces["out"]).sum(axis=1)
     level = np.abs(walls.faces["floor"] - edge["centre"][2]) < WALL_DOOR_REACH
-    beside = (off > -BEFORE) & (off < BEHIND) & (t > 0) & (t < walls.faces["length"]) & level
-    for f in np.flatnonzero(beside).tolist():
+    near = (off > -BEFORE) & (off < BEHIND) & (t > 0) & (t < walls.faces["length"]) & level
+    for f in np.flatnonzero(near).tolist():
         first, last = int(walls.first[f]) // PLACES, int(walls.first[f + 1]) // PLACES
         low, high = (first + round((t[f] + side * NEAR) / ALONG / PLACES) for side in (-1, 1))
         some = slice(max(low, first), min(high + 1, last))

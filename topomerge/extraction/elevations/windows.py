@@ -39,16 +39,16 @@ BESIDE_BANDS, ABOVE_BANDS = slice(5, 12), slice(11, 13)  # in which walls show b
 LEAST_FILL = 0.15  # of the elements of a surface: in emptier ones nothing shows where it begins or ends
 
 
-def iter_likely_stretches(chance: Array, likely: float, least: float) -> Iterator[tuple[int, int]]:
+def iter_likely_stretches(probability: Array, likely: float, least: float) -> Iterator[tuple[int, int]]:
     """First place and that after the last one of every stretch that probably shows one thing.
 
     Args:
         chance: (n,) probability of it in each place along a strip.
         likely: of it on average; least: m, width.
     """
-    ends = np.flatnonzero(np.diff(np.concatenate([[0], chance > STRETCH_CHANCE, [0]]).astype(np.int8)))
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], probability > STRETCH_CHANCE, [0]]).astype(np.int8)))
     for start, stop in ends.reshape(-1, 2).tolist():
-        if (stop - start) * PLACE >= least - 1e-9 and chance[start:stop].mean() >= likely:
+        if (stop - start) * PLACE >= least - 1e-9 and probability[start:stop].mean() >= likely:
             yield start, stop
 
 
@@ -165,7 +165,7 @@ def add_windows(map: TopometricMap, walls: Elevations, classes: Array) -> Topome
     return replace(map, windows=select_windows(map, rows))
 
 
-def detect_windows(walls: Elevations, chance: Array) -> Array:
+def detect_windows(walls: Elevations, probability: Array) -> Array:
     """(W,) WINDOW_DTYPE, each once however many faces show it, the likeliest first; `rooms` are those of the faces.
 
     Args:
@@ -173,7 +173,7 @@ def detect_windows(walls: Elevations, chance: Array) -> Array:
     """
     rows, outs = [], []
     for face, (low, high) in zip(walls.faces, iter_strip_bounds(walls), strict=True):
-        each, strip = chance[low // PLACES : high // PLACES], walls.strips[low:high]
+        each, strip = probability[low // PLACES : high // PLACES], walls.strips[low:high]
         for start, stop in iter_likely_stretches(each, LIKELY_WINDOW, LEAST_WINDOW):
             rows.append(_build_window(face, each, strip, start, stop))
             outs.append(face["out"])
@@ -207,14 +207,14 @@ def iter_same_windows(rows: Array) -> Iterator[Array]:
     return iter_distinct_rows(rows, _is_overlapping)
 
 
-def _build_window(face: Array, chance: Array, strip: Array, start: int, stop: int) -> tuple[object, ...]:
+def _build_window(face: Array, probability: Array, strip: Array, start: int, stop: int) -> tuple[object, ...]:
     """Row of WINDOW_DTYPE of one stretch of a face."""
     depth = find_wall_depth(strip, start, stop)
     off = (depth + 0.5) * ACROSS - BEFORE + HALF_WALL
     middle = face["start"] + (start + stop) / 2 * PLACE * face["along"] + off * face["out"]
     direction = float(wrap_to_turn(np.arctan2(face["out"][1], face["out"][0]), np.pi))
     centre = (*middle.tolist(), float(face["floor"]))
-    likely = float(chance[start:stop].mean())
+    likely = float(probability[start:stop].mean())
     return (
         (int(face["room"]), -1),
         centre,

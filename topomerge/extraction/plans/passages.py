@@ -67,7 +67,7 @@ class Passage:
 
 
 def joined(one: Passage, other: Passage) -> Passage:
-    """The wider of two passages between the same rooms, with what walls show of either."""
+    """Return the wider of two passages between the same rooms, with what walls show of either."""
     wider = one if one.width > other.width else other
     return replace(wider, shown=max(one.shown, other.shown))
 
@@ -192,7 +192,7 @@ def compute_door_features(passage: Passage, peaks: Sequence[float] | Array, area
 
 
 def sort_pair(a: int, b: int) -> Pair:
-    """Two rooms, the smaller number first."""
+    """Return two rooms, the smaller number first."""
     return (a, b) if a < b else (b, a)
 
 

@@ -125,7 +125,7 @@ def _split_parts(known: Array) -> list[tuple[tuple[slice, slice], Array]] | None
 
 
 def remove_furniture(plan: StoreyPlan, probability: Array) -> StoreyPlan:
-    """The plan without the walls that are probably furniture: the legs of tables in slices and grid maps, cupboards.
+    """Return the plan without the walls that are probably furniture: the legs of tables in slices and grid maps, cupboards.
 
     Where a ceiling was seen, most cupboards differ from walls already (`plan`). What touches a wall stays: a blurred wall
     keeps its face.

@@ -146,7 +146,7 @@ def cluster_markov(
 
 
 def compute_modularity(similarity: sparse.csr_array, cluster: Array) -> float:
-    """Share of the weight inside clusters beyond what random edges would put there (Newman 2004); self loops left out."""
+    """Return share of the weight inside clusters beyond what random edges would put there (Newman 2004); self loops left out."""
     graph = sparse.coo_array(similarity)
     off = graph.row != graph.col
     row, col, weight = graph.row[off], graph.col[off], graph.data[off]
@@ -219,7 +219,7 @@ def propagate_labels(grid: VoxelGrid, labels: Array, neighbourhood: Kernel, roun
 
 
 def split_rooms(grid: VoxelGrid, labels: Array, least_volume: float) -> Array:
-    """Number the connected pieces of each label that hold at least `least_volume` m3 of occupied cells (seeds 2.6, 2.7).
+    """Return number the connected pieces of each label that hold at least `least_volume` m3 of occupied cells (seeds 2.6, 2.7).
 
     Smaller pieces belong to no room.
 

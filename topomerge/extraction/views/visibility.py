@@ -84,7 +84,7 @@ class SparseVoxelOctree:
         return octree.find_in_balls(self.grid.cells, self._nodes, table, in_cells, r / self.grid.edge + RADIUS_SLACK)
 
     def build_level_of_detail(self, k: int) -> VoxelGrid:
-        """The grid k levels up, edge * 2**k, with the property ``count``: occupied cells in each octant; k in 0..21.
+        """Return the grid k levels up, edge * 2**k, with the property ``count``: occupied cells in each octant; k in 0..21.
 
         Above the root, of which there is but one, the octants grow until they hold the whole volume.
         """

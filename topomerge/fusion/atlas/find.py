@@ -112,7 +112,7 @@ def rank_by_landmarks(stored: StoredAtlas, map: TopometricMap) -> dict[int, floa
 
 
 def register_sightings(stored: StoredAtlas, map: TopometricMap, sightings: Sequence[Sighting]) -> tuple[Sighting, ...]:
-    """The first of the sightings with how well the map fits there, in that order, then the others as they were."""
+    """Return the first of the sightings with how well the map fits there, in that order, then the others as they were."""
     files = {e.name: stored.folder / e.file for e in stored.entries}
     first = sightings[:LAID_COARSELY]
     both = Maps([map, *(files[s.name] for s in first)])

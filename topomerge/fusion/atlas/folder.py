@@ -189,8 +189,8 @@ class StoredAtlas:
         """Return all that belongs to the atlas but atlas.json."""
         kinds, components = ("map", "ply", "page", "tiles"), (self.listing or {}).get("components", [])
         journals = [find_journal(e.file).as_posix() for e in self.entries if e.edits]
-        made = [name for component in components for name in files_of(component, kinds)]
-        return [e.file for e in self.entries] + journals + made
+        stored = [name for component in components for name in files_of(component, kinds)]
+        return [e.file for e in self.entries] + journals + stored
 
     def find_name(self, key: str) -> str | None:
         """Return the name of the map with this content, None if there is none."""
@@ -301,7 +301,7 @@ def _entry(listed: Mapping[str, Any]) -> Entry:
 
 
 def files_of(component: Mapping[str, Any], kinds: Sequence[str]) -> list[str]:
-    """The files of some kinds that a component of the listing names."""
+    """Return the files of some kinds that a component of the listing names."""
     named = [component[kind] for kind in kinds if kind in component]
     return [name for one in named for name in ([one] if isinstance(one, str) else one)]
 

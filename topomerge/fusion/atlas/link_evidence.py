@@ -307,8 +307,8 @@ class _LinkScorer:
                     if odds < least:  # what is left to none is spread over all that is not named, and is not this rival's
                         odds, seen = least, [False, False]
             else:
-                said = [np.clip(self._check(source.pair, move).log_odds, 0.0, CLOSING_GAIN) for move in (self.move, rival)]
-                odds = float(said[0] - said[1])
+                log_odds = [np.clip(self._check(source.pair, move).log_odds, 0.0, CLOSING_GAIN) for move in (self.move, rival)]
+                odds = float(log_odds[0] - log_odds[1])
             loser = int(odds > 0)
             named.append((odds, shares[loser] is not None or (seen[loser] and not source.named), seen[loser]))
             if source.direct and odds < loudest[0]:

@@ -320,8 +320,8 @@ def compute_features(judge: Judge, hypothesis: PoseHypothesis) -> Array:
     root = float(np.sqrt(min(total / column, MOST_COLUMNS)))
     shares = np.array([seen[1], seen[2], seen[3], seen[0] - seen[1:4].sum(), back[0] - back[1] - back[2]]) / total
     clutter, met = seen[6] + back[6], seen[7] + back[7]
-    chance = (seen[9] + back[9]) / max(float(seen[8] + back[8]), 1e-6)
-    lift = float(met - chance * clutter) / 0.4
+    by_chance = (seen[9] + back[9]) / max(float(seen[8] + back[8]), 1e-6)
+    lift = float(met - by_chance * clutter) / 0.4
     blocked = (seen[4] - seen[5]) / max(float(seen[4]), 1e-6) * np.sqrt(min(seen[4] / column, 1000.0))
     ceiling = min(features["ceilings"], 0.4) * min(features["ceiling_area"] / 10.0, 1.0)
     rest = [blocked, ceiling, np.sign(lift) * np.log1p(abs(lift)), np.sqrt(max(float(clutter - met), 0.0) / 0.4)]

@@ -144,7 +144,7 @@ def locate_contradiction(
 
 
 def find_rooms_near(map: TopometricMap, at: Array) -> tuple[int, ...]:
-    """Rooms on whose floor places (n, 3), m, lie, or the nearest floor; those that hold a tenth of the places at least."""
+    """Return rooms on whose floor places (n, 3), m, lie, or the nearest floor; those that hold a tenth of the places at least."""
     if not len(at) or not len(map.navigable):
         return ()
     distance, nearest = cKDTree(map.navigable.compute_centroids()).query(at, distance_upper_bound=PLACE_REACH)
@@ -270,8 +270,8 @@ class Checks:
         if features["free"] < OVERLAP_FLOOR and features["walls"] < OVERLAP_WALLS:
             return Check(moved, 0.0, False, features)
         conflicts = find_conflicts(a, b, moved) if compute_excess_conflict(features) else ()
-        told = self._score_landmarks(i, j, moved)
-        return Check(moved, score_pose(features, conflicts) + told, True, features, conflicts)
+        landmarks = self._score_landmarks(i, j, moved)
+        return Check(moved, score_pose(features, conflicts) + landmarks, True, features, conflicts)
 
     def _score_landmarks(self, i: int, j: int, pose: Sim3) -> float:
         """Log odds of what landmarks say of T_ij, at most as much as walls may say."""
@@ -332,9 +332,9 @@ def sample_common_points(a: Sequence[PlanFields], b: Sequence[PlanFields], pose:
         rows = np.argwhere(w.plan.explored)
         rows = rows[:: max(len(rows) // SAMPLED_COLUMNS, 1)]
         at = np.column_stack([w.plan.origin + (rows + 0.5) * w.plan.edge, np.full(len(rows), w.plan.floor_guess)])
-        there = np.floor((pose.apply(at)[:, :2] - v.plan.origin) / v.plan.edge).astype(np.int64)
-        inside = ((there >= 0) & (there < v.plan.wall.shape)).all(axis=1)
-        samples.append(at[inside][v.plan.explored[tuple(there[inside].T)]])
+        placed = np.floor((pose.apply(at)[:, :2] - v.plan.origin) / v.plan.edge).astype(np.int64)
+        inside = ((placed >= 0) & (placed < v.plan.wall.shape)).all(axis=1)
+        samples.append(at[inside][v.plan.explored[tuple(placed[inside].T)]])
     return np.concatenate(samples)
 
 

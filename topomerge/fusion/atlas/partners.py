@@ -215,7 +215,7 @@ def _run_numbered(work: Callable[[Any], Any], number: int, task: Any) -> tuple[i
 
 
 def connect_cluster(address: str) -> Workers:
-    """The workers of a Dask scheduler, e.g. ``tcp://host:8786``. Pairs of a worker that dies are given to another one.
+    """Yield the workers of a Dask scheduler, e.g. ``tcp://host:8786``. Pairs of a worker that dies are given to another one.
 
     Raises:
         InputError: Dask is missing, or nobody answers there.
@@ -289,12 +289,12 @@ def _list_similar_maps(maps: Maps) -> list[list[int]]:
 
 def _list_named_maps(maps: Maps) -> list[list[int]]:
     """For each map those that its landmarks speak of most; none where all maps are registered with each other anyway."""
-    heard = [k for k in range(len(maps)) if len(maps) > FEW_MAPS and maps.has_landmarks(k)]
+    readings = [k for k in range(len(maps)) if len(maps) > FEW_MAPS and maps.has_landmarks(k)]
     out: list[list[int]] = [[] for _ in range(len(maps))]
-    if len(heard) > 1:
-        index = build_landmark_index(maps[k] for k in heard)
-        for n, k in enumerate(heard):
-            out[k] = [heard[m] for m, _ in index.rank(maps[k], but=n)[:NAMED_PARTNERS]]
+    if len(readings) > 1:
+        index = build_landmark_index(maps[k] for k in readings)
+        for n, k in enumerate(readings):
+            out[k] = [readings[m] for m, _ in index.rank(maps[k], but=n)[:NAMED_PARTNERS]]
     return out
 
 
@@ -320,11 +320,11 @@ def _score_in_workers(maps: Maps, named: list[list[int]], scale: str, workers: W
     for i, j in sorted({_order_pair(k, m) for k, of in enumerate(named) for m in of}):
         if files[i] and files[j] and build_coarse_key(maps, i, j) not in maps.memory.coarse:
             later.setdefault(i, [i]).append(j)
-    laid = list(later.values())
-    tasks = [CoarseTask(tuple(filter(None, (files[k] for k in of))), tuple(maps.keys[k] for k in of), scale) for of in laid]
+    placed = list(later.values())
+    tasks = [CoarseTask(tuple(filter(None, (files[k] for k in of))), tuple(maps.keys[k] for k in of), scale) for of in placed]
     for number, odds in workers(score_coarsely, tasks) if tasks else ():
-        for k, log_odds in zip(laid[number][1:], odds, strict=True):
-            maps.memory.coarse[build_coarse_key(maps, laid[number][0], k)] = log_odds
+        for k, log_odds in zip(placed[number][1:], odds, strict=True):
+            maps.memory.coarse[build_coarse_key(maps, placed[number][0], k)] = log_odds
 
 
 def _order_pair(i: int, j: int) -> tuple[int, int]:

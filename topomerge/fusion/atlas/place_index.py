@@ -178,10 +178,10 @@ def build_arrays(map: TopometricMap) -> dict[str, Array]:
         levels = [plan.levels[0], plan.levels[1]]
         head = [INDEX_VERSION, *plan.origin, plan.edge, *levels, plan.observed, plan.sliced, coarse.turn, *coarse.low]
         images = np.rint(255 * np.stack([coarse.walls, coarse.clear])).astype(np.uint8)
-        made = {"head": np.array(head, float), "directions": fields.profile.astype(np.float32), "coarse": images}
-        made |= {"wall": plan.wall, "inside": plan.inside, "bits": plan.profile.astype(np.uint32)}
-        made |= {"floor": plan.floor.astype(np.float32), "ceiling": plan.ceiling.astype(np.float32), "rooms": rooms}
-        arrays |= {f"{k}.{name}": array for name, array in made.items()}
+        stored = {"head": np.array(head, float), "directions": fields.profile.astype(np.float32), "coarse": images}
+        stored |= {"wall": plan.wall, "inside": plan.inside, "bits": plan.profile.astype(np.uint32)}
+        stored |= {"floor": plan.floor.astype(np.float32), "ceiling": plan.ceiling.astype(np.float32), "rooms": rooms}
+        arrays |= {f"{k}.{name}": array for name, array in stored.items()}
     return arrays
 
 

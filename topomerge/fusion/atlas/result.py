@@ -88,8 +88,8 @@ class AtlasResult:
         """
         count = len(self.components)
         if component not in range(-count, count):
-            there = f"{count} component{'s' * (count != 1)}, counted from 0"
-            raise InputError(f"there is no component {component!r}: the atlas has {there}")
+            valid = f"{count} component{'s' * (count != 1)}, counted from 0"
+            raise InputError(f"there is no component {component!r}: the atlas has {valid}")
         return fuse(self.maps, [(k, self.transforms[k]) for k in self.components[component]], self.bends)
 
     def format_summary(self) -> str:

@@ -128,16 +128,16 @@ class RoomRows:
     def _complete_rows(self, stored: StoredAtlas, describe: Descriptor, written: Collection[str]) -> dict[str, Array]:
         """What is written of the maps of the atlas, and what is missing."""
         arrays = archive.read(self.path, ROOMS_KIND, _list_array_names(self.entries)) if written else {}
-        made: dict[str, Array] = {}
+        completed: dict[str, Array] = {}
         for entry in self.entries:
             places = f"{entry.key}.places"
             if entry.key in arrays:
-                made |= {name: arrays[name] for name in (entry.key, places) if name in arrays}
+                completed |= {name: arrays[name] for name in (entry.key, places) if name in arrays}
             else:
                 rows = embed_rooms(describe, load_corrected_map(stored.folder / entry.file, entry.edits))
-                made[entry.key] = get_rows(rows).astype(np.float32)
-                made |= {places: rows.places} if isinstance(rows, TurnedRows) else {}
-        return made
+                completed[entry.key] = get_rows(rows).astype(np.float32)
+                completed |= {places: rows.places} if isinstance(rows, TurnedRows) else {}
+        return completed
 
     def get_rows(self, maps: Sequence[int]) -> list[Rows]:
         """Return rows of some maps, by their numbers in the atlas.

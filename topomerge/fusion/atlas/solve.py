@@ -157,21 +157,21 @@ def _check_maps(
     warnings: list[str] = []
     first: MapSummary | None = None
     for k, source in enumerate(maps):
-        facts = memory.summarise(source)
-        name = names[k] if names else facts.extent.source or f"map {k}"
-        if keys and keys[k] != facts.key:
+        summary = memory.summarise(source)
+        name = names[k] if names else summary.extent.source or f"map {k}"
+        if keys and keys[k] != summary.key:
             raise InputError(f"{source}: is not the map that was added as {name}; take it out with `topomerge atlas remove`")
-        check_cells(facts.extent.cells, name)
-        if facts.key in map_keys:
-            raise InputError(f"{name}: is the same map as {map_names[map_keys.index(facts.key)]}; give it once")
+        check_cells(summary.extent.cells, name)
+        if summary.key in map_keys:
+            raise InputError(f"{name}: is the same map as {map_names[map_keys.index(summary.key)]}; give it once")
         if first is None:
-            first = facts
+            first = summary
         elif scale == "fixed":
-            check_units(first.extent, facts.extent)
-        if not facts.rooms:
+            check_units(first.extent, summary.extent)
+        if not summary.rooms:
             warnings.append(format_no_rooms_warning(name))
         map_names.append(name)
-        map_keys.append(facts.key)
+        map_keys.append(summary.key)
     return map_names, map_keys, warnings
 
 
@@ -203,14 +203,14 @@ class _Explorer:
 
     def explore(self, end: float = np.inf, workers: Workers | None = None) -> Assembly:
         """The assembly that more registrations would not change; after the end of the time that of those that were made."""
-        self.partners, looked = find_partners(self.maps, self.linked, self.scale, (time.perf_counter() + end) / 2, workers)
+        self.partners, examined = find_partners(self.maps, self.linked, self.scale, (time.perf_counter() + end) / 2, workers)
         self.tried.update({pair: self._register(*pair) for pair in self.linked if self._is_registered(*pair)})
         while True:
             assembly = self.assembler.build()
             counts = np.bincount([k for pair in self.tried for k in pair], minlength=len(self.maps))
             pairs = set(self._iter_next_pairs(assembly, counts, time.perf_counter() >= end))
             if not pairs:
-                self.complete = looked and not any(self._iter_next_pairs(assembly, counts))
+                self.complete = examined and not any(self._iter_next_pairs(assembly, counts))
                 return assembly
             in_turn = sorted(pairs, key=lambda pair: (counts[list(pair)].min(), pair))  # what nothing is known of comes first
             if workers is not None and time.perf_counter() < end:

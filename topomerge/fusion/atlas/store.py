@@ -277,7 +277,7 @@ def remove(folder: str | Path, names: Sequence[str], report: Report) -> AtlasRes
 
 
 def build_entry(name: str, map: TopometricMap, stored: StoredAtlas) -> Entry:
-    """The entry of a map that an atlas does not hold yet, under its name or, where that is taken, under another one."""
+    """Return the entry of a map that an atlas does not hold yet, under its name or, where that is taken, under another one."""
     free_name, source, counts = _find_free_name(name, stored.entries), map.source or name, (len(map.rooms), len(map.storeys))
     return Entry(free_name, hash_map(map), source, *counts, levelling=map.levelling)
 

@@ -71,10 +71,10 @@ def read_sources(folder: Path) -> dict[str, Source]:
 
 
 def _parse_source(listed: Mapping[str, Any]) -> Source:
-    words = [listed[name] for name in ("stamp", "digest", "map", "error")]
-    if not all(isinstance(word, str) for word in words):
+    parts = [listed[name] for name in ("stamp", "digest", "map", "error")]
+    if not all(isinstance(word, str) for word in parts):
         raise ValueError("no source")
-    return Source(*words)
+    return Source(*parts)
 
 
 def serialise_sources(sources: Mapping[str, Source]) -> str:
@@ -122,10 +122,10 @@ def _name_file(file: Path, path: Path) -> str:
 
 
 def files_of(path: Path) -> list[Path]:
-    """The file itself and the landmarks beside it, or all files in a folder, in their order; without hidden ones."""
+    """Return the file itself and the landmarks beside it, or all files in a folder, in their order; without hidden ones."""
     if not path.is_dir():
-        beside = find_landmark_file(path)
-        return [path] if beside is None else [path, beside]
+        companion = find_landmark_file(path)
+        return [path] if companion is None else [path, companion]
     inside = (p for p in path.rglob("*") if not any(part.startswith(".") for part in p.relative_to(path).parts))
     return sorted(p for p in inside if p.is_file())
 
@@ -288,9 +288,9 @@ class FolderWatcher:
         """Read files, as many as are written at once."""
         batch, began = list[_ReadFile](), time.monotonic()
         for path in paths:
-            looked = self._read_file(Path(path))
-            if looked is not None:
-                batch.append(looked)
+            examined = self._read_file(Path(path))
+            if examined is not None:
+                batch.append(examined)
             maps = sum(one.map is not None for one in batch)
             if maps >= MAPS_AT_ONCE or (batch and time.monotonic() - began > SECONDS_AT_ONCE):
                 yield batch
@@ -318,7 +318,7 @@ class FolderWatcher:
     def _write(self, batch: list[_ReadFile]) -> None:
         """Put what was read into the atlas, or go on with registering if nothing was, and say what came of it."""
         plan = _Plan(self, batch)
-        if batch and all(looked.map is None for looked in batch) and (self.atlas / "atlas.json").exists():
+        if batch and all(reading.map is None for reading in batch) and (self.atlas / "atlas.json").exists():
             with change_folder(self.atlas, []) as place:  # notes only
                 for name, text in plan(read_finished_folder(self.atlas)).files.items():
                     (place / name).write_text(text, encoding="utf-8")
@@ -344,14 +344,14 @@ class _Plan:
         self.links = [{stored.entries[k].name for k in pair} for pair in stored.list_linked_pairs()]
         sources = read_sources(stored.folder)
         requested = Change(replace(stored, settings={**stored.settings, **self.watch.settings}))
-        for looked in self.batch:
-            source = looked.source
+        for reading in self.batch:
+            source = reading.source
             if source.error:
                 self.lines.append((source.error, True))
                 self.counts["unreadable"] += 1
-            elif looked.map is not None:
-                requested, source = self._add_map(requested, looked, looked.map, sources.get(str(looked.path)))
-            sources[str(looked.path)] = source
+            elif reading.map is not None:
+                requested, source = self._add_map(requested, reading, reading.map, sources.get(str(reading.path)))
+            sources[str(reading.path)] = source
         seconds = SECONDS_TO_ANSWER if self.batch else SECONDS_BETWEEN
         return replace(requested, files={SOURCES_FILE: serialise_sources(sources)}, seconds=seconds)
 
@@ -362,14 +362,14 @@ class _Plan:
         for line, is_warning in lines:
             self.watch.tell(line, is_warning)
 
-    def _add_map(self, requested: Change, looked: _ReadFile, map: TopometricMap, before: Source | None) -> tuple[Change, Source]:
+    def _add_map(self, requested: Change, reading: _ReadFile, map: TopometricMap, before: Source | None) -> tuple[Change, Source]:
         """The change with one more map."""
-        stored, name = requested.stored, looked.path.name
-        entry = build_entry(looked.path.stem, map, stored)
+        stored, name = requested.stored, reading.path.name
+        entry = build_entry(reading.path.stem, map, stored)
         same = stored.find_name(entry.key)
         if same is not None:
             self.lines.append((f"{name}: is in the atlas already, as {same}", False))
-            return requested, replace(looked.source, map=same)
+            return requested, replace(reading.source, map=same)
         old = next(
             (e for e in stored.entries if before is not None and e.name == before.map and e.name not in requested.new), None
         )
@@ -381,7 +381,7 @@ class _Plan:
             except InputError as error:
                 self.lines.append((f"{name}: {error}", True))
                 self.counts["unreadable"] += 1
-                return requested, replace(looked.source, error=f"{name}: {error}")
+                return requested, replace(reading.source, error=f"{name}: {error}")
         longer = None
         if old is not None and self.watch.replacing:
             longer = find_longer_version(old.name, load_map(stored.folder / old.file), map, stored)
@@ -392,7 +392,7 @@ class _Plan:
             stored = replace(stored, entries=(*stored.entries, entry))
         self.counts["replaced" if longer else "added"] += 1
         self.names[entry.name] = describe_file(name, entry.name, map, longer, old.name if old else "")
-        return replace(requested, stored=stored, new={**requested.new, entry.name: map}), replace(looked.source, map=entry.name)
+        return replace(requested, stored=stored, new={**requested.new, entry.name: map}), replace(reading.source, map=entry.name)
 
 
 def describe_file(file: str, name: str, map: TopometricMap, longer: LongerVersion | None, old: str) -> str:

@@ -60,8 +60,8 @@ def save(map: TopometricMap, path: Path) -> None:
         "nodes": nodes,
         "edges": edges,
     }
-    with replace_on_success(path) as beside:
-        beside.write_text(json.dumps(graph, allow_nan=False, indent=1), encoding="utf-8")
+    with replace_on_success(path) as temporary:
+        temporary.write_text(json.dumps(graph, allow_nan=False, indent=1), encoding="utf-8")
 
 
 def encode_symbol(letter: str, number: int) -> int:
@@ -121,18 +121,18 @@ def _iter_room_edges(map: TopometricMap) -> Iterator[Json]:
     """Rooms to their building, and to each other."""
     for r in range(len(map.rooms)):
         yield _build_edge(encode_symbol("B", 0), encode_symbol("R", r))
-    for (a, b), ways in _group_edges_by_pair(map.edges).items():
-        yield _build_edge(encode_symbol("R", a), encode_symbol("R", b), _describe_edges(ways))
+    for (a, b), connections in _group_edges_by_pair(map.edges).items():
+        yield _build_edge(encode_symbol("R", a), encode_symbol("R", b), _describe_edges(connections))
 
 
 def _group_edges_by_pair(table: Array) -> dict[tuple[int, int], list[Any]]:
     """The rows of an edge table by the pair that they join, in order: the library refuses a second edge of a pair."""
-    ways: dict[tuple[int, int], list[Any]] = {}
+    connections: dict[tuple[int, int], list[Any]] = {}
     for way in table:
         a, b = sorted(way["rooms"].tolist())
         if a != b:
-            ways.setdefault((a, b), []).append(way)
-    return dict(sorted(ways.items()))
+            connections.setdefault((a, b), []).append(way)
+    return dict(sorted(connections.items()))
 
 
 def _describe_edges(ways: list[Any], kind: str = "") -> Json:
@@ -147,10 +147,10 @@ def _iter_places(map: TopometricMap) -> Iterator[tuple[Json, list[Json]]]:
     colours, floors = assign_room_colours(map), build_floor_polygons(map)
     owner, centres = _compute_area_centres(map, floors)
     narrows: dict[int, list[Json]] = {}
-    for (a, b), ways in _group_edges_by_pair(map.narrows).items():
+    for (a, b), connections in _group_edges_by_pair(map.narrows).items():
         far = float(np.linalg.norm(centres[a] - centres[b]))
         narrows.setdefault(b, []).append(
-            _build_edge(encode_symbol("p", a), encode_symbol("p", b), _describe_edges(ways, "narrow"), far)
+            _build_edge(encode_symbol("p", a), encode_symbol("p", b), _describe_edges(connections, "narrow"), far)
         )
     for i, (r, at) in enumerate(zip(owner.tolist(), centres, strict=True)):
         clear = 0.0 if floors[r].is_empty else floors[r].boundary.distance(shapely.Point(at[:2]))

@@ -19,5 +19,5 @@ def save(map: TopometricMap, path: Path, graph: PoseGraph | None = None) -> None
     del map
     if graph is None:
         raise InputError("g2o: needs to know where maps lie; give the folder of a merge or an atlas that brought some together")
-    with replace_on_success(path) as beside:
-        beside.write_text(format_pose_graph(graph), encoding="utf-8")
+    with replace_on_success(path) as temporary:
+        temporary.write_text(format_pose_graph(graph), encoding="utf-8")

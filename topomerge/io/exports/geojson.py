@@ -71,8 +71,8 @@ def save(map: TopometricMap, path: Path, origin: Origin | None = None, storey: i
         InputError: the path can't be written, there is no such storey, or the map is too far from its own origin for `origin`.
     """
     if storey is not None and not 0 <= storey < len(map.storeys):
-        there = f"0 to {len(map.storeys) - 1}" if len(map.storeys) else "none"
-        raise InputError(f"--storey {storey}: the map has no such storey ({there})")
+        valid = f"0 to {len(map.storeys) - 1}" if len(map.storeys) else "none"
+        raise InputError(f"--storey {storey}: the map has no such storey ({valid})")
     if origin is not None:
         _check_near(map)
     place = round_positions if origin is None else _build_geodetic_transform(origin)
@@ -87,8 +87,8 @@ def save(map: TopometricMap, path: Path, origin: Origin | None = None, storey: i
     else:
         listing["topomerge"] = _describe_map(map, "WGS84 longitude and latitude in degrees; then metres in the frame of the map")
         listing["topomerge"]["origin"] = vars(origin)
-    with replace_on_success(path) as beside:
-        beside.write_text(format_collection(listing, features), encoding="utf-8", errors="replace")
+    with replace_on_success(path) as temporary:
+        temporary.write_text(format_collection(listing, features), encoding="utf-8", errors="replace")
 
 
 def _describe_map(map: TopometricMap, coordinates: str) -> dict[str, Any]:
@@ -96,7 +96,7 @@ def _describe_map(map: TopometricMap, coordinates: str) -> dict[str, Any]:
 
 
 def format_collection(listing: dict[str, Any], features: list[dict[str, Any]]) -> str:
-    """A line for each feature, so that files can be compared."""
+    """Return a line for each feature, so that files can be compared."""
     head = json.dumps(listing, ensure_ascii=False, allow_nan=False)[:-1]
     lines = ",\n".join(json.dumps(f, ensure_ascii=False, allow_nan=False) for f in features)
     return f'{head}, "features": [\n{lines}\n]}}\n'

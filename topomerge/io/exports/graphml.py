@@ -55,8 +55,8 @@ def _get_graphml_type(values: list[Any]) -> str:
 
 def _add_data(parent: Any, where: str, values: dict[str, Any]) -> None:
     for name, value in values.items():
-        said = str(value).lower() if isinstance(value, bool) else repr(value) if isinstance(value, float) else str(value)
-        xml.SubElement(parent, "data", key=f"{where}_{name}").text = said
+        text = str(value).lower() if isinstance(value, bool) else repr(value) if isinstance(value, float) else str(value)
+        xml.SubElement(parent, "data", key=f"{where}_{name}").text = text
 
 
 def _read_row(row: Any, *left_out: str) -> dict[str, Any]:

@@ -192,21 +192,21 @@ def save(map: TopometricMap, path: Path) -> None:
             model.add_boundary(f"window {k}", spaces[r], element, side)
     for storey in range(len(storeys)):
         model.contain(storeys[storey], [model.add_annotation(k, storeys[storey]) for k in model.list_annotated(storey)])
-    with replace_on_success(path) as beside:
-        model.file.write(str(beside))
+    with replace_on_success(path) as temporary:
+        model.file.write(str(temporary))
 
 
 class _BuildingModel(Model):
     """A building in the model. Names of methods are what they make."""
 
     def add_storey(self, s: int) -> Any:
-        """A storey, placed at its floor."""
+        """Return a storey, placed at its floor."""
         z = float(self.map.storeys["floor"][s])
         at = self.create_placement(self.building.ObjectPlacement, 0, 0, z)
         return self.create_rooted("IfcBuildingStorey", f"storey {s}", ObjectPlacement=at, CompositionType="ELEMENT", Elevation=z)
 
     def add_space(self, r: int, floor: Any, level: Array, seen: bool, storeys: list[Any]) -> Any:
-        """A room with its quantities."""
+        """Return a room with its quantities."""
         room = self.map.rooms[r]
         storey = storeys[room["storey"]]
         low, high = (level - storey.Elevation).tolist()
@@ -242,13 +242,13 @@ class _BuildingModel(Model):
         self.create_rooted("IfcRelDefinesByProperties", name, RelatedObjects=[product], RelatingPropertyDefinition=facts)
 
     def add_slab(self, r: int, floor: Any, z: float, storey: Any) -> Any:
-        """The floor of a room."""
+        """Return the floor of a room."""
         body = self.extrude_polygons(floor, z - storey.Elevation - IFC_SLAB, IFC_SLAB)
         at = self.create_placement(storey.ObjectPlacement, 0, 0, 0)
         return self.create_rooted("IfcSlab", f"floor {r}", ObjectPlacement=at, Representation=body, PredefinedType="FLOOR")
 
     def add_ceiling(self, r: int, floor: Any, z: float, storey: Any) -> Any:
-        """The ceiling of a room in which one was seen."""
+        """Return the ceiling of a room in which one was seen."""
         body = self.extrude_polygons(floor, z - storey.Elevation, CEILING_THICKNESS)
         at = self.create_placement(storey.ObjectPlacement, 0, 0, 0)
         return self.create_rooted(
@@ -256,7 +256,7 @@ class _BuildingModel(Model):
         )
 
     def add_wall(self, k: int, wall: Any, storey: Any) -> Any:
-        """A wall with what is known of it."""
+        """Return a wall with what is known of it."""
         low, high = (float(wall[name]) - storey.Elevation for name in ("low", "high"))
         at = self.create_placement(storey.ObjectPlacement, 0, 0, 0)
         body = {
@@ -264,8 +264,8 @@ class _BuildingModel(Model):
             "Representation": self.extrude_polygons(shapely.MultiPolygon([build_wall_polygon(wall)]), low, high - low),
         }
         element = self.create_rooted("IfcWall", f"wall {k}", PredefinedType="NOTDEFINED", **body)
-        facts = [self._create_property("FacesSeen", "IfcInteger", int(wall["faces"]))]
-        self._define(element, self._set("IfcPropertySet", "Topomerge_Wall", k, HasProperties=facts))
+        properties = [self._create_property("FacesSeen", "IfcInteger", int(wall["faces"]))]
+        self._define(element, self._set("IfcPropertySet", "Topomerge_Wall", k, HasProperties=properties))
         sizes = {"Length": float(np.hypot(*(wall["end"] - wall["start"])))}
         if wall["faces"] == 2:  # else its thickness is a guess
             sizes["Width"] = float(wall["thickness"])
@@ -305,7 +305,7 @@ class _BuildingModel(Model):
         return element
 
     def add_door(self, i: int, opening: Any, storey: Any) -> Any:
-        """A door as a box in its opening, or an opening without one as a line on the floor."""
+        """Return a door as a box in its opening, or an opening without one as a line on the floor."""
         across = float(opening["direction"])
         along = np.array([-np.sin(across), np.cos(across)])
         width, height = float(opening["width"]), float(opening["height"])
@@ -322,9 +322,9 @@ class _BuildingModel(Model):
 
     def add_edge_properties(self, i: int, edge: Any, element: Any) -> None:
         """How likely a door, an opening or a flight is one, and whether one could walk through."""
-        facts = [self._create_property("Confidence", "IfcReal", float(edge["confidence"]))]
-        facts += [self._create_property(name, "IfcBoolean", bool(edge[name.lower()])) for name in ("Open", "Half")]
-        self._define(element, self._set("IfcPropertySet", f"Topomerge_{str(edge['kind']).title()}", i, HasProperties=facts))
+        properties = [self._create_property("Confidence", "IfcReal", float(edge["confidence"]))]
+        properties += [self._create_property(name, "IfcBoolean", bool(edge[name.lower()])) for name in ("Open", "Half")]
+        self._define(element, self._set("IfcPropertySet", f"Topomerge_{str(edge['kind']).title()}", i, HasProperties=properties))
 
     def _create_box(self, width: float, height: float) -> Any:
         """What fills an opening or stands before a wall, along x from 0, y to both sides."""
@@ -335,7 +335,7 @@ class _BuildingModel(Model):
         return self.create_shape("Body", "SweptSolid", [solid])
 
     def add_window(self, k: int, pane: Any, storey: Any) -> Any:
-        """A window as a box in its opening, on its sill, and what was seen of it."""
+        """Return a window as a box in its opening, on its sill, and what was seen of it."""
         across, width, height = float(pane["direction"]), float(pane["width"]), float(pane["head"] - pane["sill"])
         along = np.array([-np.sin(across), np.cos(across)])
         x, y, z = pane["centre"] - (*along * width / 2, 0) - self.shift + (0, 0, pane["sill"] - storey.Elevation)
@@ -346,11 +346,11 @@ class _BuildingModel(Model):
         }
         element = self.create_rooted("IfcWindow", f"window {k}", PartitioningType="NOTDEFINED", **sizes, **body)
         seen = self.map.windows[k]
-        facts = [self._create_property("Confidence", "IfcReal", float(seen["confidence"]))]
-        facts += [
+        properties = [self._create_property("Confidence", "IfcReal", float(seen["confidence"]))]
+        properties += [
             self._create_property(f"{end.title()}Seen", "IfcBoolean", bool(np.isfinite(seen[end]))) for end in ("sill", "head")
         ]
-        self._define(element, self._set("IfcPropertySet", "Topomerge_Window", k, HasProperties=facts))
+        self._define(element, self._set("IfcPropertySet", "Topomerge_Window", k, HasProperties=properties))
         return element
 
     def add_flight(self, i: int, edge: Any, storey: Any) -> Any:
@@ -395,7 +395,7 @@ class _BuildingModel(Model):
         return np.flatnonzero(known & landmarks.is_kind("text", "tag", "object")).tolist()  # type: ignore[no-any-return]
 
     def add_annotation(self, k: int, storey: Any) -> Any:
-        """A sign, a tag or an object: its text as the name, its kind as the type."""
+        """Return a sign, a tag or an object: its text as the name, its kind as the type."""
         row = self.map.landmarks.table[k]
         at = self.create_placement(storey.ObjectPlacement, *(row["position"] - self.shift - (0, 0, storey.Elevation)))
         note = self.create_rooted("IfcAnnotation", f"landmark {k}", ObjectPlacement=at, ObjectType=LANDMARK_KINDS[row["kind"]])

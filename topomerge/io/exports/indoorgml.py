@@ -112,8 +112,8 @@ def _list_room_names(map: TopometricMap) -> list[str]:
 def _add_cell(member: Any, map: TopometricMap, name: str, r: int, floor: shapely.MultiPolygon, level: Array) -> None:
     room = map.rooms[r]
     cell = _add_element(member, "CellSpace", f"C{r}")
-    facts = {"storey": int(room["storey"]), "area": f"{room['area']:.2f}", "height": f"{room['height']:.2f}"}
-    _add_description(cell, name, **facts, **{odds: f"{room[odds]:.2f}" for odds in ROOM_ODDS})
+    properties = {"storey": int(room["storey"]), "area": f"{room['area']:.2f}", "height": f"{room['height']:.2f}"}
+    _add_description(cell, name, **properties, **{odds: f"{room[odds]:.2f}" for odds in ROOM_ODDS})
     if not floor.is_empty:
         _add_solid(cell, f"C{r}", max(floor.geoms, key=lambda part: part.area), *level.tolist())
     _add_link(cell, "duality", f"S{r}")
@@ -136,8 +136,8 @@ def _add_solid(cell: Any, id: str, plan: shapely.Polygon, low: float, high: floa
 def _add_wall(member: Any, id: str, wall: Any, plan: shapely.Polygon, low: float, high: float) -> None:
     cell = _add_element(member, "CellSpace", id)
     rooms = " ".join(str(r) for r in wall["rooms"].tolist() if r >= 0)
-    facts = {"kind": "wall", "storey": int(wall["storey"]), "rooms": rooms, "thickness": f"{wall['thickness']:.2f}"}
-    _add_description(cell, f"wall {id[1:]}", **facts, measured=str(int(wall["faces"]) == 2).lower())
+    properties = {"kind": "wall", "storey": int(wall["storey"]), "rooms": rooms, "thickness": f"{wall['thickness']:.2f}"}
+    _add_description(cell, f"wall {id[1:]}", **properties, measured=str(int(wall["faces"]) == 2).lower())
     _add_solid(cell, id, plan, low, high)
 
 
@@ -193,8 +193,8 @@ def _add_polygon(parent: Any, id: str, rings: list[Array]) -> None:
 def _add_boundary(member: Any, i: int, edge: Any) -> None:
     boundary = _add_element(member, "CellSpaceBoundary", f"B{i}")
     kind = str(edge["kind"])
-    facts = {"kind": kind, "width": f"{edge['width']:.2f}", **{k: str(bool(edge[k])).lower() for k in ("open", "half")}}
-    _add_description(boundary, f"{kind} {i}", **facts, confidence=f"{edge['confidence']:.2f}")
+    properties = {"kind": kind, "width": f"{edge['width']:.2f}", **{k: str(bool(edge[k])).lower() for k in ("open", "half")}}
+    _add_description(boundary, f"{kind} {i}", **properties, confidence=f"{edge['confidence']:.2f}")
     _add_link(boundary, "duality", f"T{i}")
     a, b = compute_jambs(edge)
     up = np.array([0.0, 0.0, float(edge["height"]) or UNSEEN_LINTEL])
@@ -204,8 +204,8 @@ def _add_boundary(member: Any, i: int, edge: Any) -> None:
 
 def _add_window(member: Any, k: int, window: Any, pane: Any) -> None:
     boundary = _add_element(member, "CellSpaceBoundary", f"P{k}")
-    facts = {name: f"{window[name]:.2f}" for name in ("width", "sill", "head", "confidence") if np.isfinite(window[name])}
-    _add_description(boundary, f"window {k}", kind="window", **facts)
+    properties = {name: f"{window[name]:.2f}" for name in ("width", "sill", "head", "confidence") if np.isfinite(window[name])}
+    _add_description(boundary, f"window {k}", kind="window", **properties)
     a, b = compute_jambs(pane) + (0, 0, pane["sill"])
     up = np.array([0.0, 0.0, float(pane["head"] - pane["sill"])])
     shape = _add_element(_add_element(boundary, "cellSpaceBoundaryGeometry"), "geometry3D")

@@ -38,5 +38,5 @@ def save(map: TopometricMap, path: Path) -> None:
     las.room, las.storey = map.room, map.find_cell_storeys()
     colours = np.concatenate([assign_room_colours(map), np.array([NO_ROOM], np.uint8)])[map.room].astype(np.uint16) * 257
     las.red, las.green, las.blue = colours.T
-    with replace_on_success(path) as beside, beside.open("wb") as file:
+    with replace_on_success(path) as temporary, temporary.open("wb") as file:
         las.write(file, do_compress=path.suffix.lower() == ".laz")

@@ -24,5 +24,5 @@ def write_xml(root: Any, path: Path) -> None:
         InputError: the path can't be written.
     """
     xml.indent(root)
-    with replace_on_success(path) as beside:
-        xml.ElementTree(root).write(beside, encoding="UTF-8", xml_declaration=True)
+    with replace_on_success(path) as temporary:
+        xml.ElementTree(root).write(temporary, encoding="UTF-8", xml_declaration=True)

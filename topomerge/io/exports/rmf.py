@@ -141,8 +141,8 @@ def _make_unique(name: str, level: _Level) -> str:
 
 
 def _write(text: str, path: Path) -> None:
-    with replace_on_success(path) as beside:
-        beside.write_text(text, encoding="utf-8")
+    with replace_on_success(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def _dump(value: Any) -> str:

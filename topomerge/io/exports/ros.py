@@ -116,9 +116,9 @@ def _compute_levels(map: TopometricMap, rows: Array, first: Array, shape: tuple[
 def _count(at: tuple[Array, Array], above: Array, band: tuple[float, float], edge: float, shape: tuple[int, int]) -> Array:
     """(nx, ny) number of cells in a band of heights above the floor."""
     low, high = max(round(band[0] / edge), 1), max(round(band[1] / edge), 2)
-    there = (above >= low) & (above < high)
+    present = (above >= low) & (above < high)
     count = np.zeros(shape, np.int32)
-    np.add.at(count, (at[0][there], at[1][there]), 1)
+    np.add.at(count, (at[0][present], at[1][present]), 1)
     return count
 
 
@@ -433,7 +433,7 @@ def _save_image(grid: Occupancy, path: Path) -> None:
     image[grid.occupied] = OCCUPIED_PIXEL
     image = np.ascontiguousarray(image.T[::-1])  # rows from the top, y up
     height, width = len(image), len(image[0])
-    with replace_on_success(path) as beside, beside.open("wb") as file:
+    with replace_on_success(path) as temporary, temporary.open("wb") as file:
         file.write(f"P5\n# topomerge: {grid.size:g} m a pixel\n{width} {height}\n255\n".encode("ascii"))
         file.write(image.tobytes())
 
@@ -442,8 +442,8 @@ def _save_yaml(grid: Occupancy, image: str, path: Path) -> None:
     x, y = float(grid.low[0]), float(grid.low[1])
     lines = [f"image: {json.dumps(image)}", "mode: trinary", f"resolution: {grid.size!r}", f"origin: [{x!r}, {y!r}, 0.0]"]
     lines += ["negate: 0", "occupied_thresh: 0.65", "free_thresh: 0.196"]
-    with replace_on_success(path) as beside:
-        beside.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    with replace_on_success(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _save_route(route: Route, name: str, path: Path) -> None:
@@ -459,5 +459,5 @@ def _save_route(route: Route, name: str, path: Path) -> None:
         features.append({"type": "Feature", "properties": properties, "geometry": line})
     head = json.dumps({"type": "FeatureCollection", "name": name, "crs": None})[:-1]
     lines = ",\n".join(json.dumps(feature, allow_nan=False) for feature in features)
-    with replace_on_success(path) as beside:
-        beside.write_text(f'{head}, "features": [\n{lines}\n]}}\n', encoding="utf-8")
+    with replace_on_success(path) as temporary:
+        temporary.write_text(f'{head}, "features": [\n{lines}\n]}}\n', encoding="utf-8")

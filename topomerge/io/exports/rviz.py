@@ -42,14 +42,14 @@ def save(map: TopometricMap, path: Path) -> None:
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     markers = _MarkerFactory()
-    with tempfile.TemporaryDirectory() as made:
-        with Writer(Path(made) / "bag", version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as bag:
+    with tempfile.TemporaryDirectory() as temporary:
+        with Writer(Path(temporary) / "bag", version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as bag:
             for topic, listed in _iter_topics(map, markers):
                 to = bag.add_connection(
                     f"/topomerge/{topic}", ARRAY, typestore=markers.store, offered_qos_profiles=[_build_latched_qos()]
                 )
                 bag.write(to, TOLD_AT, markers.store.serialize_cdr(markers.build_array(listed), ARRAY))
-        (file,) = (Path(made) / "bag").glob("*.mcap")
+        (file,) = (Path(temporary) / "bag").glob("*.mcap")
         with replace_on_success(path) as beside:
             beside.write_bytes(file.read_bytes())
 
@@ -70,16 +70,16 @@ def _iter_topics(map: TopometricMap, markers: _MarkerFactory) -> Iterator[tuple[
     label = partial(markers.build_marker, "TEXT_VIEW_FACING", points=np.zeros((0, 3)), colour=WHITE, scale=(0, 0, LETTERS))
     names = [f"{r} {name}".strip() for r, name in enumerate(find_room_names(map.landmarks, len(map.rooms)))]
     yield "names", [label(at, text=names[at[1]], middle=middles[at[1]]) for at in of_rooms]
-    doors, ways = [], []
+    doors, connections = [], []
     for k, edge in enumerate(map.edges):
         a, b = edge["rooms"].tolist()
         at, centre = (storeys[a], k), edge["centre"] + (0, 0, ABOVE_FLOOR)
         colour = OPEN if edge["open"] else SHUT
         doors.append(markers.build_marker("LINE_LIST", at, compute_jambs(edge) + (0, 0, ABOVE_FLOOR), colour, (2 * LINE, 0, 0)))
         ends = np.array([middles[a], centre, centre, middles[b]])
-        ways.append(markers.build_marker("LINE_LIST", at, ends, WAY, (LINE, 0, 0)))
+        connections.append(markers.build_marker("LINE_LIST", at, ends, WAY, (LINE, 0, 0)))
     yield "doors", doors
-    yield "graph", ways
+    yield "graph", connections
 
 
 def _build_latched_qos() -> Any:
@@ -102,7 +102,7 @@ class _MarkerFactory:
         return get_typestore(Stores.ROS2_HUMBLE)
 
     def build_array(self, markers: list[Any]) -> Any:
-        """A MarkerArray."""
+        """Return a MarkerArray."""
         return self._build_message(ARRAY, markers=markers)
 
     def build_marker(
@@ -115,7 +115,7 @@ class _MarkerFactory:
         text: str = "",
         middle: Any = None,
     ) -> Any:
-        """A marker.
+        """Return a marker.
 
         Args:
             kind: CUBE_LIST, LINE_LIST or TEXT_VIEW_FACING.

@@ -49,8 +49,8 @@ def save(map: TopometricMap, path: Path, transforms: Sequence[FramePose] = ()) -
     if not transforms:
         raise InputError("tf2: needs to know where maps lie; give the folder of a merge or an atlas that brought some together")
     nodes = [_format_node(k, transform) for k, transform in enumerate(transforms)]
-    with replace_on_success(path) as beside:
-        beside.write_text("\n".join(["<launch>", *nodes, "</launch>"]) + "\n", encoding="utf-8")
+    with replace_on_success(path) as temporary:
+        temporary.write_text("\n".join(["<launch>", *nodes, "</launch>"]) + "\n", encoding="utf-8")
 
 
 def _format_node(number: int, transform: FramePose) -> str:
@@ -65,10 +65,10 @@ def _format_node(number: int, transform: FramePose) -> str:
         quaternion = tuple(Rotation.from_matrix(transform.tilted[:3, :3] / pose.scale).as_quat())
     place = dict(zip(("x", "y", "z"), translation, strict=True))
     turn = dict(zip(("qx", "qy", "qz", "qw"), quaternion, strict=True))
-    words = [f"--{name} {float(value)!r}" for name, value in {**place, **turn}.items()]
-    words += [f"--frame-id {transform.parent}", f"--child-frame-id {transform.child}"]
+    arguments = [f"--{name} {float(value)!r}" for name, value in {**place, **turn}.items()]
+    arguments += [f"--frame-id {transform.parent}", f"--child-frame-id {transform.child}"]
     node = f'pkg="tf2_ros" exec="static_transform_publisher" name="map_frame_{number}"'
-    return f"  <node {node} args={quoteattr(' '.join(words))}/>"
+    return f"  <node {node} args={quoteattr(' '.join(arguments))}/>"
 
 
 def read_frame_poses(folder: Path, names: Sequence[str] = ()) -> list[FramePose]:

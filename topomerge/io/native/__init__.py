@@ -196,11 +196,11 @@ def save_joined(form: Format, sources: Sequence[Source], target: Path, doubt: Do
     """
     module: Any = import_module(f"topomerge.io.native.{form.module}")
     try:
-        with replace_on_success(target) as beside:
-            tally: Tally = module.join(sources, beside, doubt or Doubt())
+        with replace_on_success(target) as temporary:
+            tally: Tally = module.join(sources, temporary, doubt or Doubt())
             if form.companion:
                 with replace_on_success(target.with_suffix(form.companion)) as companion:
-                    beside.with_suffix(form.companion).replace(companion)
+                    temporary.with_suffix(form.companion).replace(companion)
     except InputError:
         raise
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, struct.error) as error:

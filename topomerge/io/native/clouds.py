@@ -42,8 +42,8 @@ def join(sources: Sequence[Source], target: Path, doubt: Doubt) -> Tally:
     first = next(read_chunks(source.path, chunk=SAMPLE))
     near = source.motion.move_points(first.points.astype(np.float64) + first.shift).mean(axis=0)
     done = save_transformed_points(source.path, target, source.motion.move_points, near, same_frame=source.motion.still)
-    told = (f"{source.path}: {done.beyond:,} points are too far from all others for LAS and are left out",)
-    return Tally({"points": (done.written + done.beyond, done.written)}, told if done.beyond else ())
+    messages = (f"{source.path}: {done.beyond:,} points are too far from all others for LAS and are left out",)
+    return Tally({"points": (done.written + done.beyond, done.written)}, messages if done.beyond else ())
 
 
 def _save_ply(source: Source, target: Path) -> int:

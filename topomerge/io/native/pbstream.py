@@ -84,11 +84,11 @@ def join(sources: Sequence[Source], target: Path, doubt: Doubt) -> Tally:
         _write(out, _encode([(OPTIONS, BYTES, b"".join(_move_options(state) for state in states))]))
         for state in states:
             _guard(state.source.path, partial(_copy, state, out))
-    again = _guard(target, partial(_read_state, Source(target), 0))
+    reread = _guard(target, partial(_read_state, Source(target), 0))
     before: Counter[str] = sum((state.counts for state in states), Counter())
-    counts = {name: (before[name], again.counts[name]) for name in dict.fromkeys([*NAMES.values(), "landmarks"])}
+    counts = {name: (before[name], reread.counts[name]) for name in dict.fromkeys([*NAMES.values(), "landmarks"])}
     links = sum(state.graph.constraints for state in states) + between
-    return Tally(counts | {"links": (links, again.graph.constraints), "links between sessions": (between, between)})
+    return Tally(counts | {"links": (links, reread.graph.constraints), "links between sessions": (between, between)})
 
 
 def _guard(path: Path, act: Callable[[], _State]) -> _State:

@@ -71,10 +71,10 @@ def read_pose_graph(path: Path) -> PoseGraph:
     graph = PoseGraph()
     with path.open(encoding="utf-8", errors="replace") as stream:
         for number, line in enumerate(stream, 1):
-            words = line.split("#", 1)[0].split()
-            if words:
+            fields = line.split("#", 1)[0].split()
+            if fields:
                 try:
-                    _parse_line(graph, words)
+                    _parse_line(graph, fields)
                 except (ValueError, OverflowError) as error:
                     raise InputError(f"{path}: line {number}: {str(error)[:120]}; export the graph again") from error
     if not graph.vertices:
@@ -176,9 +176,9 @@ def join(sources: Sequence[Source], target: Path, doubt: Doubt) -> Tally:
     for a, i, b, j in find_nearest_links([np.array([joined.vertices[k].pose[:3, 3] for k in own]) for own in nodes]):
         joined.edges.append(_build_edge(joined, nodes[a][i], nodes[b][j], doubt))
     target.write_text(format_pose_graph(joined), encoding="utf-8")
-    again = read_pose_graph(target)
+    reread = read_pose_graph(target)
     vertices = sum(len(graph.vertices) for graph in graphs)
-    counts = {"nodes": (vertices, len(again.vertices)), "links": (len(joined.edges), len(again.edges))}
+    counts = {"nodes": (vertices, len(reread.vertices)), "links": (len(joined.edges), len(reread.edges))}
     between = len(joined.edges) - count
     return Tally(counts | {"links between sessions": (between, between)}, tuple(warnings))
 

@@ -88,7 +88,7 @@ def join(sources: Sequence[Source], target: Path, doubt: Doubt) -> Tally:
     _check_versions(sessions)
     target.unlink(missing_ok=True)
     newest = max(sessions, key=lambda session: session.version)
-    warnings = [f"{session.source.path}: {words}" for session in sessions for words in session.said]
+    warnings = [f"{session.source.path}: {text}" for session in sessions for text in session.said]
     with closing(sqlite3.connect(target, uri=True, isolation_level=None)) as base:
         base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_BLOB)
         for setting in ("trusted_schema = OFF", "journal_mode = OFF", "synchronous = OFF"):
@@ -143,13 +143,13 @@ def _read_session(source: Source) -> _Session:
             base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_BLOB)
             base.execute("PRAGMA trusted_schema = OFF")
             version = read_version(path, base)
-            said: list[str] = []
-            poses = read_poses(path, base, version, said)
+            warnings: list[str] = []
+            poses = read_poses(path, base, version, warnings)
             tables = _read_columns(path, base)
             stamp = ""
             if "time_enter" in tables.get("Info", {}):
                 stamp = str(base.execute("SELECT MAX(time_enter) FROM Info").fetchone()[0])
-            return _Session(source, version, poses, tables, tuple(said), stamp if STAMP.fullmatch(stamp) else "")
+            return _Session(source, version, poses, tables, tuple(warnings), stamp if STAMP.fullmatch(stamp) else "")
     except sqlite3.Error as error:
         raise build_damage_error(path, RTABMAP_KIND, error) from error
 
@@ -246,16 +246,16 @@ def _get_most(base: sqlite3.Connection, schema: str, kind: str) -> int:
 
 def _renumber_tags(session: _Session, placed: dict[int, Array], joined: dict[int, Array]) -> tuple[dict[int, int], list[str]]:
     """New numbers of tags that lie elsewhere in the sessions before, where they are other ones."""
-    told: list[str] = []
+    reported: list[str] = []
     fresh: dict[int, int] = {}
     for tag in sorted((k for k in placed if k < 0 and k in joined), reverse=True):
         apart = float(np.linalg.norm(placed[tag][:3, 3] - joined[tag][:3, 3]))
         if apart > SAME_TAG:
             fresh[tag] = min(itertools.chain(placed, joined, fresh.values())) - 1
-            told.append(
+            reported.append(
                 f"{session.source.path}: tag {-tag} lies {apart:.1f} m from that of an earlier one; it is now {-fresh[tag]}"
             )
-    return fresh, told
+    return fresh, reported
 
 
 def _copy_table(base: sqlite3.Connection, name: str, session: _Session, steps: dict[str, Any], tags: dict[int, int]) -> None:

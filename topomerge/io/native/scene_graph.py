@@ -101,13 +101,13 @@ def join(sources: Sequence[Source], target: Path, doubt: Doubt) -> Tally:
         merged += len(pairs)
         joined = _unite(joined, fresh, pairs, source.path.name)
     target.write_text(json.dumps(_build_file(joined), allow_nan=False), encoding="utf-8")
-    again = read_scene_graph(target)
+    reread = read_scene_graph(target)
     for name, layer in LAYERS.items():
-        counts[name][1] = len(again.list_nodes(layer))
+        counts[name][1] = len(reread.list_nodes(layer))
     agents = sum(len(graph.nodes) for graph in graphs) - sum(before for before, _ in counts.values())
     tally = {name: (before, after) for name, (before, after) in counts.items()}
-    tally["other nodes"] = (agents, len(again.nodes) - sum(after for _, after in counts.values()))
-    return Tally(tally | {"nodes that are one": (merged, merged), "links": (edges, len(again.edges))})
+    tally["other nodes"] = (agents, len(reread.nodes) - sum(after for _, after in counts.values()))
+    return Tally(tally | {"nodes that are one": (merged, merged), "links": (edges, len(reread.edges))})
 
 
 def read_scene_graph(path: Path) -> _Graph:

@@ -65,8 +65,8 @@ def join(sources: Sequence[Source], target: Path, doubt: Doubt) -> Tally:
     pictures = len(entries) - scans
     counts = {"scans": (scans, scans), "pictures": (pictures, pictures)}
     bent = source.motion.warp is not None
-    told = f"{source.path}: its map is bent; each scan is moved as a whole, as the map is moved at its scanner"
-    return Tally(counts, (told,) if bent else ())
+    text = f"{source.path}: its map is bent; each scan is moved as a whole, as the map is moved at its scanner"
+    return Tally(counts, (text,) if bent else ())
 
 
 def _read_inner(stream: IO[bytes], place: int, size: int) -> bytes:
@@ -115,8 +115,8 @@ def find_entries(path: Path, xml: bytes) -> list[_Entry]:
         if len(names) == 4 and names[1] in LISTS and name == "pose" and entries:
             entries[-1].pose = (entries[-1].pose[0], xml.index(b">", parser.CurrentByteIndex) + 1) if entries[-1].pose else None
         elif len(names) == 6 and names[3] == "pose" and names[1] in LISTS:
-            words = "".join(text).strip()
-            entries[-1].values[f"{names[4]}.{name}"] = float(words) if words else 0.0
+            description = "".join(text).strip()
+            entries[-1].values[f"{names[4]}.{name}"] = float(description) if description else 0.0
         names.pop()
 
     parser.StartElementHandler, parser.EndElementHandler = begin, end

@@ -62,9 +62,9 @@ def _detect_layout(path: Path) -> str | None:
     lines = lines[:-1] if len(lines) > 1 and not lines[-1].endswith("\n") else lines
     rows = []
     for line in lines:
-        words = line.split("#", 1)[0].replace(",", " ").split()
+        fields = line.split("#", 1)[0].replace(",", " ").split()
         try:
-            rows += [[float(word) for word in words]] if words else []
+            rows += [[float(word) for word in fields]] if fields else []
         except ValueError:
             return None
     if not rows or len({len(row) for row in rows}) > 1:
@@ -141,8 +141,8 @@ def _write(path: Path, target: Path, layout: str, numbers: list[int], rows: Arra
                 continue
             body, mark, rest = line.partition("#")
             parts = re.split(r"([\s,]+)", body)  # words at even places unless the line begins with blanks
-            words = [k for k, part in enumerate(parts) if part and not re.fullmatch(r"[\s,]+", part)]
-            for column, k in list(enumerate(words))[ahead:behind]:
+            elements = [k for k, part in enumerate(parts) if part and not re.fullmatch(r"[\s,]+", part)]
+            for column, k in list(enumerate(elements))[ahead:behind]:
                 parts[k] = format_number(parts[k], float(fresh[number][column]))
             out.write("".join(parts) + mark + rest)
 

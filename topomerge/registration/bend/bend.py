@@ -104,14 +104,14 @@ class Bend:
     reason: str = ""
 
     def bend_points(self, points: Array) -> Array:
-        """Points (n, 3) of b, moved so that the transform alone lays them where bending lays them on an unbent map a."""
-        laid = self.transform.apply(self.deformations[1].apply(points))
-        return self.transform.inverse().apply(self.deformations[0].undo(laid))
+        """Return points (n, 3) of b, moved so that the transform alone lays them where bending lays them on an unbent map a."""
+        placed = self.transform.apply(self.deformations[1].apply(points))
+        return self.transform.inverse().apply(self.deformations[0].undo(placed))
 
     def unbend_points(self, points: Array) -> Array:
         """Return the inverse of `relative`."""
-        laid = self.deformations[0].apply(self.transform.apply(points))
-        return self.deformations[1].undo(self.transform.inverse().apply(laid))
+        placed = self.deformations[0].apply(self.transform.apply(points))
+        return self.deformations[1].undo(self.transform.inverse().apply(placed))
 
     def inverse(self) -> Bend:
         """Return the same bending seen from b."""

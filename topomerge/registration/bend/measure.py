@@ -87,7 +87,7 @@ def _build_rasters(fields: PlanFields, main: float) -> tuple[Array, Array, Array
 
 
 def sample_walls(pieces: Pieces) -> tuple[Array, Array]:
-    """Rows of walls by which each piece is registered, with those near it, and where each piece's begin: (n + 1,)."""
+    """Return rows of walls by which each piece is registered, with those near it, and where each piece's begin: (n + 1,)."""
     rng = np.random.default_rng(0)
     along = np.argsort(pieces.walls[:, 0], kind="stable")  # so that a piece is compared with the walls of its own strip only
     x = pieces.walls[along, 0]
@@ -144,8 +144,8 @@ def measure(
     mean, information = _fit_gaussian(scores, shifts, yaws)
     back = np.eye(3)
     back[:2, :2] = turn.T / into.scale
-    there = np.linalg.inv(back)
-    return moves[chosen] + mean @ back.T, there.T @ information @ there
+    inverse = np.linalg.inv(back)
+    return moves[chosen] + mean @ back.T, inverse.T @ information @ inverse
 
 
 def _fit_gaussian(scores: Array, shifts: Array, yaws: Array) -> tuple[Array, Array]:
@@ -241,11 +241,11 @@ def measure_lines(
     enough = partners >= LEAST_PARTNERS
     own = np.eye(3)  # the target's frame -> that of the pieces
     own[:2, :2] = into.inverse().matrix[:2, :2]
-    there = np.linalg.inv(own)
+    inverse = np.linalg.inv(own)
     h, g = h[enough], g[enough]
     steps = -np.einsum("kij,kj->ki", np.linalg.pinv(h, rcond=1e-4, hermitian=True), g)
     certain = _bound_information(h / (INDEPENDENT * LINE_NOISE**2))
-    return chosen[enough], moves[chosen[enough]] + steps @ own.T, there.T @ certain @ there, sums[enough].sum(axis=0)
+    return chosen[enough], moves[chosen[enough]] + steps @ own.T, inverse.T @ certain @ inverse, sums[enough].sum(axis=0)
 
 
 def _bound_information(information: Array) -> Array:

@@ -77,8 +77,8 @@ def _cut_storey_crops(v: PlanFields, w: PlanFields, pose: Sim3) -> Crops:
     places = (low + (index + 0.5) * CROP_PIXEL) @ axes  # in a's frame
     back = pose.inverse()
     flat = places.reshape(-1, 2)
-    there = back.apply(np.column_stack([flat, np.zeros(len(flat))]))[:, :2].reshape(places.shape)
-    drawn = (_draw_layers(v, places, 1.0), _draw_layers(w, there, pose.scale))
+    placed = back.apply(np.column_stack([flat, np.zeros(len(flat))]))[:, :2].reshape(places.shape)
+    drawn = (_draw_layers(v, places, 1.0), _draw_layers(w, placed, pose.scale))
     seen = np.asarray((drawn[0][0] & 7 > 0) & (drawn[1][0] & 7 > 0))
     middle, area = _select_tiles(seen)
     if not len(area):
@@ -86,8 +86,8 @@ def _cut_storey_crops(v: PlanFields, w: PlanFields, pose: Sim3) -> Crops:
     drawn = (drawn[0], (drawn[1][0], level_ceilings(drawn[1], drawn[0])))
     parts, ceiling = (np.stack([_cut(d[k], middle) for d in drawn], axis=1) for k in (0, 1))
     at = np.column_stack([(low + (middle + 0.5) * CROP_PIXEL) @ axes, np.full(len(middle), v.plan.floor_guess)])
-    looked = np.stack([_detect_observed_heights(v.plan), _detect_observed_heights(w.plan)]).astype(np.float32)
-    return Crops(parts, ceiling, np.repeat(looked[None], len(area), axis=0), at, area)
+    examined = np.stack([_detect_observed_heights(v.plan), _detect_observed_heights(w.plan)]).astype(np.float32)
+    return Crops(parts, ceiling, np.repeat(examined[None], len(area), axis=0), at, area)
 
 
 def _find_common_box(a: StoreyPlan, b: StoreyPlan, pose: Sim3, axes: Array) -> tuple[Array, Array]:
@@ -170,7 +170,7 @@ PLACE_SIGNATURE = Signature(
 )
 
 
-def compute_planes(parts: Array, ceiling: Array, looked: Array) -> Array:
+def compute_planes(parts: Array, ceiling: Array, observed: Array) -> Array:
     """(k, SIDE / 4, SIDE / 4, PLANES) float32 of squares as in `Crops`, each the mean over 4 x 4 pixels. Which map is the first
     changes nothing.
 
@@ -187,7 +187,7 @@ def compute_planes(parts: Array, ceiling: Array, looked: Array) -> Array:
     out += _compare_layers(bit["wall"], empty, near["wall"])
     out += _compare_layers(bit["clutter"] & ~near["wall"], empty, standing)
     for n, name in enumerate(HEIGHT_PARTS):
-        seen = explored & (looked[:, :, 1 + n, None, None] > 0)
+        seen = explored & (observed[:, :, 1 + n, None, None] > 0)
         there = bit[name] & seen & ~near["wall"]
         out += _compare_layers(there, seen & ~near[name] & bit["free"], near[name])
     roof = bit["ceiling"] & bit["free"]
@@ -198,7 +198,7 @@ def compute_planes(parts: Array, ceiling: Array, looked: Array) -> Array:
     out += [both, both * gap, both & (gap > 1)]
     usual = np.clip(height - USUAL_CEILING, -1, 2) * roof
     out += [usual.sum(axis=1) / np.maximum(roof.sum(axis=1), 1)]
-    sliced = np.broadcast_to(looked[:, :, 0].max(axis=1)[:, None, None], both.shape)
+    sliced = np.broadcast_to(observed[:, :, 0].max(axis=1)[:, None, None], both.shape)
     out += [bit["wall"].any(axis=1), bit["clutter"].any(axis=1), sliced]
     return np.stack([_pool_mean(layer) for layer in out], axis=-1)
 
