@@ -230,7 +230,8 @@ def refuse_open_database(path: Path) -> None:
         companion = path.with_name(path.name + ending)
         if companion.is_file() and companion.stat().st_size:
             raise InputError(
-                f"{path}: is being written, or was cut off ({companion.name} lies there); close RTAB-Map, or open it there once"
+                f"{path}: is being written, or was cut off ({companion.name} lies beside it); close RTAB-Map, or open it "
+                "there once"
             )
 
 
