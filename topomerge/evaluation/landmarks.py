@@ -100,8 +100,8 @@ def measure(settings: Settings, log_line: LogFn) -> list[Row]:
     """Measure the pairs that are missing."""
     if settings.data.set in ALONE:
         path = Path(settings.cache) / "evaluation" / f"{settings.data.set}.jsonl"
-        items = {name: (k, ALONE[settings.data.set]) for k, name in enumerate(list_inputs(settings))}
-        return measure_missing(path, items, measure_building, log_line, settings, compute_code_digest(__name__))
+        buildings = {name: (k, ALONE[settings.data.set]) for k, name in enumerate(list_inputs(settings))}
+        return measure_missing(path, buildings, measure_building, log_line, settings, compute_code_digest(__name__))
     recipe = make_recipe(settings)
     sharing = _Sharing(settings.cache, settings.jobs)
     files = {path.stem: path for path in build_lookalikes(recipe, sharing, log_line)[0]}
