@@ -192,6 +192,7 @@ def source_name(path: str) -> str:
     return name if name.startswith("topomerge") else f"topomerge.{name}"
 
 
+@pytest.mark.longer
 def test_yaml_of_extend_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the page adds can be named in a training, from a folder of one's own."""
     pytest.importorskip("hydra")

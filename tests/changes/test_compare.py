@@ -157,6 +157,7 @@ def test_storeys_are_told_apart() -> None:
     assert not found.changes and sorted(found.compared) == [0, 1]
 
 
+@pytest.mark.longer
 def test_aligned_as_in_a_merge() -> None:
     placement, reason, _ = tm.align_maps(flat_map(), flat_map(frame=TURNED, wall=True), threshold=0.0)
     assert placement is not None and reason.startswith("aligned: ")

@@ -78,6 +78,7 @@ def test_a_scan_that_lies_off_as_a_whole_deviates_nowhere(model: list[ModelEleme
     assert all(abs(row.shift) < 0.008 for row in rows.values() if np.isfinite(row.shift))
 
 
+@pytest.mark.longer
 def test_a_wall_that_is_not_there_is_missing_and_one_that_is_not_modelled_is_new(
     model: list[ModelElement], built: TopometricMap
 ) -> None:

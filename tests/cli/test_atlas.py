@@ -42,6 +42,7 @@ def run(capsys: pytest.CaptureFixture[str], folder: Path, monkeypatch: pytest.Mo
     return call
 
 
+@pytest.mark.longer
 def test_listing(run: Run) -> None:
     status, out, err = run("atlas", "list", "house")
     assert status == 0 and err == ""

@@ -57,6 +57,7 @@ def choose(jobs: int, **others: Any) -> argparse.Namespace:
     return argparse.Namespace(quiet=True, jobs=jobs, **others)
 
 
+@pytest.mark.longer
 def test_any_number_of_processes_gives_the_same_maps(clouds: list[str], began: list[str]) -> None:
     topomerge.save_map(topomerge.extract(np.load("a.npy")), "d.tmap")
     paths = [clouds[0], "d.tmap", *clouds[1:]]

@@ -75,6 +75,7 @@ NEVER_FOR_ONE_MAP = (
 ONLY_TO_EXTRACT = ("scipy.spatial", "scipy.ndimage", "scipy.sparse", "shapely", "onnxruntime", "topomerge.extraction")
 
 
+@pytest.mark.longer
 def test_a_command_imports_only_what_it_uses(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", two_rooms().points())
     code = """

@@ -111,6 +111,7 @@ def test_hard_negatives_share_nothing(tmp_path: Path, hard: str) -> None:
     assert (facts["T_ab"] is None) == (hard != "other-storey")
 
 
+@pytest.mark.longer
 def test_signs_lie_beside_the_clouds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["simulate", "--building", "office", "--rooms", "5", "--seed", "5", "--overlap", "0.8", "-q"]
     for folder, signs in (("x", "good"), ("y", "good"), ("z", "poor")):

@@ -40,6 +40,7 @@ def test_once(run: Run, scans: Path) -> None:
     assert json.loads((Path("site") / "watch.json").read_text())["format"] == 1
 
 
+@pytest.mark.longer
 def test_what_simulate_wrote_beside_clouds_is_passed_over(run: Run, scans: Path) -> None:
     words = ("simulate", "--building", "house", "--rooms", "3", "--sensors", "tls", "-q", "-o", "pair")
     assert run(*words) == (0, "", "")

@@ -129,6 +129,7 @@ def test_a_damaged_journal_is_named_by_every_command(edit: Run) -> None:
     assert edit.run("info", "a.tmap", "--no-edits")[0] == 0  # type: ignore[attr-defined]
 
 
+@pytest.mark.longer
 def test_a_scan_that_is_extracted_again_keeps_its_corrections(edit: Run) -> None:
     edit("--join-rooms", "0,2")
     append_edits("a.edits.jsonl", [build_edit("delete_door", at=[40, 40, 0])])
@@ -168,6 +169,7 @@ def merged(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.longer
 def test_decisions_hold_when_a_merge_is_run_again(merged: Path, run: Run) -> None:
     shutil.copytree(merged, "x")
     names = ("x/a.tmap", "x/b.tmap", "-o", "x/merged")
@@ -197,6 +199,7 @@ def test_decisions_hold_when_a_merge_is_run_again(merged: Path, run: Run) -> Non
     assert status == 0 and "edit 2 (accept_merge) no longer applies: map 0 was x/a.tmap, and is x/b.tmap now" in err
 
 
+@pytest.mark.longer
 def test_matched_rooms_place_a_map(merged: Path, run: Run) -> None:
     shutil.copytree(merged, "x")
     run("merge", "x/a.tmap", "x/b.tmap", "-o", "x/merged", "-q")
@@ -231,6 +234,7 @@ def test_decisions_that_do_not_apply_are_told() -> None:
     assert decisions.poses[0, 1] == tm.Sim3()
 
 
+@pytest.mark.longer
 def test_of_three_maps_a_pair_is_kept_apart() -> None:
     maps = [office_map(0), office_map(1), office_map(2)]
     free = tm.merge(maps)
@@ -241,6 +245,7 @@ def test_of_three_maps_a_pair_is_kept_apart() -> None:
     assert sorted(held.transforms) == [2]
 
 
+@pytest.mark.longer
 def test_an_atlas_is_put_together_with_the_corrections_of_its_maps(tmp_path: Path) -> None:
     folder = tmp_path / "atlas"
     add(folder, [("west", office_map(0)), ("east", office_map(2))], tm.render_atlas_html)

@@ -93,6 +93,7 @@ def folder(run: Run) -> Run:
     return run
 
 
+@pytest.mark.longer
 def test_corrected_maps_become_captures_pairs_and_true_rooms(folder: Run, tmp_path: Path) -> None:
     status, out, err = folder("dataset", "from-edits", "maps", "-o", "data")
     assert status == 0 and err == ""
@@ -123,6 +124,7 @@ def test_corrected_maps_become_captures_pairs_and_true_rooms(folder: Run, tmp_pa
     )
 
 
+@pytest.mark.longer
 def test_what_teaches_nothing_is_told(folder: Run, run: Run) -> None:
     assert "no such folder" in run("dataset", "from-edits", "none", "-o", "data")[2]
     Path("empty").mkdir()

@@ -146,6 +146,7 @@ def build_layer_of_somebody_else(kind: str, settings: Node, channels: int):
     return Gps(channels, along, heads=settings.heads, norm="layer_norm", dropout=0.0)
 
 
+@pytest.mark.longer
 def test_a_network_that_reads_landmarks_is_exported_and_says_the_same_of_maps_without_to_the_bit(torch, tmp_path):
     """Of a map without landmarks, rows are those of the network without the part; signs change the rows of a map that has any."""
     from topomerge.models.embedder import Embedder
@@ -167,6 +168,7 @@ def test_a_network_that_reads_landmarks_is_exported_and_says_the_same_of_maps_wi
     compare(ours, reads, {"marked": build_graph_arrays(marked)})
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("kind", ["transformer", "gps"])
 def test_a_node_encoder_of_somebody_else_trains_is_exported_and_loads(torch, tmp_path, monkeypatch, kind):
     """Registered by one line. Those who load it need not know it."""
@@ -212,6 +214,7 @@ def test_attention_between_rooms_stays_within_their_map(torch, monkeypatch):
     assert torch.allclose(rows, torch.cat(alone), atol=1e-5)
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("name", ["gat_around", "one_crop"])
 def test_what_earlier_versions_wrote_is_exported_and_says_the_same(torch, name, tmp_path):
     """Weights of torch, of which the program of then said what is kept here."""

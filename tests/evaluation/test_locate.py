@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tests.fusion.atlas.test_locate import SENSOR, index, scan_part
 from topomerge.evaluation.locate import Settings, classify_outcome, find_true_room, list_inputs, measure_scan, tabulate
 from topomerge.evaluation.tasks import Data
 from topomerge.types import Sim3
 
 
+@pytest.mark.longer
 def test_a_scan_that_is_found_is_right_and_one_under_another_truth_is_wrong() -> None:
     row = measure_scan(index(), scan_part(), (0, Sim3()))
     assert classify_outcome(row) == "right" and row["pose"] and row["among"] and row["away"] < 0.3 and row["seconds"] > 0

@@ -161,6 +161,7 @@ def made_up(folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.longer
 def test_real_sites_are_measured_within_the_gate_only(tmp_path: Path, measures: ModuleType) -> None:
     data = made_up(tmp_path)
     item = measures.SealedItem("merges", "robots' grids", measures.measure_robot_pairs, (data,))

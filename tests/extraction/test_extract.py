@@ -165,6 +165,7 @@ def same(a: TopometricMap, b: TopometricMap) -> bool:
     )
 
 
+@pytest.mark.longer
 def test_same_points_in_any_order_and_chunking_give_the_same_map():
     points = scenes.corridor().points(0.01)
     first = extract(points)

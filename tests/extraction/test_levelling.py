@@ -54,6 +54,7 @@ def ramp(length: float, climb: float) -> np.ndarray:
     return scene.wall((0, 0), (0, 2), height=2.6).wall((length, 0), (length, 2), climb, 2.6).points()
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("noise", [0.0, 0.015])
 @pytest.mark.parametrize("degrees", [1.5, 2.0, 5.0, 8.0, 12.0, 15.0, 20.0])
 def test_up_is_found(degrees: float, noise: float) -> None:
@@ -93,6 +94,7 @@ def test_few_points_and_points_of_no_building_say_nothing() -> None:
         assert find_up(points) is None
 
 
+@pytest.mark.longer
 def test_rooms_and_doors_are_those_of_the_level_cloud() -> None:
     points = scenes.corridor().points()
     level = tm.extract(points)
@@ -167,6 +169,7 @@ def test_rays_of_a_tilted_scan_start_where_the_sensor_was() -> None:
     assert map.free is not None and map.free.contains(map.free.locate(places)).all()
 
 
+@pytest.mark.longer
 def test_plans_models_and_slices_are_never_levelled(tmp_path: Path) -> None:
     points = tilted(scenes.corridor().points(), 5.0)
     upright = LevelledChunks([PointCloud(points, upright=True)])

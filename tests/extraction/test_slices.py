@@ -32,6 +32,7 @@ def test_rays_are_counted_in_the_columns_that_they_cross():
     assert (passed == along).all() and met[7, 2] == 2 and met[5, 5] == 1 and met.sum() == 3
 
 
+@pytest.mark.longer
 def test_a_slanted_ray_crosses_what_a_fine_walk_along_it_does():
     rng = np.random.default_rng(0)
     for _ in range(20):

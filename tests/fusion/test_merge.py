@@ -59,6 +59,7 @@ def refused(halves, stranger):
     return tm.merge([halves[0], stranger])
 
 
+@pytest.mark.longer
 def test_what_it_may_be_and_what_each_place_says_stand_in_the_listing(merged, refused):
     for result in (merged, refused):
         listing = serialise_merge(result)
@@ -89,6 +90,7 @@ def test_two_halves_are_merged(merged, halves):
     assert merged.maps == halves
 
 
+@pytest.mark.longer
 def test_rooms_are_matched_only_where_walls_are_not_believed(merged, refused, halves):
     assert merged.seconds["embed"] == merged.seconds["match"] == 0
     assert refused.seconds["embed"] > 0 and refused.seconds["match"] > 0
@@ -300,6 +302,7 @@ def remembered(monkeypatch):
     monkeypatch.setattr("topomerge.fusion.pipeline.solve", lambda maps, settings, _: solve(maps, settings, REGISTRATIONS))
 
 
+@pytest.mark.longer
 def test_three_maps_are_merged_by_an_atlas(tmp_path, remembered):
     result = tm.merge([office_map(0), office_map(1), office_map(2)])
     assert result.merged and result.probability > 0.9 and set(result.transforms) == {1, 2}

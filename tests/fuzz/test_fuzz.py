@@ -19,6 +19,7 @@ def faults(folder: Path, seeds: range) -> tuple[int, list[str]]:
     return len(tried), [f"{name} {seed}: {message}" for name, seed, state, message in tried if state == "fault"]
 
 
+@pytest.mark.longer
 def test_a_few_mutants_of_every_format(tmp_path: Path) -> None:
     tried, wrong = faults(tmp_path / "a", range(2))
     assert tried >= 50

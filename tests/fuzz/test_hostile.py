@@ -286,6 +286,7 @@ def test_models_that_are_nested_too_deep(worker: Worker, tmp_path: Path) -> None
         assert worker.ask(str(tmp_path / "a.ifc"))[0] == state, depth
 
 
+@pytest.mark.longer
 def test_names_in_a_model_are_no_references(worker: Worker, tmp_path: Path) -> None:
     text = model_with(tmp_path, "IFCWALL", "#N=IFCWALL('0sf3ISLQz5hRzC9sJf$1AN',$,'wall #N; it''s #N',$,$,$,#72,$,$);")
     read(worker, tmp_path / "a.ifc", text)

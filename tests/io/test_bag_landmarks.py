@@ -141,6 +141,7 @@ def corridor_messages(poses: np.ndarray, depth: str, packed: bool) -> Any:
     return messages
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize(("kind", "depth", "packed"), [("bag", "images", False), ("mcap", "laser", True)])
 def test_signs_and_tags_on_pictures(tmp_path: Path, kind: str, depth: str, packed: bool) -> None:
     """As deep as the points of the bag say, whatever took them."""

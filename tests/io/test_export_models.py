@@ -224,6 +224,7 @@ def test_our_own_reader_finds_the_rooms_of_an_ifc(tmp_path, at):
     assert (points > low - 0.2).all() and (points < high + 0.2).all()
 
 
+@pytest.mark.longer
 def test_a_model_of_a_map_gives_the_map_again(tmp_path):
     pytest.importorskip("ifcopenshell")
     first = topomerge.extract(corridor().points())

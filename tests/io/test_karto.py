@@ -127,6 +127,7 @@ def test_other_archives_are_refused_by_name(folder: Path) -> None:
         assert reason in str(refused.value) and "\n" not in str(refused.value)
 
 
+@pytest.mark.longer
 def test_damaged_files_end_in_one_line(folder: Path) -> None:
     for suffix in (".posegraph", ".data"):
         path = folder / f"room{suffix}"

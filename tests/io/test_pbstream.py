@@ -153,6 +153,7 @@ def test_what_cannot_be_written_truly_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "joined.pbstream").exists()
 
 
+@pytest.mark.longer
 def test_damage_is_told(tmp_path: Path) -> None:
     good = write(tmp_path / "a.pbstream").read_bytes()
     bad = tmp_path / "bad.pbstream"

@@ -51,6 +51,7 @@ def test_cut_short(samples: dict[str, Path], tmp_path: Path, name: str) -> None:
         assert cloud is None or name not in SELF_CHECKING, f"{name} cut to {length} of {len(data)} bytes was read"
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("name", SAMPLE_NAMES)
 def test_flipped_bytes(samples: dict[str, Path], tmp_path: Path, name: str) -> None:
     path, data = source(samples, name, tmp_path)

@@ -79,6 +79,7 @@ def read(module: ModuleType, path: Path, **options: object) -> tuple[np.ndarray,
     return floor.points[:, :2], first.landmarks, first.warnings
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("turned", [0, 90])
 @pytest.mark.parametrize(
     ("texts", "scale"), [(AREAS, ""), (["-"] * 4, "Plan 1:100"), (AREAS, "1 : 50")], ids=["areas", "scale", "both"]
@@ -100,6 +101,7 @@ def test_a_page_with_a_plan(tmp_path: Path, texts: list[str], scale: str, turned
     assert max(parser[0].shape) < pdf.LONGEST_SIDE and (parser[0].mean(axis=2)[-400:, -600:] == 255).all()  # no letters on it
 
 
+@pytest.mark.longer
 def test_resolution_is_what_the_user_says(tmp_path: Path) -> None:
     path = write_pdf(tmp_path / "a.pdf", [draw_flat(AREAS)])
     floor, _, _ = read(pdf, path, resolution=0.1)
@@ -107,6 +109,7 @@ def test_resolution_is_what_the_user_says(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.ptp(floor, axis=0), pixels * 0.1, rtol=0.02)
 
 
+@pytest.mark.longer
 def test_pages(tmp_path: Path) -> None:
     plan = draw_flat(AREAS)
     two = write_pdf(tmp_path / "two.pdf", ["", plan, plan])
@@ -128,6 +131,7 @@ def test_pages(tmp_path: Path) -> None:
     assert len(read(pdf, write_pdf(tmp_path / "one.pdf", ["", plan, ""]))[0]) > 1000
 
 
+@pytest.mark.longer
 def test_a_huge_page_has_bounded_pixels(tmp_path: Path, parser: list[np.ndarray]) -> None:
     path = write_pdf(tmp_path / "a.pdf", [draw_flat(AREAS)], size=(14_400.0, 10_000.0))
     read(pdf, path)
@@ -184,6 +188,7 @@ def test_svg_states_its_scale(tmp_path: Path) -> None:
     assert any("'1:100'" in warning for warning in warnings)
 
 
+@pytest.mark.longer
 def test_what_lies_outside_of_an_svg_is_not_read(tmp_path: Path, parser: list[np.ndarray]) -> None:
     from PIL import Image
 
@@ -238,6 +243,7 @@ def test_a_bomb_of_uses(tmp_path: Path) -> None:
     assert "a.svg" in str(refusal.value) and "\n" not in str(refusal.value)
 
 
+@pytest.mark.longer
 def test_in_a_process_of_its_own(tmp_path: Path) -> None:
     """What the child refuses is told in one line by the parent."""
     write_pdf(tmp_path / "a.pdf", [""])

@@ -65,6 +65,7 @@ def assert_hang(landmarks: Landmarks | None, signs: tuple[Sign, ...], reach: flo
         assert 0.02 < row["sigma"] < 0.3 and row["confidence"] > 0.8
 
 
+@pytest.mark.longer
 def test_signs_and_tags_of_a_folder(tmp_path: Path) -> None:
     pytest.importorskip("rapidocr_onnxruntime", exc_type=ImportError)
     pytest.importorskip("pupil_apriltags", exc_type=ImportError)
@@ -199,6 +200,7 @@ def test_a_square_of_known_size_by_hand() -> None:
     assert place_square(corners, picture, 1e6) is None
 
 
+@pytest.mark.longer
 def test_tags_of_known_size_need_no_depth(tmp_path: Path) -> None:
     """Where the depth has holes at the tags, their size tells the place; a wrong size is told by a wrong distance."""
     pytest.importorskip("pupil_apriltags", exc_type=ImportError)

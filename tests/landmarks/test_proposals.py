@@ -77,6 +77,7 @@ def test_heights_that_are_not_known_are_those_of_the_floors():
     assert best.translation[2] == 3.2 and best.yaw == pytest.approx(TRUE.yaw)
 
 
+@pytest.mark.longer
 def test_a_million_signs_propose_within_bounds():
     """Hostile: of both maps the surest and rarest are looked at; poses are few and finite, and so are strings of an index."""
     rng, count = np.random.default_rng(0), 1_000_000

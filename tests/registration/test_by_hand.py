@@ -30,6 +30,7 @@ def off(pose: Sim3, truth: Sim3, middle) -> float:
     return float(pose_difference(pose, truth, middle)[0])
 
 
+@pytest.mark.longer
 def test_matched_rooms_end_where_the_search_does(pair):
     a, b, pose, rooms = pair
     placed = place_by_hand(a, b, rooms)

@@ -174,6 +174,7 @@ def test_a_refusal_is_the_same_whichever_map_is_first(row):
     assert there.posterior == pytest.approx(back.posterior) and there.reason == back.reason
 
 
+@pytest.mark.longer
 def test_more_in_common_and_more_that_is_stated_never_lower_a_right_pose(points):
     a = grid_of(part(points, high=(16, 99)))
     believed = []

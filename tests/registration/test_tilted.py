@@ -76,6 +76,7 @@ def truth() -> np.ndarray:
     return TILTS[0] @ MOVE.inverse().matrix @ np.linalg.inv(TILTS[1])
 
 
+@pytest.mark.longer
 def test_the_file_is_named(files, maps) -> None:
     for path, map, degrees in zip(files, maps, (6.0, 9.0), strict=True):
         assert map.warnings == (f"{path}: tilted by {degrees:.1f} degrees: levelled",)
@@ -149,6 +150,7 @@ def test_an_atlas_keeps_it(maps, tmp_path: Path) -> None:
     assert stored.compute_relative_poses()
 
 
+@pytest.mark.longer
 def test_points_are_levelled_and_placed(files, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli(["merge", *map(str, files), "-o", str(tmp_path / "m"), "--points"]) == 0
     warned = capsys.readouterr().err.splitlines()

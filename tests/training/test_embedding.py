@@ -368,6 +368,7 @@ def test_a_weight_is_not_touched_by_a_gradient_that_is_no_number(settings, fused
     assert all(p.isfinite().all() for p in network.parameters()) and not torch.equal(before[1], list(network.parameters())[1])
 
 
+@pytest.mark.longer
 def test_an_overflow_of_half_precision_skips_a_step(settings, tmp_path, monkeypatch):
     """A scale of 2^127 makes the first gradients infinite; the scaler halves it until they are not."""
     from lightning_fabric import Fabric

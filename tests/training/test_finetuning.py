@@ -193,6 +193,7 @@ def folder(tmp_path: Path) -> Path:
     return place
 
 
+@pytest.mark.longer
 def test_finetune_keeps_what_helped(folder: Path, tmp_path: Path, monkeypatch, capsys) -> None:
     export_embedder(Embedder(SMALL), tmp_path / "start")
     out = tmp_path / "tuned"

@@ -87,6 +87,7 @@ def test_other_pairs_under_the_name_of_the_set_do_not_go_on(settings, tmp_path):
             fit(here, quiet)
 
 
+@pytest.mark.longer
 def test_a_run_is_replaced_only_where_that_is_asked_for(settings, tmp_path):
     fit(replace(settings, epochs=2), quiet)
     kept = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
@@ -113,6 +114,7 @@ def test_tasks_keep_their_runs_too(tmp_path, monkeypatch):
         train(compose_settings([*words, "resume=true", "pull=0.1"]), quiet)
 
 
+@pytest.mark.longer
 def test_a_run_and_what_it_exports_say_where_they_come_from(settings, tmp_path, cache, monkeypatch):
     monkeypatch.setattr(sys, "orig_argv", ["python", "train.py", "name=a b"])
     fit(replace(settings, export=str(tmp_path / "exported")), quiet)

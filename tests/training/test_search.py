@@ -45,6 +45,7 @@ def read_trials(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(path.read_text()) for path in sorted(folder.glob("trial_*/config.json"))]
 
 
+@pytest.mark.longer
 def test_the_best_trial_is_named_and_is_a_run(words, tmp_path) -> None:
     result = search([*words, "name=x", "search.trials=4", "search.prune=false"])
     trials = read_trials(tmp_path / "x")

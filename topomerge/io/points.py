@@ -37,12 +37,10 @@ from topomerge.types import (
 )
 
 LARGE, HIGH = 2000.0, 100.0  # m, extents beyond what is scanned as one building
-SLAB_THICKNESS, MOST_SLAB_CELLS = 0.1, 1 << 26  # m; cells that are marked, 64 MB: more are sorted
-STOREY_HEIGHT = 4.5  # m
+SLAB_THICKNESS, STOREY_HEIGHT, MOST_SLAB_CELLS = 0.1, 4.5, 1 << 26  # m; m; cells that are marked, 64 MB: more are sorted
 LOWEST_ROOM, HIGHEST_ROOM = 2.0, 3.6  # m, usual heights of a room
-DEGREES_ACROSS = 0.1  # degrees, 11 km: no scan of a building is as wide
+DEGREES_ACROSS, DEGREES_AWAY = 0.1, 1.0  # degrees: 11 km, no building is as wide; from 0, 0, which lies in the sea
 DEGREES_TALLER = 20.0  # times as tall (m) as across (degrees): no building in metres is
-DEGREES_AWAY = 1.0  # degrees from 0, 0, which lies in the sea
 JUDGED_POINTS = 200  # points below which nothing is judged
 
 
@@ -451,8 +449,7 @@ def iter_guarded(path: Path, file_format: Format, blocks: Callable[[Any], Iterat
     """Yield the blocks of a format's reader, with its errors converted to `InputError`.
 
     Args:
-        path: of the file.
-        file_format: its module is the reader.
+        path, file_format: of the file; the format's module is the reader.
         blocks: what to ask of the reader.
 
     Raises:

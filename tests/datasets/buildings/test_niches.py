@@ -51,6 +51,7 @@ def test_niches_lie_in_walls_and_leave_something_behind(seed):
         assert niche["bottom"] < face[2] < niche["top"]
 
 
+@pytest.mark.longer
 def test_the_same_seed_gives_the_same_niches_and_every_room_stays_reachable():
     one, same = (make_building("office", 7, 1, MANY) for _ in range(2))
     assert one.niches.tobytes() == same.niches.tobytes() and len(one.niches) > 20

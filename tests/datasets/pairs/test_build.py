@@ -51,6 +51,7 @@ def contents(cache: Path) -> dict[str, bytes]:
     return {p.relative_to(cache).as_posix(): p.read_bytes() for p in sorted(cache.rglob("*")) if p.is_file() and p.name[0] != "."}
 
 
+@pytest.mark.longer
 def test_what_is_there_is_not_made_again(whole: Path) -> None:
     before = contents(whole)
     report = build(Build(SMALL, str(whole)))

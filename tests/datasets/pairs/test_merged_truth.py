@@ -72,6 +72,7 @@ def folder(tmp_path: Path) -> Path:
     return place
 
 
+@pytest.mark.longer
 def test_a_folder_without_truth(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

@@ -324,6 +324,7 @@ def test_the_building_is_what_its_owner_calls_it() -> None:
     assert find_physical_building("own", "x + y") == "own/x"
 
 
+@pytest.mark.longer
 def test_sets_are_made_once_and_say_what_is_true(houses: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(own_pairs, "extract", lambda *_, **__: pytest.fail("extracted again"))
     sets = build_own_sets(houses, cache)
@@ -374,6 +375,7 @@ def test_rooms_that_match_are_those_of_the_simulator(houses: Path, cache: Path) 
         assert found and len(found & requested) >= 0.5 * len(found), (found, requested)
 
 
+@pytest.mark.longer
 def test_train_and_evaluate(houses: Path, cache: Path, tmp_path: Path) -> None:
     words = ["data=folder", f"path={houses}", f"cache={cache}", f"runs={tmp_path}", "name=own", "logger=none", "epochs=2"]
     best = train(compose_settings([*words, "experiment=surroundings", "batch=1"]), quiet)

@@ -53,6 +53,7 @@ def test_walls_of_a_drawn_map_are_as_full_as_those_of_a_file(edge, tmp_path):
     assert (ours[:, 2:6] == 1).mean() > 0.9
 
 
+@pytest.mark.longer
 def test_flat_items_are_grids_drawings_and_slices():
     items = [draw_item(seed, {}, flat=True) for seed in range(100_000, 100_030)]
     made = [simulate_item_scan(item, None) for item in items[:6]]

@@ -28,6 +28,7 @@ def manifest(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build(Build(THREE, str(cache))).manifest
 
 
+@pytest.mark.longer
 def test_each_file_tells_what_is_true_of_each_two_maps(manifest: Path) -> None:
     rows = [json.loads(line) for line in manifest.read_text().splitlines()]
     assert rows and all(row["sides"] == "abc" and len(row["sensors"]) == 3 for row in rows)

@@ -102,6 +102,7 @@ def test_the_guard_bites(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert leaks(tmp_path, "campus", [*lists, "gone"]) == ["lonely", "school1 and school2", "gone"]
 
 
+@pytest.mark.longer
 @pytest.mark.data
 @pytest.mark.parametrize("source", splits.FOLDERS)
 def test_every_plan_is_in_a_split_with_its_siblings(source: str, data_dir: Path) -> None:

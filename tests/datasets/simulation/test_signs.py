@@ -106,6 +106,7 @@ def test_few_signs_change():
     assert 0.01 < (changed["text"] != signs["text"])[text].mean() < 0.03 and (changed["text"] == signs["text"])[~text].all()
 
 
+@pytest.mark.longer
 def test_signs_of_lookalikes_are_those_of_their_places():
     items = draw_lookalike_items(
         LookalikeRecipe(pairs=dict.fromkeys(LOOKALIKES, 1), again=dict.fromkeys(LOOKALIKES, 1), scaled=0.0)

@@ -22,6 +22,7 @@ def parts() -> dict[str, tm.TopometricMap]:
     return office_parts(6)
 
 
+@pytest.mark.longer
 def test_an_altered_room_does_not_keep_maps_apart(parts) -> None:
     result = merge([parts[name] for name in NAMES])
     assert result.status == "merged" and set(result.transforms) == {1, 2} and result.probability > 0.9

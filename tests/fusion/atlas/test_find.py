@@ -89,6 +89,7 @@ def test_the_map_on_which_it_lies_best_comes_first(house: Path, monkeypatch: pyt
     assert register_sightings(read_atlas(house), office_map(0), turned) == (second, turned[1])
 
 
+@pytest.mark.longer
 def test_maps_that_hold_the_same_rare_strings_come_first(house: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A sign that both hold counts, also where the looks of rooms left the map out; words of all buildings do not."""
     signs = build_landmarks("text", ["4.711", "EXIT"], "r", room=0)

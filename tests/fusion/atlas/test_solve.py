@@ -48,6 +48,7 @@ def right(result: AtlasResult, members: dict[int, int], first: int = 0) -> bool:
     return all(metres < 0.08 and degrees < 0.5 for metres, degrees in gaps)
 
 
+@pytest.mark.longer
 def test_parts_of_a_building_come_together_and_a_stranger_stays_apart(atlas):
     assert atlas.components == ((0, 1, 2, 3), (4,)) and atlas.alone == (4,) and atlas.status == "parted"
     assert right(atlas, {k: k for k in range(4)}) and atlas.transforms[4] == Sim3()

@@ -47,6 +47,7 @@ MAPS = ["maps/east.tmap", "maps/stranger.tmap", "maps/west.tmap"]
 WHOLE = ["atlas.json", "map_0.tmap", *MAPS, "merged_0.ply", "pairs.json", "report.html", "report_stamp.css"]
 
 
+@pytest.mark.longer
 def test_what_is_written(built):
     assert names(built) == WHOLE
     listing = listing_of(built)
@@ -62,6 +63,7 @@ def test_what_is_written(built):
     assert "Some maps are connected" in page and "http" not in page.replace("http-equiv", "")
 
 
+@pytest.mark.longer
 def test_adding_later_is_building_at_once(built, tmp_path):
     later = tmp_path / "later"
     add(later, named(0), tm.render_atlas_html)

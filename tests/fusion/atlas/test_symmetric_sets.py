@@ -47,6 +47,7 @@ def test_maps_of_a_symmetric_arena_are_believed_no_more_than_a_pair(arena: Arena
         assert not turned_wrongly(result, truth)
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize(("arena", "count"), [(Arena(fold=1, seed=12), 4), (Arena(14.0, 9.0, fold=1, seed=11), 3)])
 def test_maps_of_an_arena_that_does_not_repeat_are_joined(arena: Arena, count: int, tmp_path: Path) -> None:
     maps, truth = arena_maps(arena, tmp_path, count)

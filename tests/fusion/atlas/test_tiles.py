@@ -79,6 +79,7 @@ def test_a_small_map_and_one_without_rooms_are_one_tile(large: TopometricMap) ->
     assert len(split_into_tiles(bare)) == 1 and len(select_tile(bare, split_into_tiles(bare)[0]).grid) == len(bare.grid)
 
 
+@pytest.mark.longer
 def test_a_large_joined_map_has_a_page_for_each_tile(tmp_path: Path, small_tiles: None, large: TopometricMap) -> None:
     folder = tmp_path / "house"
     add(folder, [("one", room(0)), ("two", room(1))], tm.render_atlas_html)

@@ -98,6 +98,7 @@ def test_a_journal_is_heard_with_its_settings_only(tmp_path):
     assert Journal(tmp_path, settings) == {}
 
 
+@pytest.mark.longer
 def test_a_worker_loads_a_map_of_many_pairs_once_and_forgets_what_was_laid_at_another_scale(alone, monkeypatch):
     loaded: list[Path] = []
     monkeypatch.setattr(memory, "load_corrected_map", lambda path: loaded.append(path) or load_map(path))
