@@ -26,7 +26,7 @@ from topomerge.extraction.room_odds import add_room_probabilities
 from topomerge.extraction.scan import COARSEST_CELL, FINEST_CELL, Scan
 from topomerge.extraction.slices import is_raised
 from topomerge.extraction.topology import build_topometric_map
-from topomerge.fusion.joined_rooms import JOINED_PARAMETERS, LaidFloor, join_rooms, select_laid_floor
+from topomerge.fusion.joined_rooms import JOINED_PARAMETERS, PartFloor, join_rooms, select_part_floor
 from topomerge.fusion.resampling import decode_cells, encode_cells, find_wall_copies, resample_cells, transform_means, unite_codes
 from topomerge.fusion.transfer import (
     PlacedPart,
@@ -238,7 +238,7 @@ def _build_joined(
     grid = VoxelGrid.from_cells(cells - base, joined.origin + base * joined.edge, joined.edge, properties=tables)
     provenance, label = grid.properties["provenance"], grid.properties["room"]
     grid = replace(grid, properties={})
-    floors = [select_laid_floor(map, lattice - base, rows, grid) for map, (lattice, rows) in laid]
+    floors = [select_part_floor(map, lattice - base, rows, grid) for map, (lattice, rows) in laid]
     if any(len(floor.cells) for floor in floors):
         map = _carry_rooms(grid, label, floors, parts)
         map = replace(map, source=name)
@@ -270,7 +270,7 @@ def _build_free_space(joined: _JoinedCells, grid: VoxelGrid, base: Array) -> Vox
     return free.select_cells(~grid.coarsen(2).contains(free.cells))
 
 
-def _carry_rooms(grid: VoxelGrid, label: Array, floors: Sequence[LaidFloor], parts: Sequence[PlacedPart]) -> TopometricMap:
+def _carry_rooms(grid: VoxelGrid, label: Array, floors: Sequence[PartFloor], parts: Sequence[PlacedPart]) -> TopometricMap:
     """The joined map with the rooms of its parts, and those that were cut anew; doors only of these.
 
     Args:

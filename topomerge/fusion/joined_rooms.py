@@ -37,7 +37,7 @@ JOINED_PARAMETERS = DefaultParameters()
 MOST_CARRIED = 0.5  # of a room that is cut anew, on floor that is carried over: it is a glimpse of that
 
 
-class LaidFloor(NamedTuple):
+class PartFloor(NamedTuple):
     """The floor of a part's rooms on the lattice of the joined map.
 
     Args:
@@ -55,7 +55,7 @@ class LaidFloor(NamedTuple):
     complete: bool
 
 
-def select_laid_floor(part: TopometricMap, cells: Array, rows: Array, grid: VoxelGrid) -> LaidFloor:
+def select_part_floor(part: TopometricMap, cells: Array, rows: Array, grid: VoxelGrid) -> PartFloor:
     """Return the floor of a part's rooms as it lies in the joined grid.
 
     Args:
@@ -67,7 +67,7 @@ def select_laid_floor(part: TopometricMap, cells: Array, rows: Array, grid: Voxe
     complete = standing is not None
     stands = np.ones(len(rows), bool) if standing is None else np.asarray(standing, bool)[rows]
     room, area = part.navigable_room[rows].astype(np.int64), part.navigable_area[rows].astype(np.int64)
-    return LaidFloor(cells[inside], room, area, stands, part.areas["room"], complete)
+    return PartFloor(cells[inside], room, area, stands, part.areas["room"], complete)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,7 @@ class _Columns:
         floors: of the parts.
     """
 
-    def __init__(self, grid: VoxelGrid, floors: Sequence[LaidFloor]) -> None:
+    def __init__(self, grid: VoxelGrid, floors: Sequence[PartFloor]) -> None:
         self.grid = grid
         cells, stands = (np.concatenate(part) for part in zip(*((f.cells, f.standing) for f in floors), strict=True))
         self.navigable = grid.replace_cells(cells, {"standing": stands})
@@ -138,7 +138,7 @@ class _Columns:
         at = np.minimum(np.searchsorted(self.numbers, numbers), len(self.numbers) - 1)
         return np.where(self.numbers[at] == numbers, at, -1)
 
-    def claim(self, floors: Sequence[LaidFloor], values: Sequence[Array]) -> Array:
+    def claim(self, floors: Sequence[PartFloor], values: Sequence[Array]) -> Array:
         """(parts, columns) what each part has on its lowest floor in each column, -1 nothing."""
         out = np.full((len(floors), len(self.numbers)), -1, np.int64)
         for claimed, floor, rows, value in zip(out, floors, self.rows, values, strict=True):
@@ -227,7 +227,7 @@ def _unite_areas(claims: Array, group_of: Array) -> Array:
 
 
 def join_rooms(
-    grid: VoxelGrid, label: Array, floors: Sequence[LaidFloor], tables: Sequence[Array], parts: Sequence[PartRooms]
+    grid: VoxelGrid, label: Array, floors: Sequence[PartFloor], tables: Sequence[Array], parts: Sequence[PartRooms]
 ) -> JoinedFloor:
     """Cut the floor of a joined map into rooms.
 
@@ -275,7 +275,7 @@ def _find_unknown_borders(columns: _Columns, owner: Array, group: Array, part_of
     return out
 
 
-def _carry_over(columns: _Columns, floors: Sequence[LaidFloor], member: Array, owner: Array) -> tuple[CutFloor, Array]:
+def _carry_over(columns: _Columns, floors: Sequence[PartFloor], member: Array, owner: Array) -> tuple[CutFloor, Array]:
     """The floor on which the parts agree, without labels and completeness, and which area each area of the parts became, -1 none.
 
     Args:
