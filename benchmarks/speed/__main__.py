@@ -33,10 +33,8 @@ SMALL: dict[str, dict[str, Any]] = {
     "studio": {"rooms": [10]},
     "bags": {"gigabytes": [0.02], "spacing": 0.1},
 }
-COMPARED: dict[str, dict[str, Any]] = {
-    **{name: SMALL[name] for name in ("voxelise", "networks", "room_search")},
-    "extract_floor": {"points": 100_000, "most": 1, "repeat": 1},
-}
+# Of so few points the thesis' preset finds no room: extract_floor compares nothing in its small form.
+COMPARED: dict[str, dict[str, Any]] = {name: SMALL[name] for name in ("voxelise", "networks", "room_search")}
 RECORDED = Path(__file__).with_name("recorded.json")  # ratios of the small forms
 
 
