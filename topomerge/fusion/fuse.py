@@ -51,7 +51,7 @@ from topomerge.types import JOINED, LEVELLED, Array, Deformation, Placement, Sim
 ALIKE_EDGES = 0.8  # ratio of edge lengths: cells of another map that are not smaller than that keep those of the first
 PROVENANCE_BITS = 32  # maps that one bit set tells apart
 ASSUMED_MARGIN = 0.3  # m around what other maps saw: there an extruded wall is one of theirs that is a little off
-Laid = tuple[Array, Array]  # cells of the joined map that those of a map fill, and which do
+PlacedCells = tuple[Array, Array]  # cells of the joined map that those of a map fill, and which do
 
 
 class MapSequence(Protocol):
@@ -86,12 +86,12 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
     placements = [Placement.of(pose, (bends or {}).get(k), maps[k].grid.edge) for k, pose in poses]
     windows, marks = [], {}
     laid: list[PlacedPart] = []
-    floors: list[tuple[TopometricMap, Laid]] = []
+    floors: list[tuple[TopometricMap, PlacedCells]] = []
     for n in order:
         map = maps[poses[n][0]]
         first_room = sum(len(part.table) for part in laid)
         cells.add_map(map, placements[n], int(first_bits[n]), first_room, parts[n].assumed and n != order[0])
-        floors.append((map, cells.lay_floor(map, placements[n])))
+        floors.append((map, cells.place_floor(map, placements[n])))
         windows.append(transform_windows(map, placements[n]))
         laid.append(transform_part(map, placements[n]))
         if len(map.landmarks):
@@ -171,7 +171,7 @@ class _JoinedCells:
         if free_cells is not None:
             self.free_codes = unite_codes(self.free_codes, encode_cells(free_cells))
 
-    def lay_floor(self, map: TopometricMap, placement: Placement) -> Laid:
+    def place_floor(self, map: TopometricMap, placement: Placement) -> PlacedCells:
         """Return the cells (k, 3) of the lattice that the navigable cells of a map fill, and the row (k,) of one that does."""
         return resample_cells(map.navigable, placement, self.origin, self.edge)
 
@@ -224,7 +224,7 @@ class _JoinedCells:
 
 
 def _build_joined(
-    joined: _JoinedCells, laid: Sequence[tuple[TopometricMap, Laid]], parts: Sequence[PlacedPart], name: str
+    joined: _JoinedCells, laid: Sequence[tuple[TopometricMap, PlacedCells]], parts: Sequence[PlacedPart], name: str
 ) -> TopometricMap:
     """Rooms and narrowings of what was joined, and doors where rooms were cut anew.
 

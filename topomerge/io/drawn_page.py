@@ -75,7 +75,7 @@ def find_page(picture: Array) -> DrawnPage | None:
     if not few and is_blueprint(picture):
         picture = invert_picture(picture)
         mended.append("turned into dark lines on light paper")
-    if photograph and (lit := even_light(picture)) is not None:
+    if photograph and (lit := equalise_light(picture)) is not None:
         picture = lit
         mended.append("lit evenly")
     if not has_bright_border(picture):
@@ -314,7 +314,7 @@ def invert_picture(picture: Array) -> Array:
     return np.repeat(grey[..., None], 3, axis=2)
 
 
-def even_light(picture: Array) -> Array | None:
+def equalise_light(picture: Array) -> Array | None:
     """Return a picture (h, w, 3) without shades and tints of the light; None where it is lit evenly."""
     small, _ = reduce_picture(picture, 4 * LIGHT_SIDE)
     paper = ndimage.percentile_filter(small[::4, ::4], 85, (11, 11, 1))
