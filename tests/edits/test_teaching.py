@@ -19,7 +19,7 @@ from topomerge.edits.apply import apply_edits
 from topomerge.edits.draft import find_room_place
 from topomerge.edits.journal import Edit, append_edits, build_edit, find_journal, read_journal
 from topomerge.errors import InputError
-from topomerge.evaluation.edits import correct_to_truth, save_corrections
+from topomerge.evaluation.edits import GESTURES, SHOWN, correct_to_truth, estimate_minutes, save_corrections
 from topomerge.evaluation.rooms import Settings, list_cases, measure
 from topomerge.evaluation.tasks import Data
 from topomerge.io.maps import load_map, save_map
@@ -135,3 +135,12 @@ def test_what_teaches_nothing_is_told(folder: Run, run: Run) -> None:
     find_journal("maps/a.tmap").write_text("{\n")
     status, _, err = run("dataset", "from-edits", "maps", "-o", "data")
     assert status == 1 and "a.edits.jsonl: line 1" in err
+
+
+def test_minutes_are_of_the_keystroke_level_model() -> None:
+    split = Edit("split_room", {"at": [0.0, 0.0, 0.0], "line": [[0.0, 0.0], [1.0, 0.0]]})  # a thought, S, two clicks
+    join = Edit("join_rooms", {"at": [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]})  # a thought, J, three clicks
+    assert estimate_minutes([], 4) == pytest.approx(4 * 1.35 / 60)
+    assert estimate_minutes([split], 0) == pytest.approx((1.35 + 0.28 + 2 * 1.3) / 60)
+    assert estimate_minutes([join, split], 4) == pytest.approx((4 * 1.35 + 2 * 1.63 + 5 * 1.3) / 60)
+    assert GESTURES.keys() == set(SHOWN)  # whatever the simulated user does has its gesture
