@@ -2,8 +2,8 @@
 
 A simulated user sees the true rooms and doors of a scan and corrects its extracted map, one edit after the other, as somebody
 would in the studio: cuts that are missing, rooms that are one, floor that is no room, then doors. Each edit has to bring the map
-nearer to the truth, and is applied as any other (`topomerge.edits`). Cuts are straight lines. Minutes of a person are computed, not
-timed: the keystroke-level model (Card, Moran and Newell, "The keystroke-level model for user performance time with interactive
+nearer to the truth, and is applied as any other (`topomerge.edits`). Cuts are straight lines. Minutes of a person are computed,
+not timed: the keystroke-level model (Card, Moran and Newell, "The keystroke-level model for user performance time with interactive
 systems", CACM 23, 1980) over the studio's own gestures.
 
 ``data=homes`` (the default): homes as vacuum robots drew them; ``data=dev``: training buildings. The first ten are taken.
@@ -122,8 +122,8 @@ def measure_case(case: Case, scans: Path, data: Path | None, keep: Path | None =
 def estimate_minutes(edits: Sequence[Edit], rooms: int) -> float:
     """Estimate how long a practised person takes in the studio to look at each room once and to make some edits.
 
-    Each room and each edit takes a thought; the one hand is on the mouse, the other one on the keys. What the person must find out
-    about the building is not in it.
+    Each room and each edit takes a thought; the one hand is on the mouse, the other one on the keys. What the person must find
+    out about the building is not in it.
     """
     seconds = THINK * rooms
     for edit in edits:
@@ -314,10 +314,11 @@ def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
         counts = [row["ops"].get(op, 0) for op in SHOWN]
         edits = [row["edits"], f"{row['edits_a_room']:.2f}", *counts, f"{row['minutes']:.1f}"]
         lines.append([row["kind"], row["true_rooms"], *ious, *doors, *edits])
+    minutes = sum(row["minutes"] for row in rows)
     rooms, edits_made = (sum(row[name] for row in rows) for name in ("true_rooms", "edits"))
     text = (
         f"{len(rows)} maps with {rooms} true rooms: {edits_made} edits, {edits_made / max(rooms, 1):.2f} a room "
-        f"(mean over maps {write_mean(rows, 'edits_a_room')}), {sum(row['minutes'] for row in rows):.1f} minutes. Mean IoU {write_mean(rows, 'iou_before')} before and "
+        f"(mean over maps {write_mean(rows, 'edits_a_room')}), {minutes:.1f} minutes. Mean IoU {write_mean(rows, 'iou_before')} before and "
         f"{write_mean(rows, 'iou_after')} after."
     )
     name = (settings.data.set or "homes").replace(",", "-")
