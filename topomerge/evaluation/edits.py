@@ -3,8 +3,8 @@
 A simulated user sees the true rooms and doors of a scan and corrects its extracted map, one edit after the other, as somebody
 would in the studio: cuts that are missing, rooms that are one, floor that is no room, then doors. Each edit has to bring the map
 nearer to the truth, and is applied as any other (`topomerge.edits`). Cuts are straight lines. Minutes of a person are computed,
-not timed: the keystroke-level model (Card, Moran and Newell, "The keystroke-level model for user performance time with interactive
-systems", CACM 23, 1980) over the studio's own gestures.
+not timed: the keystroke-level model (Card, Moran and Newell, "The keystroke-level model for user performance time with
+interactive systems", CACM 23, 1980) over the studio's own gestures.
 
 ``data=homes`` (the default): homes as vacuum robots drew them; ``data=dev``: training buildings. The first ten are taken.
 """
@@ -318,8 +318,8 @@ def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
     rooms, edits_made = (sum(row[name] for row in rows) for name in ("true_rooms", "edits"))
     text = (
         f"{len(rows)} maps with {rooms} true rooms: {edits_made} edits, {edits_made / max(rooms, 1):.2f} a room "
-        f"(mean over maps {write_mean(rows, 'edits_a_room')}), {minutes:.1f} minutes. Mean IoU {write_mean(rows, 'iou_before')} before and "
-        f"{write_mean(rows, 'iou_after')} after."
+        f"(mean over maps {write_mean(rows, 'edits_a_room')}), {minutes:.1f} minutes. "
+        f"Mean IoU {write_mean(rows, 'iou_before')} before and {write_mean(rows, 'iou_after')} after."
     )
     name = (settings.data.set or "homes").replace(",", "-")
     return {"corrections" if name == "homes" else f"corrections-{name}": f"{text}\n\n{write_table(HEADS, lines)}"}
