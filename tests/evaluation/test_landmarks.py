@@ -1,7 +1,10 @@
 """The table of look-alikes with signs: what counts as wrong and as right."""
 
 import numpy as np
+import pytest
 
+from topomerge.errors import InputError
+from topomerge.evaluation import sign_readers
 from topomerge.evaluation.landmarks import (
     READ_ALONE,
     READINGS,
@@ -12,6 +15,8 @@ from topomerge.evaluation.landmarks import (
     measure_building,
     tabulate,
 )
+from topomerge.evaluation.sign_readers import draw_sign, measure_reader, tabulate_readers
+from topomerge.io import pictures
 
 
 def row(kind, again, reading, believed, right, landmarks):
@@ -53,3 +58,39 @@ def test_signs_alone_are_scored_and_tabulated(tmp_path):
     wrong = [[name, relation, -5.0 if relation else 5.0] for name in READ_ALONE for relation in ("",) * 4 + (*RELATIONS,)]
     table = tabulate([{"scored": wrong}], settings)["landmark-odds"]
     assert table.count("| 1 | " + " | ".join(["5.007", "1.000"] * 5)) == len(READ_ALONE)
+
+
+@pytest.mark.parametrize("height", [10, 40])
+def test_a_sign_has_letters_of_the_height_that_is_asked_for(height):
+    picture = draw_sign("HHHH", height, 0.0, np.random.default_rng(1))
+    assert picture.shape == (480, 640, 3)
+    assert np.array_equal(picture, draw_sign("HHHH", height, 0.0, np.random.default_rng(1)))
+    grey = picture[..., 0].astype(float)
+    plate = np.abs(grey - np.median(grey[:5])) > 25  # what is not wall
+    rows, columns = (np.flatnonzero(plate.any(axis=axis)) for axis in (1, 0))
+    edge = height // 2  # the letters stand their own height from the edge of the plate
+    inside = grey[rows[0] + edge : rows[-1] + 1 - edge, columns[0] + edge : columns[-1] + 1 - edge]
+    ink = np.flatnonzero(np.abs(inside - np.median(inside)).max(axis=1) > 60)
+    assert 0.8 * height - 2 <= np.ptp(ink) + 1 <= 1.2 * height + 3
+
+
+def test_large_signs_are_read_and_tiny_ones_are_not(monkeypatch):
+    pytest.importorskip("rapidocr_onnxruntime", exc_type=ImportError)
+    monkeypatch.setattr(sign_readers, "HEIGHTS", (3, 26))
+    monkeypatch.setattr(sign_readers, "ANGLES", (0.0,))
+    tiny, large = measure_reader(3)["scored"]
+    assert large[2:] == [4, 4, 0, 0, 0] and sum(tiny[4:]) > 0  # E-420, dashes aside
+
+
+def test_without_a_reader_a_line_says_what_helps(monkeypatch):
+    monkeypatch.setattr(sign_readers, "load_text_reader", lambda: None)
+    monkeypatch.setattr(pictures, "load_text_reader", lambda: None)
+    with pytest.raises(InputError, match="data=reader: no reader of texts"):
+        measure_reader(0)
+
+
+def test_errors_of_readers_are_shares_of_the_characters():
+    scored = [[26, 0.0, 4, 4, 0, 0, 0], [26, 0.0, 4, 4, 1, 0, 0], [26, 0.0, 4, 0, 0, 0, 4], [26, 0.0, 4, 5, 0, 0, 1]]
+    table = tabulate_readers([{"text": "E-420", "scored": scored}])
+    assert "| 26 | 0° | 4 | 1 | 1 | 0.01–0.81 | 0.167 | 50 % | 50 % |" in table  # 2 of the 12 characters of three signs
+    assert "| 6 | 0° | 0 | 0 | 0 |" not in table

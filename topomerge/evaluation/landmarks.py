@@ -5,7 +5,8 @@ places made to be alike (`datasets.pairs.lookalikes`), and so many of the first 
 pair is registered without landmarks, with half of the door signs read with a fifth of their characters wrong, with signs read
 well, and with tags (`READINGS`).
 Signs are drawn beside the maps: these are those of the other tables. Right: within 0.5 m and 5 degrees. ``data=signs``: the
-likelihood of signs alone, without walls, in a minute; ``data=signs_train``: of training buildings, to choose by.
+likelihood of signs alone, without walls, in a minute; ``data=signs_train``: of training buildings, to choose by; ``data=reader``:
+a real reader on pictures of signs.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ from topomerge.datasets.simulation.signs import (
     read_signs,
 )
 from topomerge.evaluation.documents import write_table
+from topomerge.evaluation.sign_readers import measure_reader, tabulate_readers
 from topomerge.evaluation.tasks import Row, TaskSettings, measure_missing
 from topomerge.landmarks.evidence import score_landmarks
 from topomerge.registration.pipeline import register
@@ -91,6 +93,8 @@ def make_recipe(settings: Settings) -> LookalikeRecipe:
 
 def list_inputs(settings: Settings) -> list[str]:
     """Return names of the pairs, or of the buildings whose signs are scored alone."""
+    if settings.data.set == "reader":
+        return [f"sign {k}" for k in range(settings.data.limit or PICTURED)]
     if settings.data.set in ALONE:
         return [f"signs {k}" for k in range(settings.data.limit or BUILDINGS)]
     return [item.name for item in draw_lookalike_items(make_recipe(settings))]
@@ -98,6 +102,10 @@ def list_inputs(settings: Settings) -> list[str]:
 
 def measure(settings: Settings, log_line: LogFn) -> list[Row]:
     """Measure the pairs that are missing."""
+    if settings.data.set == "reader":
+        signs = {name: (k,) for k, name in enumerate(list_inputs(settings))}
+        path = Path(settings.cache) / "evaluation" / "sign_readers.jsonl"
+        return measure_missing(path, signs, measure_reader, log_line, settings, compute_code_digest(*READING))
     if settings.data.set in ALONE:
         path = Path(settings.cache) / "evaluation" / f"{settings.data.set}.jsonl"
         buildings = {name: (k, ALONE[settings.data.set]) for k, name in enumerate(list_inputs(settings))}
@@ -118,7 +126,8 @@ def measure(settings: Settings, log_line: LogFn) -> list[Row]:
 
 
 ALONE = {"signs": "test", "signs_train": "train"}  # sets of signs alone: split of the buildings
-BUILDINGS = 40
+BUILDINGS, PICTURED = 40, 40
+READING = ("topomerge.evaluation.sign_readers", "topomerge.io.pictures")
 LAYOUTS = ("office", "hotel", "hospital", "school")
 SEEN_ROOMS, VISITED = 8, 6  # rooms near each other, and how many of them each visitor enters
 READ_ALONE = {**READERS, "fair": Reader(reads=0.7, wrong=0.08)}
@@ -231,6 +240,8 @@ def is_false(row: Row) -> bool:
 
 def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
     """Tabulate what is wrongly merged and what is believed of true pairs, all and by kind, for each reading."""
+    if settings.data.set == "reader":
+        return {"sign-readers": tabulate_readers(rows)}
     if settings.data.set in ALONE:
         return {"landmark-odds": tabulate_alone(rows)}
     out = [_format_line(name, [r for r in rows if r["reading"] == name]) for name in READINGS]
