@@ -148,6 +148,9 @@ def test_words_that_make_no_sense_are_one_line(words, monkeypatch) -> None:
         search(words[:-3])
     with pytest.raises(InputError, match="leave out -m"):
         compose_search(["-m", *words])
+    assert compose_search(["-m", "experiment=gat_scalars,none_scalars", "seed=0,1"]) is None  # a sweep of experiments
+    with pytest.raises(InputError, match="leave out -m"):
+        compose_search(["-m", "experiment=gat_scalars,none_scalars", "search=optuna"])
     assert compose_search(["task=door_classification"]) is None and compose_search(["experiment=gat_scalars"]) is None
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(InputError, match=r"search=optuna needs optuna: pip install topomerge\[search\]"):

@@ -76,12 +76,17 @@ def compose_search(words: Sequence[str]) -> Search | None:
     """
     if not any(word.lstrip("+").startswith(("search", "experiment=")) for word in words):
         return None
+    if {"-m", "--multirun"} & set(words):
+        names = [word.partition("=")[2] for word in words if word.lstrip("+").startswith("experiment=")]
+        alone = [word for word in words if word.lstrip("+").startswith(("search", "plugins"))]
+        tried = [[*alone, f"experiment={name}"] for name in ",".join(names).split(",") if name] or [alone]
+        if any(compose_config("train", prepare_words(one)).get("search") is not None for one in tried):
+            raise InputError("search: runs several trainings by itself; leave out -m")
+        return None
     composed = compose_config("train", prepare_words([word for word in words if not word.startswith("-")]))
     given = None if {"-c", "--cfg"} & set(words) else composed.get("search")
     if given is None:
         return None
-    if {"-m", "--multirun"} & set(words):
-        raise InputError("search: runs several trainings by itself; leave out -m")
     return convert_to_dataclass(given, Search)
 
 
