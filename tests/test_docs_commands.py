@@ -57,8 +57,10 @@ def take(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         Exception: it does not take them.
     """
     if words[0] == "train.py":
+        from topomerge.training.search import compose_search
         from topomerge.training.tasks import compose_settings
 
+        compose_search([FLAGS.get(w, w) for w in words[1:]])
         plain = [FLAGS.get(w, w) for w in words[1:] if w != "-m" and not w.startswith("hydra")]
         compose_settings([select_first(w) for w in plain] if "-m" in words else plain)  # of a sweep, its first run
         return
