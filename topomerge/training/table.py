@@ -1,6 +1,7 @@
 """The runs of a folder as one table, Markdown: ``python -m topomerge.training.table runs/sweep``.
 
-A second table has the mean over the seeds of runs that differ in nothing else, with its 95 % interval (Student's t).
+A second table has the mean over the seeds of runs that differ in nothing else, with its 95 % interval (Student's t); of
+two seeds with both.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from topomerge.registry import TASKS, load_plugins
 from topomerge.statistics import estimate_mean
 from topomerge.training.provenance import MAY_CHANGE
 from topomerge.training.tasks import DEFAULT_TASK
+from topomerge.types import Array
 
 
 class SweepTable:
@@ -76,9 +78,15 @@ def gather_seeds(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         for name in (name for name in first if name not in ("run", "seed", "same", "best")):
             values = [one[name] for one in group]
             numbers = isinstance(first[name], float) and name != "s an epoch"
-            row[name] = "{:.3f} [{:.3f}, {:.3f}]".format(*estimate_mean(np.array(values))) if numbers else first[name]
+            row[name] = _format_mean(np.array(values)) if numbers else first[name]
         out.append({key: value for key, value in row.items() if key not in ("epoch", "s an epoch")})
     return out
+
+
+def _format_mean(values: Array) -> str:
+    """Mean with its interval; of two values, whose interval would tell nothing, with these."""
+    mean, low, high = estimate_mean(values) if len(values) > 2 else (values.mean(), values.min(), values.max())
+    return f"{mean:.3f} [{low:.3f}, {high:.3f}]" if len(values) > 2 else f"{mean:.3f}, {low:.3f}–{high:.3f}"
 
 
 def format_table(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> list[str]:
