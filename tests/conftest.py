@@ -26,6 +26,27 @@ def pytest_configure(config: pytest.Config) -> None:
         compile_once()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _forked_readers() -> Generator[None]:
+    """Readers of files of strangers are forks of this process; a fresh process takes a second to start."""
+    from tests.forked import ForkedChild
+    from topomerge.io import piece
+
+    with pytest.MonkeyPatch.context() as patch:
+        if hasattr(os, "fork"):
+            patch.setattr(piece, "start_child", ForkedChild)
+        yield
+
+
+@pytest.fixture
+def fresh_readers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests of the process itself: it starts as in the product."""
+    from tests.forked import start_fresh_child
+    from topomerge.io import piece
+
+    monkeypatch.setattr(piece, "start_child", start_fresh_child)
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The folder of real data named by TOPOMERGE_DATA; tests that ask for it are marked `data` and skip without it."""

@@ -8,10 +8,15 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 
 
-def copied(folder: Path) -> Path:
-    """Copy the package's sources and data into a folder; the folder of `topomerge` in it."""
+def copied(folder: Path, compiled: bool = False) -> Path:
+    """Copy the package's sources and data into a folder; the folder of `topomerge` in it.
+
+    Args:
+        compiled: with what Python and numba have compiled of them: a copy that is run starts in a quarter of the time.
+    """
+    ignored = None if compiled else shutil.ignore_patterns("__pycache__")
     for name in ("topomerge", "models", "datasets", "configs"):
-        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / name, folder / name, ignore=ignored)
     return folder / "topomerge"
 
 

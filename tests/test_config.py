@@ -11,10 +11,9 @@ from topomerge.evaluation.settings import Evaluation
 
 
 def test_keys_that_a_recipe_leaves_out_can_be_overridden() -> None:
-    settings = compose("build", Build, ["data=procedural", "data.maps=true", "data.sources.ipa=0.5", "data.vary.density=[1,0.3]"])
-    assert settings.data.maps and settings.data.sources["ipa"] == 0.5 and settings.data.vary == {"density": [1.0, 0.3]}
+    settings = compose("build", Build, ["data=procedural", "data.maps=true", "data.sources.ipa=0.5"])
+    assert settings.data.maps and settings.data.sources["ipa"] == 0.5
     assert compose("build", Build, ["cluster=tcp://host:1"]).cluster == "tcp://host:1"
-    assert compose("build", Build).data.vary == {}
     assert compose("evaluate", Evaluation, ["data.maps=false", "poses=rooms"]).data.maps is False
 
 

@@ -1,6 +1,6 @@
 """Nearest rooms among many: exact search beside the index of a large atlas (`fusion.atlas.neighbours`, `prepare_rooms_index`).
 
-``python -m benchmarks.speed.room_search [ROOMS ...] [--write FILE]``: vectors of length 1 as of the embedder that ships (256
+``python -m benchmarks.speed.room_search [ROOMS ...]``: vectors of length 1 as of the embedder that ships (256
 numbers), noisy copies of a twentieth as many looks; what is looked for are noisy copies of some of them, as many as a map of 30
 rooms has at four turns. Seconds are of the processor: run it on one core. It prints a table, and a line a
 size as `bench.print_line` does.
@@ -9,7 +9,6 @@ size as `bench.print_line` does.
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,7 +17,6 @@ from time import process_time
 import numpy as np
 
 from benchmarks.speed.bench import print_line
-from topomerge.evaluation.tables import write_section
 from topomerge.fusion.atlas.partners import find_nearest
 from topomerge.fusion.atlas.rooms_index import RoomsIndex
 from topomerge.types import Array
@@ -90,18 +88,12 @@ def measure(rooms: int) -> str:
     return f"| {searches} | {memory[0]:,.0f}, {memory[1]:,.0f} | {size:,.0f} | {made:,.0f} | {read:.1f} |"
 
 
-def main(rooms: Sequence[int] = ROOMS, write: Path | None = None) -> None:
-    """Measure, print, and write where asked."""
-    text = "\n".join([SEARCH_COLUMNS, *(measure(count) for count in rooms)])
-    print(text)
-    if write is not None:
-        words = " ".join(["python -m benchmarks.speed.room_search", *sys.argv[1:]])
-        write_section(write, "index", f"`{words}`\n\n{text}")
+def main(rooms: Sequence[int] = ROOMS) -> None:
+    """Measure and print a table."""
+    print("\n".join([SEARCH_COLUMNS, *(measure(count) for count in rooms)]))
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(prog="python -m benchmarks.speed.room_search", description=__doc__)
     parser.add_argument("rooms", nargs="*", type=int, help=f"sizes, instead of {ROOMS}")
-    parser.add_argument("--write", type=Path, help="file whose section between the marks `index` is replaced")
-    args = parser.parse_args()
-    main(args.rooms or ROOMS, args.write)
+    main(parser.parse_args().rooms or ROOMS)

@@ -10,12 +10,9 @@ import shapely
 from scipy import ndimage
 from topomerge.datasets.core.building import Building
 from topomerge.datasets.pairs.flat_maps import FlatMap, build_from_masks, extrude_flat, label_points, transform_room
-from topomerge.datasets.pairs.pairs import Pair, find_common_rooms
-from topomerge.datasets.pairs.parts import compute_dice
 from topomerge.datasets.pairs.plan_truth import HUNG_KINDS, compute_footprints
 from topomerge.datasets.simulation.floor_truth import rasterize_floors
 
-from topomerge.errors import InputError
 from topomerge.types import Array, PointCloud, Sim3
 
 DRAWING_CELL = 0.05  # m
@@ -24,28 +21,6 @@ SYMBOLS_SHARES = (0.5, 0.2, 0.5)  # of the drawings have arcs of doors, outlines
 DRAWN_AROUND = 8.0  # m about the rooms that are asked for
 LETTER_SIZES = (0.25, 0.5)  # m
 SAME_LEVEL = 1.0  # m between a door and the floor of its storey, at most
-
-
-def replace_map_with_plan(pair: Pair, building: Building) -> Pair:
-    """Return the pair with the floor plan of the whole building instead of its second map.
-
-    Raises:
-        InputError: the building has several storeys, or the pair is of two buildings.
-    """
-    if len(building.storeys) > 1 or pair.frames is None or pair.kind != "overlap":
-        raise InputError(f"{pair.name}: a floor plan is drawn of buildings of one storey, and of the one that was mapped")
-    frame = pair.frames[1]
-    flat = draw(building).transform(replace(frame, translation=(*frame.translation[:2], 0.0)))
-    b = extrude_flat(flat, frame.translation[2] + frame.scale * float(building.storeys["floor"][0]))
-    visited = tuple(i for i, r in enumerate(building.rooms) if r.kind != "lift")
-    return replace(
-        pair,
-        b=b,
-        shared=find_common_rooms(pair.a, b),
-        overlap=compute_dice(list(pair.visited[0]), list(visited)),
-        sensors=(pair.sensors[0], "drawing"),
-        visited=(pair.visited[0], visited),
-    )
 
 
 def draw(building: Building, storey: int = 0) -> FlatMap:

@@ -15,9 +15,8 @@ from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.core.builder import BuildRow, make_item
 from topomerge.datasets.core.building import Building, Plan
 from topomerge.datasets.pairs.atlases import make_atlas
-from topomerge.datasets.pairs.drawing import replace_map_with_plan
 from topomerge.datasets.pairs.evaluation_pair import build_evaluation_arrays, compute_pair_statistics, save_maps
-from topomerge.datasets.pairs.items import SIDES, UNCHANGED, Item, corrupt_pair, get_difficulty
+from topomerge.datasets.pairs.items import SIDES, Item, get_difficulty
 from topomerge.datasets.pairs.pairs import Atlas, Pair, make_pair, simulate_signs
 from topomerge.datasets.pairs.parts import find_true_matches, match_true_rooms
 from topomerge.datasets.simulation.signs import READERS
@@ -144,8 +143,6 @@ def extract_maps(clouds: Sequence[PointCloud], item: Item, signs: Sequence[Landm
 def describe_item(item: Item) -> dict[str, Any]:
     """Describe an item as in a file; fields that came later are left out where they have their defaults."""
     entries = asdict(item)
-    if item.change == UNCHANGED:
-        del entries["change"]
     if not item.maps:
         del entries["maps"]
     if not item.more:
@@ -180,14 +177,13 @@ def build_pair_arrays(pair: Pair, maps: Sequence[TopometricMap], item_entries: M
 
 
 def _make_first_pair(item: Item, plans: Sequence[Sequence[Plan]]) -> tuple[Pair, list[Landmarks]]:
-    """The pair of the first candidate that has one, changed, and the signs that both maps read; none without."""
+    """The pair of the first candidate that has one, and the signs that both maps read; none without."""
 
     def make(k: int, rng: np.random.Generator) -> tuple[Pair, list[Landmarks]]:
         building, other = build_candidate(item, k, plans)
         pair = make_pair(building, item.pair_settings, rng, other, get_difficulty(item), item.source)
-        pair = replace_map_with_plan(pair, building) if item.change[0] == "plan" else pair
         signs = simulate_signs(building, pair, READERS[item.signs]) if item.signs else []
-        return corrupt_pair(pair, item.change, item.seed), signs
+        return pair, signs
 
     return _make_first(item, make)
 

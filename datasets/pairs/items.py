@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import shapely
-from scipy.spatial import cKDTree
 from topomerge.datasets.buildings.procedural import PROFILES
 from topomerge.datasets.buildings.stack import Stack, count_matching_rooms, iter_stacks
 from topomerge.datasets.core.building import Difficulty, Plan
 from topomerge.datasets.pairs.atlases import FLAT_KINDS
-from topomerge.datasets.pairs.pairs import HARD, Pair, PairSettings
+from topomerge.datasets.pairs.pairs import HARD, PairSettings
 from topomerge.datasets.plans import splits
-from topomerge.datasets.simulation.scanner import transform_cloud
 from topomerge.datasets.simulation.sensors import get_sensor
 from topomerge.datasets.simulation.signs import READERS
 
@@ -27,81 +25,13 @@ from topomerge.code_digest import compute_code_digest, compute_data_digest
 from topomerge.embedding import graph
 from topomerge.embedding.graph import POINTS_PER_ROOM
 from topomerge.errors import InputError
-from topomerge.types import Array, PointCloud, Sim3
-
-UNCHANGED = ("", 0.0)
-BALL = 1.0  # m, radius of a hole
-CHANGES = {
-    "density": (0.001, 1.0),  # share of the points that is kept
-    "noise": (0.0, 0.5),  # m, standard deviation that is added to each coordinate
-    "missing": (0.0, 0.95),  # share of the points that lie in holes of 1 m
-    "scale": (0.1, 10.0),  # by which the second map is larger
-    "plan": (1.0, 1.0),  # the second map is the building's floor plan (`drawing`)
-    "time": (0.0, 1.0),  # share of the furniture that moved, and of the doors; half as much is gone
-}
-
-
-def check_change(what: str, values: Sequence[float]) -> None:
-    """Refuse a change that can't be made.
-
-    Raises:
-        InputError: names it.
-    """
-    if what not in CHANGES:
-        raise InputError(f"vary: unknown {what!r}; {', '.join(CHANGES)} are possible")
-    low, high = CHANGES[what]
-    for value in values:
-        if not low <= value <= high:
-            raise InputError(f"vary.{what} must be {low:g} to {high:g}, not {value}")
-
-
-def add_time_change(difficulty: Difficulty, change: tuple[str, float]) -> Difficulty:
-    """Return the difficulty of sessions that lie apart as the change ``("time", share)`` says; of other changes the same."""
-    what, value = change
-    return replace(difficulty, moved=value / 2, gone=value / 2, doors_moved=value) if what == "time" else difficulty
-
-
-def corrupt_pair(pair: Pair, change: tuple[str, float], seed: int) -> Pair:
-    """Return the pair with both its clouds changed (of ``scale`` only the second)."""
-    what, value = change
-    if what == "scale":
-        size = Sim3(scale=value)
-        truth = None if pair.truth is None else pair.truth @ size.inverse()
-        frames = None if pair.frames is None else (pair.frames[0], size @ pair.frames[1])
-        return replace(pair, b=transform_cloud(pair.b, size), truth=truth, frames=frames)
-    if what not in KEEPING:
-        return pair
-    a, b = (KEEPING[what](c, value, np.random.default_rng([seed, k])) for k, c in enumerate((pair.a, pair.b)))
-    return replace(pair, a=a, b=b)
-
-
-def _thin_points(cloud: PointCloud, share: float, rng: np.random.Generator) -> PointCloud:
-    return select_points(cloud, rng.random(len(cloud)) < share)
-
-
-def _add_noise(cloud: PointCloud, spread: float, rng: np.random.Generator) -> PointCloud:
-    return replace(cloud, points=cloud.points + rng.normal(0, spread, cloud.points.shape).astype(np.float32))
-
-
-def _cut_holes(cloud: PointCloud, share: float, rng: np.random.Generator) -> PointCloud:
-    """Without the points in balls about random points; the last ball may take more than the share."""
-    tree, lost = cKDTree(cloud.points), np.zeros(len(cloud), bool)
-    for centre in rng.permutation(len(cloud)):
-        if lost.mean() >= share:
-            break
-        lost[tree.query_ball_point(cloud.points[centre], BALL)] = True
-    return select_points(cloud, ~lost)
+from topomerge.types import Array, PointCloud
 
 
 def select_points(cloud: PointCloud, rows: Array) -> PointCloud:
     """Select some points of a cloud."""
     some = {n: v[rows] for n in ("points", "colors", "labels", "pose_of", "intensities") if (v := getattr(cloud, n)) is not None}
     return replace(cloud, **some)
-
-
-KEEPING: dict[str, Callable[[PointCloud, float, np.random.Generator], PointCloud]] = {
-    "density": _thin_points, "noise": _add_noise, "missing": _cut_holes,
-}  # fmt: skip
 
 
 LEAST_PLAN = (5, 45.0)  # rooms, m2 of a real plan: fewer have no two parts, and those of a tiny flat are hardly told apart
@@ -140,7 +70,6 @@ class Recipe:
             overlaps are as they come. Their sensors may also be those of `atlases.FLAT_KINDS`.
         drifts: of more than two walks: times the usual drift of a sensor, drawn for each map; empty: the usual one.
         signs: share of the pairs whose maps hold door signs, read well or badly (`simulation.signs.READERS`).
-        vary: name of a change (`degrade.CHANGES`) -> values; every pair is made once for each of all these.
     """
 
     name: str = "set"
@@ -165,7 +94,6 @@ class Recipe:
     walks: int = 2
     drifts: list[float] = field(default_factory=list)
     signs: float = 0.0
-    vary: dict[str, list[float]] = field(default_factory=dict)
 
 
 def check(recipe: Recipe) -> None:
@@ -194,16 +122,14 @@ def check(recipe: Recipe) -> None:
     for key, value in shares.items():
         if not 0 <= value <= 1:
             raise InputError(f"{key} must be 0 to 1, not {value}")
-    for what, values in recipe.vary.items():
-        check_change(what, values)
     if recipe.pairs < 1 or not recipe.overlaps or len(recipe.rooms) != 2 or not 3 <= recipe.rooms[0] <= recipe.rooms[1]:
         raise InputError("pairs must be 1 or more, overlaps one or more, rooms [fewest, most] with 3 or more each")
     if recipe.drifts and (recipe.walks == 2 or not all(0 <= drift <= MOST_DRIFT for drift in recipe.drifts)):
         raise InputError(f"drifts are of more than two walks, 0 to {MOST_DRIFT:g} each, not {recipe.drifts}")
-    if not 2 <= recipe.walks <= len(SIDES) or (recipe.walks > 2 and (recipe.maps or recipe.vary)):
-        raise InputError(f"walks must be 2 to {len(SIDES)}, and 2 where maps are kept or changed, not {recipe.walks}")
-    if recipe.signs and (recipe.vary or recipe.walks != 2):
-        raise InputError("signs are of pairs that are not changed: leave vary out, and set walks to 2")
+    if not 2 <= recipe.walks <= len(SIDES) or (recipe.walks > 2 and recipe.maps):
+        raise InputError(f"walks must be 2 to {len(SIDES)}, and 2 where maps are kept, not {recipe.walks}")
+    if recipe.signs and recipe.walks != 2:
+        raise InputError("signs are of pairs of two walks: set walks to 2")
     if not 0.02 <= recipe.voxel_size <= 1 or recipe.points_per_room < 1:
         raise InputError("voxel_size must be 0.02 to 1 m, and points_per_room 1 or more")
 
@@ -261,7 +187,6 @@ class Item:
         other: the building of "other-building", likewise, and its digest.
         difficulty: what differs from the defaults.
         maps: are the extracted maps kept beside the pair?
-        change: what is done to the clouds before they are extracted, and how much (`degrade`).
         more: sensors of further maps of the building, in the same file (`build_several_maps`).
         drifts: of all its maps, times the usual drift; empty: the usual one.
         signs: how the door signs of both maps are read, of `simulation.signs.READERS`; empty: there are none.
@@ -284,7 +209,6 @@ class Item:
     points_per_room: int
     over_stairs: bool = False
     maps: bool = False
-    change: tuple[str, float] = UNCHANGED
     more: tuple[str, ...] = ()
     drifts: tuple[float, ...] = ()
     signs: str = ""
@@ -305,7 +229,7 @@ class Item:
         """
         values = asdict(self)
         # These came later: at their defaults older names hold.
-        later = {"maps": False, "change": UNCHANGED, "more": (), "drifts": (), "signs": ""}
+        later = {"maps": False, "more": (), "drifts": (), "signs": ""}
         values = {key: value for key, value in values.items() if key not in later or value != later[key]}
         maker = compute_code_digest(MAKER) if self.maps else compute_data_digest(EXTRACTION)
         inputs = [PAIR_FORMAT, graph.GRAPH_FORMAT, maker, convert_to_plain(values)]
@@ -329,9 +253,7 @@ def _round_values(value: Any) -> Any:
 def draw_items(recipe: Recipe, plans: Library) -> list[Item]:
     """Draw the items of a recipe, each from its own number: a longer set begins with the shorter one."""
     shelves = {source: _digest_plans(of) for source, of in plans.items()}
-    items = [replace(_draw(recipe, shelves, i), maps=recipe.maps) for i in range(recipe.pairs)]
-    changes = [(what, float(value)) for what, values in sorted(recipe.vary.items()) for value in values]
-    return [replace(item, change=change) for item in items for change in changes or [UNCHANGED]]
+    return [replace(_draw(recipe, shelves, i), maps=recipe.maps) for i in range(recipe.pairs)]
 
 
 @dataclass(frozen=True)
@@ -417,7 +339,7 @@ def _sample_difficulty(spread: float, rng: np.random.Generator) -> tuple[tuple[s
 
 def get_difficulty(item: Item) -> Difficulty:
     """Return the item's difficulty; storeys are alike where that is what makes the item hard."""
-    difficulty = add_time_change(Difficulty(**dict(item.difficulty)), item.change)
+    difficulty = Difficulty(**dict(item.difficulty))
     return replace(difficulty, differ=0.0) if item.hard == "other-storey" else difficulty
 
 

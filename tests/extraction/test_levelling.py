@@ -55,8 +55,7 @@ def ramp(length: float, climb: float) -> np.ndarray:
 
 
 @pytest.mark.longer
-@pytest.mark.parametrize("noise", [0.0, 0.015])
-@pytest.mark.parametrize("degrees", [1.5, 2.0, 5.0, 8.0, 12.0, 15.0, 20.0])
+@pytest.mark.parametrize(("degrees", "noise"), [(1.5, 0.015), (2.0, 0.0), (5.0, 0.015), (12.0, 0.0), (20.0, 0.015)])
 def test_up_is_found(degrees: float, noise: float) -> None:
     for about in (0.0, 33.0, 90.0, 250.0):
         up = find_up(tilted(scenes.corridor().points(noise), degrees, about))

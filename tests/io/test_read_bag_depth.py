@@ -24,8 +24,6 @@ IMAGE, PACKED, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 TOPIC, INFO_TOPIC = "/camera/depth/image_raw", "/camera/depth/camera_info"
 FRAME = "camera_optical"
 
-pytestmark = pytest.mark.usefixtures("bags_here")
-
 
 def image_messages(form: str = "16UC1", rectified: bool = True, poses: bool = True, order: str = "<", topic: str = TOPIC) -> Make:
     """What a robot with a camera of depth records in the room, its colours beside."""

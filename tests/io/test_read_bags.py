@@ -49,7 +49,6 @@ def test_a_bag_is_the_walk(tmp_path: Path, walk: Walk, kind: str) -> None:
     assert_same(read_points(write_bag(tmp_path, kind, walk_messages(walk))), walk)
 
 
-@pytest.mark.usefixtures("bags_here")
 @pytest.mark.parametrize("kind", ["bag", "mcap"])
 def test_odometry_moves_what_tf_does_not(tmp_path: Path, walk: Walk, kind: str) -> None:
     cloud = read_points(write_bag(tmp_path, kind, walk_messages(walk, "odometry")))
@@ -57,7 +56,6 @@ def test_odometry_moves_what_tf_does_not(tmp_path: Path, walk: Walk, kind: str) 
     assert cloud.warnings == ()
 
 
-@pytest.mark.usefixtures("bags_here")
 def test_odometry_of_a_frame_without_tf(tmp_path: Path, walk: Walk) -> None:
     robot = Walk(walk.scans, walk.poses @ MOUNT, walk.times)  # then odometry has the poses of the walk
     cloud = read_points(write_bag(tmp_path, "mcap", without(walk_messages(robot, "odometry"), "/tf_static")))
@@ -65,7 +63,6 @@ def test_odometry_of_a_frame_without_tf(tmp_path: Path, walk: Walk) -> None:
     assert cloud.warnings == ("tf does not say where 'lidar' stands in 'base_link', which /odom moves: taken as the same frame",)
 
 
-@pytest.mark.usefixtures("bags_here")
 @pytest.mark.parametrize("poses", ["tf", "none"])
 def test_a_trajectory_goes_before_tf(tmp_path: Path, walk: Walk, poses: str) -> None:
     moved = Walk(walk.scans, walk.poses + np.array([[0, 0, 0, 5.0], *np.zeros((3, 4))]), walk.times)
@@ -78,7 +75,6 @@ def test_a_trajectory_goes_before_tf(tmp_path: Path, walk: Walk, poses: str) -> 
     assert cloud.warnings == ("1 of 3 messages of /points have no pose near their time and are left out",)
 
 
-@pytest.mark.usefixtures("bags_here")
 def test_a_topic_of_poses(tmp_path: Path, walk: Walk) -> None:
     """Two odometries: one has to be named; the one that is named goes before tf."""
 
@@ -111,7 +107,6 @@ def registered(walk: Walk, carrier: bool) -> Make:
     return make
 
 
-@pytest.mark.usefixtures("bags_here")
 def test_registered_points_stay_where_they_are(tmp_path: Path, walk: Walk) -> None:
     assert_same(read_points(write_bag(tmp_path / "a", "bag", registered(walk, True))), walk)
     path = write_bag(tmp_path / "b", "bag", registered(walk, False))
@@ -124,7 +119,6 @@ def test_registered_points_stay_where_they_are(tmp_path: Path, walk: Walk) -> No
     assert_same(read_points(path, poses=str(write_tum(tmp_path / "a.txt", walk.poses, walk.times))), walk)
 
 
-@pytest.mark.usefixtures("bags_here")
 def test_poses_are_interpolated(tmp_path: Path) -> None:
     """tf ten times a second, and a scan between: half the way, half the turn."""
 
@@ -143,7 +137,6 @@ def test_poses_are_interpolated(tmp_path: Path) -> None:
     np.testing.assert_allclose(cloud.poses[0, :3, 3], (1.5, 0, 0), atol=1e-5)
 
 
-@pytest.mark.usefixtures("bags_here")
 def test_slices_of_a_2d_laser(tmp_path: Path) -> None:
     """A round room: every range is 3 m; what is out of the laser's reach or nothing met gives no point."""
     ranges = np.full(360, 3.0)
@@ -162,7 +155,6 @@ def test_slices_of_a_2d_laser(tmp_path: Path) -> None:
     np.testing.assert_allclose(cloud.points[0], pose[:3, 3] + 3 * np.array([np.cos(angle), np.sin(angle), 0]), atol=1e-5)
 
 
-@pytest.mark.usefixtures("bags_here")
 @pytest.mark.parametrize("kind", ["bag", "mcap"])
 def test_a_map_is_that_of_map_server(tmp_path: Path, kind: str) -> None:
     """The newest grid of a topic gives the points of the same map saved as yaml and pgm."""
@@ -180,7 +172,6 @@ def test_a_map_is_that_of_map_server(tmp_path: Path, kind: str) -> None:
     np.testing.assert_allclose(cloud.points, expected.points, atol=1e-5)
 
 
-@pytest.mark.usefixtures("bags_here")
 def test_colors_and_parts(tmp_path: Path, walk: Walk) -> None:
     """A recording in two files of ROS 1, the first of them with colours."""
     colors = box_colors(len(walk.scans[0]))
@@ -287,7 +278,6 @@ BAD = {
 }
 
 
-@pytest.mark.usefixtures("bags_here")
 @pytest.mark.parametrize("name", BAD)
 def test_bad_bags(tmp_path: Path, walk: Walk, name: str) -> None:
     make, says = BAD[name]
@@ -296,7 +286,6 @@ def test_bad_bags(tmp_path: Path, walk: Walk, name: str) -> None:
     assert refusal_of(path).startswith(f"{path}: ")
 
 
-@pytest.mark.usefixtures("bags_here")
 def test_bad_choices(tmp_path: Path, walk: Walk) -> None:
     both = joined(walk_messages(walk), walk_messages(walk, "none", "/rear"))
     path = write_bag(tmp_path, "mcap", both)
@@ -317,7 +306,6 @@ def test_a_cut_bag_is_refused_by_the_process_that_reads(tmp_path: Path, walk: Wa
     assert refusal_of(path).startswith(f"{path}: ")
 
 
-@pytest.mark.usefixtures("bags_here")
 @pytest.mark.parametrize("kind", ["bag", "db3", "mcap"])
 def test_cut_bags(tmp_path: Path, walk: Walk, kind: str) -> None:
     data = write_bag(tmp_path, kind, walk_messages(walk)).read_bytes()
@@ -328,7 +316,6 @@ def test_cut_bags(tmp_path: Path, walk: Walk, kind: str) -> None:
 
 
 @pytest.mark.longer
-@pytest.mark.usefixtures("bags_here")
 @pytest.mark.parametrize("kind", ["bag", "db3", "mcap"])
 def test_damaged_bags(tmp_path: Path, walk: Walk, kind: str) -> None:
     """Points or one line, whatever is flipped."""

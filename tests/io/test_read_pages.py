@@ -80,9 +80,10 @@ def read(module: ModuleType, path: Path, **options: object) -> tuple[np.ndarray,
 
 
 @pytest.mark.longer
-@pytest.mark.parametrize("turned", [0, 90])
 @pytest.mark.parametrize(
-    ("texts", "scale"), [(AREAS, ""), (["-"] * 4, "Plan 1:100"), (AREAS, "1 : 50")], ids=["areas", "scale", "both"]
+    ("texts", "scale", "turned"),
+    [(AREAS, "", 0), (["-"] * 4, "Plan 1:100", 90), (AREAS, "1 : 50", 90)],
+    ids=["areas", "scale", "both"],
 )
 def test_a_page_with_a_plan(tmp_path: Path, texts: list[str], scale: str, turned: int, parser: list[np.ndarray]) -> None:
     """The scale is what is written in rooms or beside the plan; where both disagree (a plan printed smaller), the rooms'."""
@@ -195,12 +196,14 @@ def test_what_lies_outside_of_an_svg_is_not_read(tmp_path: Path, parser: list[np
     Image.new("L", (50, 50)).save(tmp_path / "black.png")
     plain = write_svg(tmp_path / "a.svg")
     read(svg, plain)
-    for address in (tmp_path / "black.png", (tmp_path / "black.png").as_uri(), "http://127.0.0.1:9/x.png", "black.png"):
-        for name in ("href", "xlink:href"):
-            body = f'<image {name}="{address}" x="0" y="0" width="10" height="10"/><use {name}="{address}#a"/>'
-            head = f'<?xml-stylesheet href="{address}"?>'
-            read(svg, write_svg(tmp_path / "b.svg", body + f"<style>@import url({address});</style>", head))
-            np.testing.assert_array_equal(parser[-1], parser[0])
+    addresses = (tmp_path / "black.png", (tmp_path / "black.png").as_uri(), "http://127.0.0.1:9/x.png", "black.png")
+    body = "".join(
+        f'<image {name}="{address}" x="0" y="0" width="10" height="10"/><use {name}="{address}#a"/>'
+        for address in addresses for name in ("href", "xlink:href")
+    )  # fmt: skip
+    imports = "".join(f"<style>@import url({address});</style>" for address in addresses)
+    read(svg, write_svg(tmp_path / "b.svg", body + imports, "".join(f'<?xml-stylesheet href="{a}"?>' for a in addresses)))
+    np.testing.assert_array_equal(parser[-1], parser[0])
 
 
 LAUGHS = (
@@ -244,6 +247,7 @@ def test_a_bomb_of_uses(tmp_path: Path) -> None:
 
 
 @pytest.mark.longer
+@pytest.mark.usefixtures("fresh_readers")
 def test_in_a_process_of_its_own(tmp_path: Path) -> None:
     """What the child refuses is told in one line by the parent."""
     write_pdf(tmp_path / "a.pdf", [""])

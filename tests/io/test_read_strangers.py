@@ -106,7 +106,6 @@ def test_bags_of_another_format(tmp_path: Path, version: str) -> None:
     assert refusal_of(path) == f"{path}: is a bag of format {version}, not 2.0; {advice}"
 
 
-@pytest.mark.usefixtures("bags_here")
 @pytest.mark.parametrize(("kind", "tool"), [("bag", "rosbag reindex"), ("mcap", "mcap recover")])
 def test_bags_whose_index_overstates_a_length(tmp_path: Path, kind: str, tool: str) -> None:
     """The records are whole, the index at the end of the file is not."""

@@ -33,7 +33,6 @@ def sources(folder: Path, walk: Walk) -> dict[str, Path]:
 
 
 @pytest.mark.longer
-@pytest.mark.usefixtures("bags_here")
 def test_the_same_cells_and_the_same_rooms(tmp_path: Path) -> None:
     """What a walk shows does not depend on the file: cells, rays, rooms, and the free space that its rays cross."""
     walk = house_walk()

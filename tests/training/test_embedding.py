@@ -59,12 +59,6 @@ def settings(cache, tmp_path) -> Training:
     return Training(**common, epochs=3, batch=4, rate=0.01, network=SMALL)
 
 
-@pytest.fixture
-def unexported(monkeypatch):
-    """For tests of the training alone: an export takes six seconds; without it `best/` keeps the weights of torch."""
-    monkeypatch.setattr(EmbeddingJob, "export_best", lambda self, folder: None)
-
-
 @pytest.mark.longer
 def test_a_set_is_packed_once(cache):
     said: list[str] = []
@@ -183,9 +177,8 @@ def weights(folder: Path) -> bytes:
 
 
 @pytest.mark.longer
-@pytest.mark.parametrize("parts", [("scalars",), ("scalars", "pointnet")])
-def test_resumed_equals_uninterrupted(settings, tmp_path, monkeypatch, parts):
-    settings.network = replace(SMALL, geometry=Geometry(list(parts), width=16))
+def test_resumed_equals_uninterrupted(settings, tmp_path, monkeypatch):
+    settings.network = replace(SMALL, geometry=Geometry(["scalars", "pointnet"], width=16))
     fit(replace(settings, name="whole"), quiet)
     step, done = EmbeddingJob.train_step, []
 
@@ -227,6 +220,7 @@ def test_it_stops_early(settings):
 
 
 @pytest.mark.longer
+@pytest.mark.usefixtures("unexported")
 def test_geometry_alone_then_frozen(settings, tmp_path):
     alone = replace(settings, name="alone", network=replace(SMALL, node=Node("none")))
     fit(alone, quiet)
@@ -369,6 +363,7 @@ def test_a_weight_is_not_touched_by_a_gradient_that_is_no_number(settings, fused
 
 
 @pytest.mark.longer
+@pytest.mark.usefixtures("unexported")
 def test_an_overflow_of_half_precision_skips_a_step(settings, tmp_path, monkeypatch):
     """A scale of 2^127 makes the first gradients infinite; the scaler halves it until they are not."""
     from lightning_fabric import Fabric

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 import json
 import os
@@ -20,6 +21,7 @@ from topomerge.embedding.learned import load_embedder
 from topomerge.errors import InputError
 from topomerge.networks.network import Signature, Tensor, load_network
 from topomerge.registry import DATASETS, LOSSES, NODES, Registry
+from topomerge.training.tasks import compose_settings
 
 ROOT = Path(__file__).parent.parent.parent
 EMBEDDER = '''
@@ -148,7 +150,7 @@ def test_encoder_loss_optimizer_and_schedule_train_export_load_and_merge(tmp_pat
     assert len(result.maps) == 2 and len(ours(maps[0])) == len(maps[0].rooms)
     again = run(tmp_path, "train.py", *words, "logger=none", "name=x", "resume=true", "epochs=3")
     assert again.returncode == 0, again.stderr
-    table = run(tmp_path, "train.py", "-m", *words, "logger=none", "network.node.layers=1,2", "runs=swept")
+    table = run(tmp_path, "train.py", "-m", *words, "logger=none", "epochs=1", "network.node.layers=1,2", "runs=swept")
     assert table.returncode == 0, table.stderr
     assert (tmp_path / "swept" / "sweep" / "table.md").read_text().count("| transformer ") == 2
 
@@ -172,7 +174,6 @@ def test_a_task_of_somebody_else_trains_and_is_judged(tmp_path: Path) -> None:
     assert judged.returncode == 0 and f"| error | {best:.3f} |" in judged.stdout, judged.stderr
 
 
-@pytest.mark.longer
 @pytest.mark.parametrize(
     ("text", "words", "said"),
     [
@@ -186,12 +187,25 @@ def test_a_task_of_somebody_else_trains_and_is_judged(tmp_path: Path) -> None:
          "plugins=mine: loss.kind: 'triplet' is registered twice; give yours another name"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_one_line(text: str, words: list[str], said: str, tmp_path: Path) -> None:
+def test_what_is_wrong_is_one_line(
+    text: str, words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "mine", raising=False)
+    importlib.invalidate_caches()
     (tmp_path / "mine.py").write_text(text)
-    (tmp_path / "cache").mkdir()
-    write_set(tmp_path / "cache", "procedural", 2)
-    done = run(tmp_path, "train.py", "plugins=[mine]", "data=procedural", *words)
-    assert done.returncode == 1 and done.stderr.count("\n") == 1 and done.stderr.startswith(f"train: {said}"), done.stderr
+    with pytest.raises(InputError) as refused:
+        compose_settings(["plugins=[mine]", "data=procedural", *words])
+    assert str(refused.value).startswith(said) and "\n" not in str(refused.value)
+    sys.modules.pop("mine", None)
+
+
+@pytest.mark.longer
+def test_the_script_ends_with_that_line(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("import nothing_like_this")
+    done = run(tmp_path, "train.py", "plugins=[mine]", "data=procedural")
+    assert done.returncode == 1 and done.stderr.count("\n") == 1, done.stderr
+    assert done.stderr.startswith("train: plugins=mine: cannot be imported (ModuleNotFoundError: No module named 'nothing")
 
 
 def test_a_plugin_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

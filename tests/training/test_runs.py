@@ -52,6 +52,7 @@ def settings(cache, tmp_path) -> Training:
     return Training(**common, epochs=1, batch=4, network=SMALL)
 
 
+@pytest.mark.usefixtures("unexported")
 def test_a_run_with_other_settings_does_not_go_on(settings, tmp_path):
     fit(settings, quiet)
     before = (tmp_path / "run" / "config.json").read_bytes()
@@ -75,6 +76,7 @@ def test_keys_that_one_version_lacks_count_for_nothing():
     assert compare_settings({"a": {"b": 1, "old": 2}, "c": [1, 2]}, {"a": {"b": 3}, "c": (1, 2), "new": 1}) == {"a.b": [1, 3]}
 
 
+@pytest.mark.usefixtures("unexported")
 def test_other_pairs_under_the_name_of_the_set_do_not_go_on(settings, tmp_path):
     for count in (6, 7):
         write_set(tmp_path / "cache", "some", count)
@@ -87,7 +89,7 @@ def test_other_pairs_under_the_name_of_the_set_do_not_go_on(settings, tmp_path):
             fit(here, quiet)
 
 
-@pytest.mark.longer
+@pytest.mark.usefixtures("unexported")
 def test_a_run_is_replaced_only_where_that_is_asked_for(settings, tmp_path):
     fit(replace(settings, epochs=2), quiet)
     kept = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
@@ -163,7 +165,7 @@ def test_the_scripts_of_a_second_clone_say_so(tmp_path, script):
     """The clone has its own `topomerge`, which Python finds first, but the environment's models and datasets."""
     from tests.package_copy import copied
 
-    copied(tmp_path)
+    copied(tmp_path, compiled=True)
     (tmp_path / script).write_text((ROOT / script).read_text())
     done = subprocess.run(
         [sys.executable, str(tmp_path / script), "task=nothing"], cwd=tmp_path, capture_output=True, text=True, check=False

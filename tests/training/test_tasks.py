@@ -210,8 +210,8 @@ def test_a_task_is_trained_exported_read_and_judged(task, words, tmp_path, monke
     assert find_weights(task, "").is_file() and evaluate_task(task, words(task, f"folder={tmp_path / 'eval'}"), quiet).scores
 
 
-# The trainer knows no task by name: two tasks stand for all of them, the others are tried with the slow tests.
-SAMPLED = [pytest.param(t, marks=() if t in ("room_matcher", "wall_segmentation") else pytest.mark.slow) for t in NETWORKS]
+# The trainer knows no task by name: one task stands for all of them, the others are tried with the slow tests.
+SAMPLED = [pytest.param(t, marks=() if t == "wall_segmentation" else pytest.mark.slow) for t in NETWORKS]
 
 
 @pytest.mark.longer

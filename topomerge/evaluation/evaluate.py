@@ -42,7 +42,6 @@ from topomerge.evaluation.tables import (
     tabulate_matching,
     tabulate_methods,
     tabulate_ranking,
-    tabulate_robustness,
     write_csv,
     write_section,
 )
@@ -218,15 +217,11 @@ def tabulate_all(matches: list[Row], ranks: list[Row], merges: list[Row], settin
             if settings.data.real
             else []
         )
-    if any(m["change"] for m in matches):
-        tables.append(tabulate_robustness(ranks, matches, merges, settings))
     return [*tables, tabulate_reliability(matches, merges)]
 
 
 def tabulate_short(matches: list[Row], ranks: list[Row], merges: list[Row], settings: Evaluation) -> list[Table]:
     """Return the tables that go into the documentation."""
-    if any(m["change"] for m in matches):
-        return [tabulate_robustness(ranks, matches, merges, settings)]
     table_makers: dict[str, Callable[[], Table]] = {
         "ranking": lambda: tabulate_ranking(ranks, settings),
         "matching": lambda: tabulate_methods(matches, settings),

@@ -1,4 +1,4 @@
-"""Figures of an evaluation: reliability, recall by overlap, precision against recall, curves of robustness."""
+"""Figures of an evaluation: reliability, recall by overlap, precision against recall."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ def save_figures(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[
         ("reliability", _draw_reliability),
         ("overlap", _draw_overlap),
         ("pr", _draw_precision_recall),
-        ("robustness", _draw_robustness),
     ):
         figure = draw(ranks, matches, merges)
         if figure is not None:
@@ -143,39 +142,3 @@ def _draw_precision_recall(ranks: Sequence[Row], matches: Sequence[Row], merges:
     ax.set(xlabel="recall of rooms in common", ylabel="precision", xlim=(0, 1), ylim=(0, 1.02))
     _add_legend(ax)
     return figure
-
-
-def _draw_robustness(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]) -> Any:
-    """F1 against what was changed, one panel a change."""
-    changes = sorted({m["change"] for m in matches if m["change"]})
-    if not changes:
-        return None
-    figure, axes = _create_figure(len(changes))
-    for ax, change in zip(axes, changes, strict=True):
-        changed_rows = [
-            m for m in matches if m["change"] == change and m["k"] == 0 and m["method"] in ("assignment", "consistent", "mutual")
-        ]
-        values = sorted({m["value"] for m in changed_rows})
-        for name, rows in _group_rows([{**m, "title": f"{m['variant']}, {m['method']}"} for m in changed_rows], "title").items():
-            ax.plot(
-                values,
-                [compute_value([r for r in rows if r["value"] == v], "F1", 1).value for v in values],
-                "o-",
-                ms=4,
-                label=name,
-            )
-        joined = [m for m in merges if m["change"] == change]
-        if joined:
-            right = [compute_value([r for r in joined if r["value"] == v], "merged", 1).value for v in values]
-            ax.plot(values, right, "k--", lw=1, label="merged right")
-        ax.set(title=change, xlabel=LABELS[change], ylabel="F1", ylim=(0, 1.02))
-        if change == "density":
-            ax.set_xscale("log")
-        _add_legend(ax)
-    return figure
-
-
-LABELS = {
-    "density": "share of the points", "noise": "m of noise", "missing": "share of the surface missing",
-    "scale": "scale of the second map", "time": "share of the furniture moved or gone",
-}  # fmt: skip

@@ -106,8 +106,6 @@ def classify_pair(pair: EvaluationPair, settings: Evaluation) -> Row:
     title = about["title"] if real or own else pair.name
     origins = find_captures(source, title) if real else about["captures"] if own else (f"{pair.name}a", f"{pair.name}b")
     size = next(name for name, limit in AREAS if common < limit) if kind == "overlap" and common >= 1 else "none"
-    change = about.get("change") or ("", 0.0)
-    change = ("", 0.0) if change[0] == "plan" else change  # another sensor, no curve
     return {
         "pair": pair.name,
         "title": title,
@@ -126,8 +124,6 @@ def classify_pair(pair: EvaluationPair, settings: Evaluation) -> Row:
         "area": size,
         "large": common >= SHARED and kind == "overlap",
         "truth": about["rooms"],
-        "change": change[0],
-        "value": float(change[1]),
     }
 
 

@@ -183,26 +183,6 @@ def _list_methods(matches: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(m["method"] for m in matches if m["k"] == 0))
 
 
-def tabulate_robustness(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row], settings: Evaluation) -> Table:
-    """recall@1, F1 and merges against what was changed."""
-    rows = []
-    for change, changed in group_by([m for m in matches if m["change"]], "change").items():
-        for v in sorted({m["value"] for m in changed}):
-            for name in group_by_variant([m for m in changed if m["k"] == 0]):
-                these = [m for m in changed if m["value"] == v and m["variant"] == name]
-                cells = [
-                    format_value(compute_value([m for m in these if m["method"] == k], "F1", settings.rounds))
-                    for k in _list_methods(matches)
-                ]
-                present = [r for r in ranks if (r["change"], r["value"], r["variant"]) == (change, v, name)]
-                joined = [r for r in merges if (r["change"], r["value"], r["variant"]) == (change, v, name)]
-                first = compute_value(present, "recall@1", settings.rounds)
-                right = format_value(compute_value(joined, "merged", settings.rounds), False)
-                rows.append([change, f"{v:g}", name, str(first.pairs), format_value(first), *cells, right])
-    head = ["change", "value", "descriptor", "pairs", "recall@1", *(f"F1 {m}" for m in _list_methods(matches)), "merged right"]
-    return Table("Robustness", head, rows, 3)
-
-
 def iter_long_rows(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row], settings: Evaluation) -> Iterator[Row]:
     """Every metric of every group, one a row, for other tools."""
     for rows, metrics in ((ranks, (*RANKING, *AFTER)), (matches, MATCHING), (merges, (*MERGING, "false"))):

@@ -269,11 +269,7 @@ def read_in_subprocess(
         InputError: as the reader; or the child came to an end before it was done.
     """
     task = json.dumps([module, str(path), asdict(options), seconds, room])
-    arguments = [sys.executable, "-c", f"from {__name__} import main; main()", task]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    child = subprocess.Popen(
-        arguments, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL, env=environment
-    )
+    child = start_child(task)
     assert child.stdout is not None
     try:
         while (piece := _receive_piece(path, kind, child.stdout)) is not None:
@@ -285,6 +281,15 @@ def read_in_subprocess(
     finally:
         child.kill()
         child.communicate()
+
+
+def start_child(task: str) -> subprocess.Popen[bytes]:
+    """Start the process that reads: `main`, whose pieces come on its standard output."""
+    arguments = [sys.executable, "-c", f"from {__name__} import main; main()", task]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    return subprocess.Popen(
+        arguments, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL, env=environment
+    )
 
 
 def _receive_piece(path: Path, kind: str, stream: IO[bytes]) -> Piece | None:

@@ -330,8 +330,8 @@ def test_signs_change_nothing_else_of_a_recipe() -> None:
     assert {item.signs for item in after} == {"", "good", "poor"} and 10 < sum(bool(item.signs) for item in after) < 30
     assert all((one.name == other.name) == (not one.signs) for one, other in zip(after, before, strict=True))
     assert "signs" not in describe_item(before[0])
-    with pytest.raises(InputError, match="signs are of pairs that are not changed"):
-        check(replace(signed, vary={"noise": [0.1]}))
+    with pytest.raises(InputError, match="signs are of pairs of two walks"):
+        check(replace(signed, walks=3))
 
 
 @pytest.mark.longer

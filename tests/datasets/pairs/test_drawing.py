@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
 import shapely
 from scipy.spatial import cKDTree
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.pairs.drawing import draw, replace_map_with_plan
+from topomerge.datasets.pairs.drawing import draw
 from topomerge.datasets.pairs.flat_maps import extrude_flat
-from topomerge.datasets.pairs.pairs import PairSettings, make_pair
 
-from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 
 
@@ -28,21 +23,6 @@ def test_walls_stand_where_rooms_end_and_doors_are_open() -> None:
     assert shapely.distance(free, shapely.points(inner["centre"][:, :2])).max() < 0.2
     map = extract(extrude_flat(flat), carve=False)
     assert abs(len(map.rooms) - len(building.rooms)) <= 2 and len(map.edges) >= 0.7 * len(inner)
-
-
-def test_the_plan_lies_where_the_scan_would_be() -> None:
-    building = make_building("house", 3)
-    pair = make_pair(building, PairSettings(0.5, ("depth", "depth"), 4), 4)
-    drawn = replace_map_with_plan(pair, building)
-    assert drawn.truth == pair.truth and drawn.sensors == ("depth", "drawing")
-    assert drawn.truth is not None and drawn.frames is not None
-    for room, other in zip(drawn.a.rooms, drawn.b.rooms, strict=True):
-        corners = np.column_stack([other.polygon, np.full(len(other.polygon), other.floor)])
-        assert np.allclose(drawn.truth.apply(corners)[:, :2], room.polygon, atol=1e-6)
-        assert abs(drawn.truth.apply(corners)[0, 2] - room.floor) < 0.05
-    assert len(drawn.shared) >= len(pair.visited[0])
-    with pytest.raises(InputError, match="one storey"):
-        replace_map_with_plan(replace(pair, kind="twin-wing", shared=()), building)
 
 
 @pytest.mark.longer
