@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import zipfile
 from contextlib import suppress
 from pathlib import Path
@@ -10,8 +11,8 @@ import numpy as np
 import pytest
 
 from topomerge.errors import InputError
-from topomerge.io.karto import SCAN, get_pose, read_karto_graph
-from topomerge.io.native import NATIVE, Motion, Source, find_format, plan_outputs, save_joined
+from topomerge.io.karto import SCAN, WHOLE, build_planar_pose, get_pose, parse_karto_graph, read_karto_graph, write_archive
+from topomerge.io.native import NATIVE, Doubt, Motion, Source, find_format, plan_outputs, save_joined
 from topomerge.io.points import read_points
 from topomerge.types import transform_points
 
@@ -91,6 +92,60 @@ def test_what_does_not_move_stays_to_the_byte(folder: Path) -> None:
     save_joined(NATIVE["karto"], [Source(folder / "room.posegraph")], folder / "same.posegraph")
     for suffix in (".posegraph", ".data"):
         assert (folder / f"same{suffix}").read_bytes() == (folder / f"room{suffix}").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["room", "apart", "old"])
+def test_what_is_written_again_is_what_boost_wrote_to_the_byte(folder: Path, name: str) -> None:
+    path = folder / f"{name}.posegraph"
+    files = [file.read_bytes() for file in (path, path.with_suffix(".data"))]
+    graph = parse_karto_graph(path, files, WHOLE)
+    assert [write_archive(root, [archive]) for root, archive in zip(graph.roots, graph.archives, strict=True)] == files
+
+
+@pytest.mark.parametrize("name", ["room", "old"])
+def test_graphs_of_one_laser_become_one(folder: Path, name: str) -> None:
+    """`./new joined` and `./old joined` of `karto_archive.cpp` open these with Boost 1.74, too."""
+    path = folder / f"{name}.posegraph"
+    sources = [Source(path), Source(path, Motion(MOTION)), Source(path)]
+    ((target, form, members),) = plan_outputs(sources, folder)
+    assert target.name == "joined.posegraph" and members == sources
+    tally = save_joined(form, sources, target, Doubt(0.1, 0.02))
+    assert tally.counts["scans"] == (18, 18) and tally.counts["links between sessions"] == (6, 6)
+    joined, alone = (parse_karto_graph(p, [p.read_bytes(), p.with_suffix(".data").read_bytes()], WHOLE) for p in (target, path))
+    scans = list(joined.scans.values())
+    assert len({scan["state"] for scan in scans}) == 18 and joined.find_largest_part() == list(joined.scans)
+    poses, before = (np.array([build_planar_pose(*pose) for pose in graph.place_scans()]) for graph in (joined, alone))
+    for k, motion in enumerate([np.eye(4), MOTION, np.eye(4)]):
+        np.testing.assert_allclose(poses[6 * k : 6 * k + 6, :2], (motion @ before)[:, :2], atol=1e-12)
+        for a, b in zip(scans[6 * k : 6 * k + 6], alone.scans.values(), strict=True):
+            np.testing.assert_array_equal(a["ranges"], b["ranges"])
+            assert (a["time"], get_pose(a["odometry"])) == (b["time"], get_pose(b["odometry"]))
+    mapper, data = joined.roots
+    (manager,) = [own for _, own in mapper["manager"]["managers"]]
+    held = [scan for scan in (e[1] if isinstance(e, tuple) else e for e in manager["scans"]) if scan]
+    assert [s["id"] for s in held] == list(joined.scans) and manager["next"] == 1 + max(s["state"] for s in scans)
+    assert mapper["manager"]["next"] == 1 + max(joined.scans) and [k for k, _ in data["data"]] == list(joined.scans)
+    number = {id(scan): k for k, scan in enumerate(scans)}
+    for link in mapper["graph"]["edges"]:
+        a, b = number[id(link["a"]["scan"])], number[id(link["b"]["scan"])]
+        assert link in link["a"]["edges"] and link in link["b"]["edges"]
+        if a // 6 != b // 6:
+            relative = build_planar_pose(*get_pose(link["link"]["difference"]))
+            np.testing.assert_allclose((poses[a] @ relative)[:2], poses[b][:2], atol=1e-9)
+            np.testing.assert_allclose(link["link"]["covariance"]["rows"], np.diag([0.01, 0.01, 0.0004]))
+
+
+def test_graphs_of_two_lasers_are_moved_each_for_itself(folder: Path) -> None:
+    for suffix, was, now in ((".posegraph", b"", b""), (".data", struct.pack("<d", 12.0), struct.pack("<d", 11.0))):
+        data = (folder / f"room{suffix}").read_bytes()
+        (folder / f"other{suffix}").write_bytes(data.replace(was, now) if was else data)
+    (folder / "cut.posegraph").write_bytes((folder / "room.posegraph").read_bytes() + b"later")  # of a version with more in it
+    (folder / "cut.data").write_bytes((folder / "room.data").read_bytes())
+    names = ["room", "other", "cut", "old", "room"]
+    plan = plan_outputs([Source(folder / f"{name}.posegraph") for name in names], folder)
+    assert [(path.name, len(of)) for path, _, of in plan] == [
+        ("joined.posegraph", 2), ("other_moved.posegraph", 1), ("cut_moved.posegraph", 1), ("old_moved.posegraph", 1),
+    ]  # fmt: skip
 
 
 def test_a_tilted_map_is_refused(folder: Path) -> None:

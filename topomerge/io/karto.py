@@ -2,14 +2,14 @@
 
 Both are binary archives of Boost: the members of an object in their order, without names. Where a class comes first, it is told
 whether its objects are counted, and in which version. An object behind a pointer has the number of its class, and is written
-where it is first met. So all that comes before the graph has to be known; what comes after it is not read.
+where it is first met. So all that comes before the graph has to be known; what comes after it is read only to write it again.
 Source: `lib/karto_sdk/include/karto_sdk/{Karto,Mapper}.h` of slam_toolbox (ROS 1 Melodic to ROS 2 Jazzy), and
 `basic_oarchive.cpp` of Boost.Serialization (tried: 1.74).
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -29,8 +29,15 @@ LARGEST = 1 << 32  # bytes of a file
 MOST_ITEMS = 1 << 23  # of a list of objects
 MOST_READINGS = 1 << 16  # of a scan
 ADVICE = "save the map as a grid (`ros2 run nav2_map_server map_saver_cli`), or give a bag of the scans"
+END = "end"  # as size: an array to the end of the file
 NUMBERS = {"bool": "?", "u1": "B", "i4": "<i4", "u4": "<u4", "f8": "<f8"}
-ABSTRACT = ("AbstractParameter", "Object", "Sensor", "CustomData")  # only what derives from them is behind a pointer
+ABSTRACT = (
+    "AbstractParameter",
+    "Object",
+    "Sensor",
+    "CustomData",
+    "GraphTraversal",
+)  # only what derives from them is behind a pointer
 SCAN = "LocalizedRangeScan"
 CLASSES = {  # members in their order, `name:type`; without a name: a base. What follows the graph is left out.
     "NonCopyable": "",
@@ -86,13 +93,31 @@ LAYOUTS = (  # since 2019, and before
     {"Graph": "edges:vector<Edge*> vertices:map<Name,map<i4,Vertex*>>"},
     {"Graph": "edges:vector<Edge*> vertices:map<Name,vector<Vertex*>>"},
 )
+_SCANS = (f"scans:map<i4,{SCAN}*>", f"scans:vector<{SCAN}*>")
+WHOLE = tuple(  # with what follows the graph; parameters are those that the module lists, once more
+    {
+        **layout,
+        "MapperGraph": "Graph mapper:Mapper* matcher:ScanMatcher* walk:GraphTraversal*",
+        "GraphTraversal": "graph:Graph*",
+        f"BreadthFirstTraversal<{SCAN}>": "GraphTraversal",
+        "ScanManager": f"{scans} running:vector<{SCAN}*> last:{SCAN}* most:u4 longest:f8 next:u4",
+        "MapperSensorManager": f"managers:map<Name,ScanManager*> most:u4 longest:f8 next:i4 {scans}",
+        "MapperListener": "",
+        "Mapper": (
+            f"{CLASSES['Mapper']} manager:MapperSensorManager* listeners:vector<MapperListener*> "
+            f"settings:AbstractParameter*[{END}]"
+        ),
+        "Dataset": f"{CLASSES['Dataset']} devices:vector<Object*> info:DatasetInfo*",
+    }
+    for layout, scans in zip(LAYOUTS, _SCANS, strict=True)
+)
 ALIASES = {
     "Parameter<unsignedint>": "Parameter<int32u>",
     "Parameter<uint32_t>": "Parameter<int32u>",
     "Parameter<int>": "Parameter<int32s>",
 }
 Members = dict[str, Any]
-Reading = Generator[Any, Any, Any]
+Passing = Generator[Any, Any, Any]
 
 
 @cache
@@ -108,33 +133,44 @@ def _split(text: str) -> tuple[str, ...]:
 
 
 class BinaryArchive:
-    """A binary archive of Boost that is read from its start: what it said of classes, and its objects.
+    """A binary archive of Boost that is read or written from its start: what it says of classes, and its objects.
+
+    One description of the classes serves both ways, as Boost's `archive & member` does: what is written is passed in as `value`.
 
     Args:
         data: of the file.
         layout: classes that differ between versions.
+        like: writes, in place of reading: descriptions of classes are those of these archives, the head is that of the first.
     """
 
-    def __init__(self, data: bytes, layout: Mapping[str, str]) -> None:
-        self.data, self.at = data, len(SIGNATURE)
+    def __init__(self, data: bytes, layout: Mapping[str, str], like: Sequence[BinaryArchive] = ()) -> None:
+        self.data, self.at, self.out = data, len(SIGNATURE), bytearray()
+        self.layout, self.like = layout, like
         self.members = {**CLASSES, **layout}
         self.numbers: dict[str, int] = {}  # of classes, in the order in which they were met
         self.counted: dict[str, bool] = {}  # of those that were described: are its objects counted?
+        self.names: dict[str, str] = {}  # of classes, as the archive writes them
         self.objects: list[Any] = []
+        self.entered: dict[tuple[int, str], int] = {}  # numbers of objects that were written
         self.found: dict[str, list[Members]] = {SCAN: [], "LinkInfo": [], "Edge": []}
 
     def read(self, kind: str) -> Members:
-        """Read the object with which the archive begins; graphs are deeper than Python's stack.
+        """Read the object with which the archive begins.
 
         Raises:
             ValueError: it is damaged, of another layout, or another kind of archive.
         """
-        library = self._read_number("<u2")
+        library = self._move_number("<u2")
         if not LIBRARY[0] <= library <= LIBRARY[1]:
             raise ValueError(f"an archive of version {library} of Boost")
         if self._take(len(SIZES)) != SIZES:
             raise ValueError("an archive of another kind of machine")
-        stack, value = [self._read_object(kind)], None
+        return self._run(kind)
+
+    def _run(self, kind: str, value: Members | None = None) -> Members:
+        """Go through an object; graphs are deeper than Python's stack."""
+        stack = [self._move_object(kind, value)]
+        value = None
         while stack:
             try:
                 stack.append(stack[-1].send(value))
@@ -151,144 +187,188 @@ class BinaryArchive:
         self.at += count
         return self.data[self.at - count : self.at]
 
-    def _read_number(self, form: str) -> Any:
+    def _move_block(self, form: str, count: int, values: Any = None) -> Array:
+        """Numbers that lie behind each other."""
         kind = np.dtype(form)
-        return np.frombuffer(self._take(kind.itemsize), kind)[0].item()
+        if self.like:
+            self.out += np.asarray(values, kind).tobytes()
+            return np.asarray(values)
+        return np.frombuffer(self._take(count * kind.itemsize), kind)
 
-    def _read_count(self, most: int = MOST_ITEMS) -> int:
-        count = int(self._read_number("<u8"))
-        if count > min(most, len(self.data) - self.at):
+    def _move_number(self, form: str, value: Any = None) -> Any:
+        return self._move_block(form, 1, value if value is None else [value])[0].item()
+
+    def _move_count(self, value: int, most: int = MOST_ITEMS) -> int:
+        count = int(self._move_number("<u8", value))
+        if not self.like and count > min(most, len(self.data) - self.at):
             raise ValueError(f"a list of {count:,} entries")
         return count
 
-    def _read_text(self) -> str:
-        return self._take(self._read_count(1 << 20)).decode(errors="replace")
+    def _move_text(self, value: str | None) -> str:
+        data = (value or "").encode(errors="surrogateescape")
+        count = self._move_count(len(data), 1 << 20)
+        if self.like:
+            self.out += data
+            return value or ""
+        return self._take(count).decode(errors="surrogateescape")
 
     def _register(self, kind: str) -> None:
         self.numbers.setdefault(kind, len(self.numbers))
 
     def _describe(self, kind: str) -> bool:
-        """Read what is said of a class where it comes first; are its objects counted?"""
+        """Say of a class, where it comes first, whether its objects are counted."""
         if kind not in self.counted:
-            counted, version = self._read_number("u1"), self._read_number("<u4")
+            known = next((archive.counted[kind] for archive in self.like if kind in archive.counted), False)
+            counted, version = self._move_number("u1", known), self._move_number("<u4", 0)
             if counted > 1 or version:
                 raise ValueError(f"version {version} of {kind}")
             self.counted[kind] = bool(counted)
         return self.counted[kind]
 
-    def _count(self, kind: str) -> int | None:
-        """The number of an object that was read before; a new one is entered."""
-        number = int(self._read_number("<u4"))
-        if number > len(self.objects):
+    def _enter(self, kind: str, value: Any) -> tuple[int, bool]:
+        """The number of an object, and whether it is new."""
+        held = len(self.objects)
+        number = int(self._move_number("<u4", self.entered.get((id(value), kind), held)))
+        if number > held:
             raise ValueError(f"object {number:,} before its time")
-        if number < len(self.objects):
-            return number
-        self.objects.append(None)
-        return None
+        if number == held:
+            self.objects.append(value)
+            self.entered[id(value), kind] = held
+        return number, number == held
 
-    def _read(self, kind: str) -> Reading:
+    def _move(self, kind: str, value: Any) -> Passing:
         """A member of any type."""
         if kind in NUMBERS:
-            return self._read_number(NUMBERS[kind])
+            return self._move_number(NUMBERS[kind], value)
         if kind == "str":
-            return self._read_text()
+            return self._move_text(value)
         if kind.endswith("*"):
-            return (yield self._read_pointer(kind[:-1]))
-        return (yield self._read_object(kind))
+            return (yield self._move_pointer(kind[:-1], value))
+        return (yield self._move_object(kind, value))
 
-    def _read_pointer(self, kind: str) -> Reading:
-        if kind not in ABSTRACT:
-            self._register(kind)
-        number = self._read_number("<i2")
+    def _move_class(self, value: Members | None) -> str | None:
+        """The class of what is behind a pointer."""
+        kind = "" if value is None else value["class"]
+        number = self._move_number("<i2", self.numbers.get(kind, len(self.numbers)) if value is not None else -1)
         if number == -1:
             return None
-        if number == len(self.numbers):  # a class that was not met: by its name
-            name = self._read_text().replace(" ", "").replace("karto::", "").replace("kt_", "")
-            kind = ALIASES.get(name, name)
-            if kind not in self.members or kind in self.numbers:
-                raise ValueError(f"an object of class {name[:60]!r}")
-            self._register(kind)
-        elif 0 <= number < len(self.numbers):
-            kind = list(self.numbers)[number]
-        else:
-            raise ValueError(f"an object of class {number}")
-        if self._describe(kind):
-            old = self._count(kind)
-            if old is not None:
-                return self.objects[old]
-        return (yield self._fill(kind, len(self.objects) - 1 if self.counted[kind] else None))
+        if number != len(self.numbers):
+            if not 0 <= number < len(self.numbers):
+                raise ValueError(f"an object of class {number}")
+            return list(self.numbers)[number]
+        text = self._move_text(next((archive.names[kind] for archive in self.like if kind in archive.names), None))
+        name = text.replace(" ", "").replace("karto::", "").replace("kt_", "")
+        kind = ALIASES.get(name, name)
+        if kind not in self.members or kind in self.numbers:
+            raise ValueError(f"an object of class {name[:60]!r}")
+        self.names[kind] = text
+        self._register(kind)
+        return kind
 
-    def _read_object(self, kind: str) -> Reading:
+    def _move_pointer(self, static: str, value: Members | None) -> Passing:
+        if static not in ABSTRACT:
+            self._register(static)
+        kind, number = self._move_class(value), None
+        if kind is None:
+            return None
+        if self._describe(kind):
+            number, new = self._enter(kind, value)
+            if not new:
+                return self.objects[number]
+        return (yield self._fill(kind, number, value))
+
+    def _move_object(self, kind: str, value: Any) -> Passing:
         self._register(kind)
         if kind == "vector<f8>":  # lists of numbers are not described
-            return np.frombuffer(self._take(8 * self._read_count()), "<f8")
-        if self._describe(kind) and self._count(kind) is not None:
-            raise ValueError(f"{kind} twice")
-        return (yield self._fill(kind, len(self.objects) - 1 if self.counted[kind] else None))
+            return self._move_block("<f8", self._move_count(0 if value is None else len(value)), value)
+        number = None
+        if self._describe(kind):
+            number, new = self._enter(kind, value)
+            if not new:
+                raise ValueError(f"{kind} twice")
+        return (yield self._fill(kind, number, value))
 
-    def _fill(self, kind: str, number: int | None) -> Reading:
+    def _fill(self, kind: str, number: int | None, value: Any) -> Passing:
         """The content of an object, a pair or a list."""
         head, _, rest = kind.partition("<")
         inner = _split(rest[:-1]) if head in ("vector", "map", "pair") else ()
         if head == "vector":
-            return (yield self._read_list(inner[0]))
+            return (yield self._move_list(inner[0], value))
         if head == "map":
-            return (yield self._read_list(f"pair<{inner[0]},{inner[1]}>"))
+            return (yield self._move_list(f"pair<{inner[0]},{inner[1]}>", value))
         if head == "pair":
-            first = yield self._read(inner[0])
-            return first, (yield self._read(inner[1]))
-        members: Members = {"class": kind}
+            first = yield self._move(inner[0], value and value[0])
+            return first, (yield self._move(inner[1], value and value[1]))
+        members: Members = value if self.like else {"class": kind}
         if number is not None:
             self.objects[number] = members
         for member in self.members[kind].split():
             name, _, of = member.rpartition(":")
+            at = self.at
             if not name:
-                members |= {k: v for k, v in (yield self._read(of)).items() if k != "class"}
+                base = yield self._move(of, value)
+                members |= {} if self.like else {k: v for k, v in base.items() if k != "class"}
             elif of.endswith("]"):
-                members[name] = yield self._read_array(of, members)
+                members[name] = yield self._move_array(of, members, members.get(name))
             else:
-                at = self.at
-                members[name] = yield self._read(of)
+                members[name] = yield self._move(of, members.get(name))
                 members[f"@{name}"] = at, self.at
         if kind in self.found:
             self.found[kind].append(members)
         return members
 
-    def _read_list(self, kind: str) -> Reading:
-        count = self._read_count()
-        if self._read_number("<u4"):
+    def _move_list(self, kind: str, values: Any) -> Passing:
+        count = self._move_count(0 if values is None else len(values))
+        if self._move_number("<u4", 0):
             raise ValueError(f"another version of {kind}")
         if kind != "Vector2<double>" or not count:
-            out = []
-            for _ in range(count):
-                out.append((yield self._read(kind)))
-            return out
+            return (yield self._move_all(kind, count, values))
         self._register(kind)
         if self._describe(kind):
             raise ValueError(f"{kind} is counted")
-        return np.frombuffer(self._take(16 * count), "<f8").reshape(-1, 2)
+        return self._move_block("<f8", 2 * count, values).reshape(-1, 2)
 
-    def _read_array(self, kind: str, members: Members) -> Reading:
-        """An array, whose length other members tell."""
+    def _move_all(self, kind: str, count: int, values: Any) -> Passing:
+        out = []
+        for k in range(count):
+            out.append((yield self._move(kind, None if values is None else values[k])))
+        return out
+
+    def _move_array(self, kind: str, members: Members, values: Any) -> Passing:
+        """An array, whose length other members tell, or the end of the file."""
         of, *sizes = kind.replace("]", "").split("[")
         if of == "f8" and sizes == ["3", "3"]:
-            rows = [self._read_row() for _ in range(self._read_count(3))]
-            return np.array(rows)
+            rows = range(self._move_count(3, 3))
+            return np.array(
+                [self._move_block("<f8", self._move_count(3, 3), values if values is None else values[k]) for k in rows]
+            )
+        if sizes == [END]:
+            out: list[Any] = []
+            while self.at < len(self.data) if values is None else len(out) < len(values):
+                out.append((yield self._move(of, None if values is None else values[len(out)])))
+            return out
         count = 1
         for size in sizes[0].split("*"):
             count *= len(members[size]) if hasattr(members[size], "__len__") else int(members[size])
         if of in NUMBERS:
-            form = np.dtype(NUMBERS[of])
-            return np.frombuffer(self._take(count * form.itemsize), form)
+            return self._move_block(NUMBERS[of], count, values)
         if not 0 <= count <= MOST_ITEMS:
             raise ValueError(f"an array of {count:,} entries")
-        out = []
-        for _ in range(count):
-            out.append((yield self._read(of)))
-        return out
+        return (yield self._move_all(of, count, values))
 
-    def _read_row(self) -> Array:
-        return np.frombuffer(self._take(8 * self._read_count(3)), "<f8")
+
+def write_archive(value: Members, like: Sequence[BinaryArchive]) -> bytes:
+    """Write an object as an archive, whose classes are described as in others, of one layout.
+
+    Raises:
+        ValueError: these describe a class in two ways.
+    """
+    for archive in like[1:]:
+        if any(like[0].counted.get(kind, counted) != counted for kind, counted in archive.counted.items()):
+            raise ValueError("they were written by different builds of slam_toolbox")
+    writer = BinaryArchive(b"", like[0].layout, like)
+    writer._run(value["class"], value)
+    return like[0].data[: len(SIGNATURE) + 2 + len(SIZES)] + bytes(writer.out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,12 +380,14 @@ class KartoGraph:
         links: (n, 2) numbers of scans.
         lasers: by their name.
         archives: of the pose graph and of its data, for their bytes.
+        roots: what they hold, a Mapper and a Dataset.
     """
 
     scans: dict[int, Members]
     links: Array
     lasers: dict[str, Members]
     archives: tuple[BinaryArchive, BinaryArchive]
+    roots: tuple[Members, Members]
 
     def place_scans(self) -> Array:
         """Place (n, 3) robots of the scans: x, y, heading."""
@@ -340,43 +422,63 @@ def read_karto_graph(path: Path) -> KartoGraph:
         raise InputError(
             f"{path}: {companion.name} is not beside it, which knows the laser; copy both files that slam_toolbox saved"
         )
-    graph, _ = _read_archive(path, "Mapper")
-    data, dataset = _read_archive(companion, "Dataset")
+    return parse_karto_graph(path, [_read_bytes(file) for file in (path, companion)])
+
+
+def _read_bytes(path: Path) -> bytes:
+    if path.stat().st_size > LARGEST:
+        raise InputError(f"{path}: has more than {LARGEST >> 30} GB, too many for {KIND}; {ADVICE}")
+    data = path.read_bytes()
+    if not data.startswith(SIGNATURE):
+        raise InputError(f"{path}: is not {KIND}: no binary archive of Boost for 64 bits; check the file, or {ADVICE}")
+    return data
+
+
+def parse_karto_graph(path: Path, files: Sequence[bytes], layouts: Sequence[Mapping[str, str]] = LAYOUTS) -> KartoGraph:
+    """Parse a pose graph and its data.
+
+    Args:
+        layouts: `WHOLE`, with what follows the graph.
+
+    Raises:
+        InputError: as `read_karto_graph`.
+    """
+    companion = path.with_suffix(".data")
+    graph, mapper = _parse_archive(path, files[0], "Mapper", layouts)
+    data, dataset = _parse_archive(companion, files[1], "Dataset", layouts)
     scans = {int(scan["id"]): scan for scan in graph.found[SCAN]}
-    lasers = {_get_name(name): laser for name, laser in dataset["lasers"] if laser and laser["class"] == "LaserRangeFinder"}
+    lasers = {get_name(name): laser for name, laser in dataset["lasers"] if laser and laser["class"] == "LaserRangeFinder"}
     if len(scans) != len(graph.found[SCAN]) or not scans:
         raise build_damage_error(path, KIND, "it has no scans, or two of one number")
     ends = [(e["a"]["scan"]["id"], e["b"]["scan"]["id"]) for e in graph.found["Edge"] if _is_whole(e)]
     for scan in scans.values():
-        laser = lasers.get(_get_name(scan["sensor"]))
+        laser = lasers.get(get_name(scan["sensor"]))
         if laser is None or laser["count"] != len(scan["ranges"]) or laser["count"] > MOST_READINGS:
             raise InputError(f"{path}: {companion.name} does not know the laser of its scans; copy both files of one saving")
         if not np.isfinite(get_pose(scan["pose"])).all():
             raise build_damage_error(path, KIND, "a pose that is none")
-    return KartoGraph(dict(sorted(scans.items())), np.array(ends, np.int64).reshape(-1, 2), lasers, (graph, data))
+    return KartoGraph(
+        dict(sorted(scans.items())), np.array(ends, np.int64).reshape(-1, 2), lasers, (graph, data), (mapper, dataset)
+    )
 
 
 def _is_whole(edge: Members) -> bool:
     return all(edge[end] is not None and edge[end]["scan"] is not None for end in "ab")
 
 
-def _get_name(name: Members) -> str:
+def get_name(name: Members) -> str:
+    """Return a Name as text."""
     return f"{name['scope']}/{name['name']}"
 
 
-def _read_archive(path: Path, kind: str) -> tuple[BinaryArchive, Members]:
+def _parse_archive(path: Path, data: bytes, kind: str, layouts: Sequence[Mapping[str, str]]) -> tuple[BinaryArchive, Members]:
     """Read an archive in the first layout that fits.
 
     Raises:
         InputError: in none.
     """
-    if path.stat().st_size > LARGEST:
-        raise InputError(f"{path}: has more than {LARGEST >> 30} GB, too many for {KIND}; {ADVICE}")
-    data = path.read_bytes()
-    if not data.startswith(SIGNATURE):
-        raise InputError(f"{path}: is not {KIND}: no binary archive of Boost for 64 bits; check the file, or {ADVICE}")
     reasons = []
-    for layout in LAYOUTS:
+    for layout in layouts:
         archive = BinaryArchive(data, layout)
         try:
             return archive, archive.read(kind)
@@ -396,7 +498,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     poses, points = [], []
     for number in chosen:
         scan = graph.scans[number]
-        laser = graph.lasers[_get_name(scan["sensor"])]
+        laser = graph.lasers[get_name(scan["sensor"])]
         pose = build_planar_pose(*get_pose(scan["pose"])) @ build_planar_pose(*get_pose(laser["offset"]["value"]))
         ranges, about = scan["ranges"], [laser[name]["value"] for name in ("low", "step", "nearest", "threshold")]
         seen = np.isfinite(ranges) & (ranges >= about[2]) & (ranges <= about[3])

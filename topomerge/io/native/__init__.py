@@ -102,21 +102,22 @@ class Tally:
 
 @dataclass(frozen=True)
 class Format:
-    """A format: what such files are called, their suffixes, the module that writes them, whether several become one, and the
-    suffix of a file that is written beside."""
+    """A format: what such files are called, their suffixes, the module that writes them, whether several become one, the
+    suffix of a file that is written beside, and whether only those of one group are joined (`find_group` of the module)."""
 
     name: str
     suffixes: tuple[str, ...]
     module: str
     joins: bool = False
     companion: str = ""
+    grouped: bool = False
 
 
 NATIVE = {
     "rtabmap": Format("an RTAB-Map database", (".db",), "rtabmap", joins=True),
     "g2o": Format("a pose graph", (".g2o",), "pose_graph", joins=True),
     "pbstream": Format("a state of Cartographer", (".pbstream",), "pbstream", joins=True),
-    "karto": Format("a pose graph of slam_toolbox", (".posegraph",), "karto", companion=".data"),
+    "karto": Format("a pose graph of slam_toolbox", (".posegraph",), "karto", joins=True, companion=".data", grouped=True),
     "dsg": Format("a scene graph", (".json",), "scene_graph", joins=True),
     "e57": Format("an E57 file", (".e57",), "stations"),
     "las": Format("a LAS file", (".las", ".laz"), "clouds"),
@@ -155,6 +156,8 @@ def plan_outputs(sources: Sequence[Source], folder: Path) -> list[tuple[Path, Fo
             able = f"only {list_native_suffixes()} are written again with new poses"
             raise InputError(f"{source.path}: {able}; leave it out, or take its points by `merge --points`")
         key = form.module if form.joins else str(number)
+        if form.grouped:
+            key += import_module(f"topomerge.io.native.{form.module}").find_group(source.path)
         groups.setdefault(key, (form, []))[1].append(source)
     taken: set[str] = set()
     plan = []

@@ -1,37 +1,176 @@
-"""Pose graphs of slam_toolbox moved into the joined frame: poses of scans, their points and the ends of their links.
+"""Pose graphs of slam_toolbox in the joined frame: those of one laser as one graph, others moved.
 
-The files are copied, and only these numbers are written anew, where they stand. What is relative stays: odometry, ranges,
-differences of links and their covariance. slam_toolbox's own tool for merging takes such files, and so does its localisation.
+What moves is written anew where it stands: poses of scans, their points and the ends of their links. What is relative stays:
+odometry, ranges, differences of links and their covariance. Graphs are joined as objects then, and written with new numbers.
 """
 
 from __future__ import annotations
 
+import json
 import struct
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.karto import SCAN, BinaryArchive, Members, build_planar_pose, get_pose, read_karto_graph
-from topomerge.io.native import NATIVE, Doubt, Motion, Source, Tally
+from topomerge.io.karto import (
+    LAYOUTS,
+    SCAN,
+    WHOLE,
+    BinaryArchive,
+    KartoGraph,
+    Members,
+    build_planar_pose,
+    get_pose,
+    parse_karto_graph,
+    read_karto_graph,
+    write_archive,
+)
+from topomerge.io.native import NATIVE, Doubt, Motion, Source, Tally, find_nearest_links
 from topomerge.types import Array
+
+LASER = ("low", "high", "step", "nearest", "farthest", "threshold", "kind")
+
+
+def find_group(path: Path) -> str:
+    """Find what graphs must have in common to be joined: the laser, and the layout of their files.
+
+    slam_toolbox takes the first laser of a file for all of its scans. A graph of several, one without links, or one in which what
+    follows the graph is of a version that is not known, is joined with no other.
+
+    Raises:
+        InputError: it can't be read.
+    """
+    graph = read_karto_graph(path)
+    try:
+        graph = _parse_whole(path, [archive.data for archive in graph.archives])
+    except InputError:
+        return str(path)
+    mapper, data = graph.roots
+    of_lasers = graph.lasers, data["lasers"], data["devices"], mapper["graph"]["vertices"], mapper["manager"]["managers"]
+    if any(len(of) != 1 for of in of_lasers) or not {"Edge", "LinkInfo"} <= graph.archives[0].counted.keys():
+        return str(path)
+    (laser,) = graph.lasers.values()
+    values = [*(laser[name]["value"] for name in LASER), *get_pose(laser["offset"]["value"]), laser["count"]]
+    return json.dumps([_find_layout(graph), values])
+
+
+def _find_layout(graph: KartoGraph) -> int:
+    return [layout["Graph"] for layout in LAYOUTS].index(graph.archives[0].layout["Graph"])
+
+
+def _parse_whole(path: Path, files: Sequence[bytes]) -> KartoGraph:
+    return parse_karto_graph(path, files, WHOLE)
 
 
 def join(sources: Sequence[Source], target: Path, doubt: Doubt) -> Tally:
-    """Write a pose graph moved, and the data beside it.
+    """Write pose graphs of one group (`find_group`) as one, and the data beside it; a single one is moved.
 
     Raises:
-        InputError: it is damaged, or its map is tilted.
+        InputError: one is damaged, or its map is tilted.
     """
-    (source,) = sources
-    if not source.motion.level:
-        raise InputError(f"{source.path}: is a pose graph in a plane, and its map is tilted; it can't be written truly")
-    graph = read_karto_graph(source.path)
-    for archive, path in zip(graph.archives, (target, target.with_suffix(NATIVE["karto"].companion)), strict=True):
-        path.write_bytes(archive.data if source.motion.still else _move_archive(archive, source.motion))
-    scans, links = len(graph.scans), len(graph.links)
-    return Tally({"scans": (scans, scans), "links": (links, links)})
+    graphs, files = [], []
+    for source in sources:
+        if not source.motion.level:
+            raise InputError(f"{source.path}: is a pose graph in a plane, and its map is tilted; it can't be written truly")
+        graphs.append(read_karto_graph(source.path))
+        still = source.motion.still
+        files.append([a.data if still else _move_archive(a, source.motion) for a in graphs[-1].archives])
+    scans, links, between = (sum(map(len, of)) for of in ([g.scans for g in graphs], [g.links for g in graphs], []))
+    if len(sources) > 1:
+        wholes = [_parse_whole(source.path, file) for source, file in zip(sources, files, strict=True)]
+        between = _join_graphs(wholes, doubt)
+        files = [[write_archive(wholes[0].roots[k], [whole.archives[k] for whole in wholes]) for k in (0, 1)]]
+    for data, path in zip(files[0], (target, target.with_suffix(NATIVE["karto"].companion)), strict=True):
+        path.write_bytes(data)
+    written = parse_karto_graph(target, files[0])
+    counts = {"scans": (scans, len(written.scans)), "links": (links + between, len(written.links))}
+    return Tally(counts | ({"links between sessions": (between, between)} if len(sources) > 1 else {}))
+
+
+def _join_graphs(graphs: Sequence[KartoGraph], doubt: Doubt) -> int:
+    """Put the scans and links of all graphs into the first one; how many links between them were added."""
+    first, vertices, places = graphs[0], [], []
+    for k, graph in enumerate(graphs):
+        own = [v for _, of in graph.roots[0]["graph"]["vertices"] for v in _list_values(of) if v and v["scan"]]
+        vertices.append(own)
+        places.append(np.array([[*get_pose(v["scan"]["pose"])[:2], 0.0] for v in own]).reshape(-1, 3))
+        if k:
+            _renumber(graph, first)
+            _put_in(graph, first)
+    links = 0
+    for a, i, b, j in find_nearest_links(places):
+        _link(first, vertices[a][i], vertices[b][j], doubt)
+        links += 1
+    return links
+
+
+def _list_values(of: Sequence[Any]) -> list[Any]:
+    """What a list holds, or a map of numbers."""
+    return [entry[1] if isinstance(entry, tuple) else entry for entry in of]
+
+
+def _renumber(graph: KartoGraph, first: KartoGraph) -> None:
+    """Give the scans of a graph numbers that those of the first one do not have, and the name of its laser."""
+    manager = first.roots[0]["manager"]
+    step = max(manager["next"], len(manager["scans"]), 1 + max(int(scan["id"]) for scan in _list_scans(first)))
+    state = max(1 + int(scan["state"]) for scan in _list_scans(first))
+    for _, of in manager["managers"]:
+        state = max(state, of["next"], len(of["scans"]))
+    ((name, _),) = first.roots[1]["lasers"]
+    for scan in _list_scans(graph):
+        scan["id"] += step
+        scan["state"] += state
+        scan["sensor"] |= {"name": name["name"], "scope": name["scope"]}
+
+
+def _list_scans(graph: KartoGraph) -> list[Members]:
+    """The scans of both files: each has its own."""
+    return [scan for archive in graph.archives for scan in archive.found[SCAN]]
+
+
+def _put_in(graph: KartoGraph, first: KartoGraph) -> None:
+    """Put renumbered scans, and their links, into the lists of the first graph."""
+    (mapper, data), (own, own_data) = first.roots, graph.roots
+    mapper["graph"]["edges"] += own["graph"]["edges"]
+    ((_, vertices),) = mapper["graph"]["vertices"]
+    _extend(vertices, [v for _, of in own["graph"]["vertices"] for v in _list_values(of) if v], lambda v: int(v["scan"]["state"]))
+    ((_, of),) = mapper["manager"]["managers"]
+    scans = [scan for scan in _list_values(own["manager"]["scans"]) if scan]
+    _extend(of["scans"], scans, lambda scan: int(scan["state"]))
+    _extend(mapper["manager"]["scans"], scans, lambda scan: int(scan["id"]))
+    of["next"] = 1 + max(int(scan["state"]) for scan in _list_scans(graph))
+    mapper["manager"]["next"] = 1 + max(int(scan["id"]) for scan in _list_scans(graph))
+    data["data"] += [(int(scan["id"]), scan) for _, scan in own_data["data"] if scan]
+
+
+def _extend(of: list[Any], entries: Sequence[Any], get_number: Any) -> None:
+    """Put entries into a map of numbers; a list, as before 2019, has each at its number."""
+    if of and isinstance(of[0], tuple):
+        of += [(get_number(entry), entry) for entry in entries]
+        return
+    for entry in entries:
+        of += [None] * (get_number(entry) - len(of) + 1)
+        of[get_number(entry)] = entry
+
+
+def _link(graph: KartoGraph, a: Members, b: Members, doubt: Doubt) -> None:
+    """Add a link between two scans, as Karto's LinkInfo: the covariance is that of the second one in the first one's frame."""
+    ends = [get_pose(vertex["scan"]["pose"]) for vertex in (a, b)]
+    relative = np.linalg.inv(build_planar_pose(*ends[0])) @ build_planar_pose(*ends[1])
+    turn = float(np.arctan2(relative[1, 0], relative[0, 0]))
+    poses = [_build_pose(*end) for end in (*ends, (float(relative[0, 3]), float(relative[1, 3]), turn))]
+    covariance = {"class": "Matrix3", "rows": np.diag([doubt.place**2, doubt.place**2, doubt.turn**2])}
+    info = {"class": "LinkInfo", **dict(zip(("a", "b", "difference"), poses, strict=True)), "covariance": covariance}
+    edge = {"class": "Edge", "a": a, "b": b, "link": info}
+    for edges in (a["edges"], b["edges"], graph.roots[0]["graph"]["edges"]):
+        edges.append(edge)
+
+
+def _build_pose(x: float, y: float, heading: float) -> Members:
+    return {"class": "Pose2", "place": {"class": "Vector2<double>", "x": x, "y": y}, "heading": heading}
 
 
 def _move_archive(archive: BinaryArchive, motion: Motion) -> bytes:
