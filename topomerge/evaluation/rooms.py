@@ -29,6 +29,7 @@ from topomerge.evaluation.scans import EDITED_SOURCE, Case, Scan, load_scan
 from topomerge.evaluation.tasks import Row, TaskSettings, find_optional_data, limit_cases, measure_missing
 from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS
+from topomerge.extraction.zones import cut_zones
 from topomerge.types import LogFn
 
 MAKERS = ("topomerge.extraction.extract", "topomerge.metrics", "topomerge.evaluation.scans")
@@ -44,6 +45,7 @@ COLUMNS = {
 }  # fmt: skip
 WITH_INTERVAL = ("iou", "mcc")
 FAILED = 0.5  # mean IoU
+ZONED = ("home", "ipa", "gdc")  # sources of real grids, whose zones are scored beside their rooms
 LISTED = ("dev", "homes", "grids", "look")  # sets whose cases are listed
 HEADLINES = {  # set of cases -> figure of the README
     "ordinary": "rooms-simulated",
@@ -147,7 +149,7 @@ def measure_case(case: Case, preset: str, scans: Path, data: Path | None, pictur
         row |= {"points": len(scan.cloud), "levels_found": len(extracted.storeys)}
         picture = Path(pictures) / f"{case.name}-{preset}.png" if pictures else None
         if scan.truth is not None:
-            row |= score_map(scan, extracted, f"{case.name}  {preset}", picture)
+            row |= score_map(scan, extracted, f"{case.name}  {preset}", picture, case.source in ZONED)
         elif picture:
             from topomerge.viz.figures import save_figure
 
@@ -166,8 +168,8 @@ def load_compiled(preset: str) -> None:
         extract(np.concatenate([*box, *(b[:, [1, 0, 2]] for b in box[2:])]), preset=preset)
 
 
-def score_map(scan: Scan, extracted: Any, name: str, picture: Path | None) -> Row:
-    """Score the rooms, doors, edges and storeys of a map; draw them where a file is named."""
+def score_map(scan: Scan, extracted: Any, name: str, picture: Path | None, zones: bool = False) -> Row:
+    """Score the rooms, doors, edges and storeys of a map, and its zones where asked; draw them where a file is named."""
     assert scan.truth is not None
     columns = predict_columns(extracted, scan.truth)
     verdict = evaluate_map(extracted, scan.truth, columns)
@@ -176,6 +178,11 @@ def score_map(scan: Scan, extracted: Any, name: str, picture: Path | None) -> Ro
     row |= {"door_precision": doors.precision, "door_recall": doors.recall}
     row |= {"edge_precision": edges.precision, "edge_recall": edges.recall, "storeys": float(verdict.storeys)}
     row |= {"rooms": verdict.true_rooms, "doors": doors.true, "levels": verdict.true_storeys}
+    if zones:
+        finer = cut_zones(extracted)
+        zoned = evaluate_map(finer, scan.truth).rooms
+        row |= {"zones": len(finer.rooms), "zone_iou": zoned.iou}
+        row["better_iou"] = float(np.maximum(rooms.each, zoned.each).sum() / max(verdict.true_rooms, 1))
     order = [i for i in np.argsort(rooms.each, kind="stable") if scan.truth.visited[i]][:4]
     row["worst"] = {scan.rooms[i].name or str(i): round(float(rooms.each[i]), 2) for i in order}
     if picture:
@@ -197,6 +204,11 @@ def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
     simulated = [r for r in judged if r["set"].startswith("by ")]
     if simulated:
         parts += ["The same simulated buildings by kind:", tabulate_groups(simulated, "kind", "building")]
+    if any("zone_iou" in r for r in judged):
+        parts += [
+            "Two cuts of one tree: rooms, and their zones. Better: of each true room the better of the two.",
+            tabulate_levels(judged),
+        ]
     if name in LISTED:
         parts.append(tabulate_cases(rows))
     return {block: "\n\n".join([*parts, list_failures(judged)])}
@@ -215,6 +227,15 @@ def tabulate_groups(rows: Sequence[Row], key: str, title: str) -> str:
         means = [write_mean(these, k) if k in WITH_INTERVAL else compute_mean(these, k) for k in COLUMNS]
         lines.append([group, preset, len(these), *means])
     return write_table((title, "preset", "maps", *COLUMNS.values()), lines)
+
+
+def tabulate_levels(rows: Sequence[Row]) -> str:
+    """Tabulate the IoU of rooms, of their zones, and of the better of the two for each true room."""
+    lines = []
+    for group, preset in dict.fromkeys((r["set"], r["preset"]) for r in rows if "zone_iou" in r):
+        these = [r for r in rows if (r["set"], r["preset"]) == (group, preset)]
+        lines.append([group, preset, len(these), *(write_mean(these, key) for key in ("iou", "zone_iou", "better_iou"))])
+    return write_table(("set", "preset", "maps", "IoU of rooms", "of zones", "of the better"), lines)
 
 
 def tabulate_cases(rows: Sequence[Row]) -> str:
