@@ -67,10 +67,12 @@ def test_the_probabilities_are_in_the_file(open_plan: TopometricMap, tmp_path: P
     assert (load_map(tmp_path / "a.tmap").narrows == open_plan.narrows).all()
 
 
-def test_a_small_zone_is_part_of_the_one_that_it_is_most_surely_one_with(open_plan: TopometricMap) -> None:
-    areas, narrows = np.zeros(4, AREA_DTYPE), np.zeros(3, EDGE_DTYPE)
-    areas["area"] = 5, 5, 1, 5
-    narrows["rooms"], narrows["confidence"] = [(0, 2), (1, 2), (1, 3)], [0.6, 0.4, 0.1]
+def test_zones_are_numbered_room_by_room(open_plan: TopometricMap) -> None:
+    areas, narrows = np.zeros(5, AREA_DTYPE), np.zeros(3, EDGE_DTYPE)
+    narrows["rooms"], narrows["confidence"] = [(0, 2), (1, 2), (1, 3)], [0.6, 0.2, 0.1]
     drawn = replace(open_plan, areas=areas, narrows=narrows, navigable_area=None)
-    assert find_zones(drawn).tolist() == [0, 1, 1, 1]
-    assert find_zones(drawn, least=0.5).tolist() == [0, 1, 2, 1]
+    assert find_zones(drawn).tolist() == [0, 1, 1, 1, 2]
+    assert find_zones(drawn, 0.15).tolist() == [0, 1, 2, 1, 3] and find_zones(drawn, 0.6).tolist() == [0, 0, 0, 0, 1]
+    two = replace(drawn, rooms=np.repeat(drawn.rooms, 2))
+    two.areas["room"][[0, 4]] = 1
+    assert find_zones(two).tolist() == [1, 0, 0, 0, 2]

@@ -15,7 +15,6 @@ from topomerge.extraction.plans.storey_plan import Merge
 from topomerge.types import Array, TopometricMap, select_lowest_of_column
 
 ZONE_LEVEL = 0.2  # up to this probability of a door between them two areas are one zone
-LEAST_ZONE = 2.0  # m2 of floor; smaller ones are parts of the zone that they are most surely one with
 
 
 def compute_merge_levels(merges: Sequence[Merge], pairs: Array) -> Array:
@@ -40,22 +39,18 @@ def compute_merge_levels(merges: Sequence[Merge], pairs: Array) -> Array:
     return level
 
 
-def find_zones(map: TopometricMap, level: float = ZONE_LEVEL, least: float = LEAST_ZONE) -> Array:
+def find_zones(map: TopometricMap, level: float = ZONE_LEVEL) -> Array:
     """Find the zone of each area: the parts of rooms that a door parts with more than a probability.
 
     Args:
         level: that probability; from that of the rooms' doors on, rooms have one zone each.
-        least: m2 of floor of a zone, unless its room is smaller.
 
     Returns:
         (A,) int64, numbered from 0 in the order of the rooms and their areas.
     """
     zone = np.arange(len(map.areas))
-    order = np.argsort(map.narrows["confidence"], kind="stable")
-    for (a, b), probability in zip(map.narrows["rooms"][order].tolist(), map.narrows["confidence"][order].tolist(), strict=True):
-        floor = np.bincount(zone, map.areas["area"], len(zone))
-        if probability <= level or min(floor[zone[a]], floor[zone[b]]) < least:
-            zone[zone == zone[b]] = zone[a]
+    for a, b in map.narrows["rooms"][map.narrows["confidence"] <= level].tolist():
+        zone[zone == zone[b]] = zone[a]
     by_room = np.lexsort((np.arange(len(zone)), map.areas["room"]))
     _, first, of = np.unique(zone[by_room], return_index=True, return_inverse=True)
     out = np.empty(len(zone), np.int64)
