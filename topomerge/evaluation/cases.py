@@ -52,6 +52,61 @@ LOOK = (
     f"{TSC}/strands_morse/g4s/g4s_y2.yaml",
 )
 
+# Places told apart by eye on robots' grids for development, m: fans of rays behind windows and doors, rooms in which the robot
+# stood (or that were drawn after it), and letters painted on the map.
+MARKS: dict[str, dict[str, tuple[tuple[float, float], ...]]] = {
+    f"{TSC}/strands_maps/strands_maps/tsc_y3/maps/tsc20160523.yaml": {
+        "fan": ((1.5, 31.7), (-12.8, 22), (-11, 10.5), (-12.8, 1.2), (-12.6, 0.2), (-9.5, 0.8), (-20.2, -6.1), (-17.1, -6.4),
+                (-26.2, -6.3), (-49.7, 4.4), (-51.1, 3.1), (-40.7, 1.2), (-61.7, -37.6), (-63.9, -10.9), (-58.5, -17.9),
+                (-62.2, -20.5), (-72.2, -23.1), (-68.4, -22.6), (-64.6, -26.1), (-61.9, -28), (-60.1, -22.9), (-58.6, -37.1),
+                (-50.9, -47.1), (-12.2, -26.4), (-13.8, -23.6), (-6, -28), (-5.7, -23.8), (-2.2, -27.8), (-0.5, -24.3), (1.2,
+                -24.3), (4.3, -20.6), (-63.2, -9.2), (8.8, 16.8), (9.2, 13.6), (-24.1, -5.5),),
+        "room": ((-53.6, -33.8), (-50.8, -8.6), (-46, -29.2), (-51, -17.9), (-1, 9.5), (-12.4, -18), (-45.4, -1), (-6, 24.7),
+                (-42.5, -15.8), (-17.9, -11.1), (-55.6, -22), (-2.5, -10), (2.8, 4.9), (-2.7, -18.9), (-1, 28.7), (-34.8,
+                -11.2), (-28.4, -10.4), (-8.7, -10.2), (1.8, -2.3), (-5.8, -4.6), (0, -5.6), (-0.4, -11.6), (-0.2, -16.9),),
+    },
+    f"{TSC}/strands_morse/aachen/UMIC_first_floor.yaml": {
+        "fan": ((-18.4, 8.4),),
+        "room": ((-23.8, -0.8), (-23.6, 8.4), (22.1, -0.8), (26.9, 8.7), (7.8, -0.8), (17.4, -0.6), (-18.9, -0.8), (12.4,
+                -0.8), (-8.9, -0.8), (-1.9, -0.9), (15.2, 5.8), (26.9, -0.8), (2.9, -0.8), (22.1, 9.4), (12.4, 9.3), (17.3,
+                9.2), (-4.4, 9.2), (-14.1, -0.8), (17.8, 3.9), (26.4, 3.9), (-13.8, 9.2), (-8.9, 9.3), (7.8, 9.3), (-23.8,
+                3.6), (-13.4, 5.8), (21.9, 4.1), (7.8, 6.4),),
+    },
+    f"{TSC}/strands_morse/g4s/g4s_y2.yaml": {
+        "room": ((17.6, 15.1), (17.2, 25.9), (9.9, 17.1), (14.7, 22.8), (7.3, 9.4), (21.2, 27.8), (6.9, 3), (3.3, 8),),
+    },
+    f"{TSC}/Giraff/home_f.yaml": {
+        "fan": ((-7.2, -5.8), (3.4, -3.4),),
+        "room": ((0, -4), (-2.2, 2.4), (-1, -0.5), (-6.9, -0), (-5, 1.3), (-3.9, -2.8), (-5.3, -6.5), (-2.7, -2),),
+    },
+    f"{TSC}/Giraff/map_05_03_2019_4.yaml": {
+        "fan": ((27.8, 12.2), (10.2, 5.8), (20.1, 3.7), (24.1, 15.2), (19.4, 12.2), (14, 6.4),),
+        "room": ((2.8, 0.2), (13, 3.1), (15.8, -0.1), (7.4, -5.7), (21.7, 6.9),),
+    },
+    "storeys_jsk/eng8-b1f.yaml": {
+        "fan": ((13.5, 5), (20.5, 3), (9.6, 8.6),),
+        "room": ((13.2, 12.8), (26.2, 27.2), (13.5, 47.1), (19.5, 11.6), (16.1, 31), (19.1, 15), (18.2, 47.8), (9, 47), (9.5,
+                51.9), (7.7, 12.2), (11.5, 44.2),),
+        "letter": ((28.1, 51.5), (27.9, 48.9),),
+    },
+    "storeys_jsk/eng2-3f.yaml": {
+        "room": ((4.9, 9.8), (38.8, 7.8), (17.2, 4.8), (54.1, 44), (67.6, 40), (29.4, 43.4), (66.7, 17.6), (11.2, 30), (11.6,
+                49.8), (17.1, 39.8), (62.6, 18.2),),
+        "letter": ((20.4, 32.5), (24.2, 32.4),),
+    },
+    "storeys_jsk/eng2-7f_raw.yaml": {
+        "room": ((19.2, 55.4), (6.3, 53.6), (29.1, 21.2), (29.4, 41.6), (11.8, 31.4), (46.7, 11.3), (46.8, 31.4), (46.8,
+                51.2), (12, 49.8), (11.8, 11.3),),
+        "letter": ((19.2, 10.6),),
+    },
+    "storeys_jsk/eng2-8f.yaml": {
+        "fan": ((14.4, 51.1), (24, 49.9), (14.6, 12.7),),
+        "room": ((24.1, 20.2), (18.1, 47.6), (33.2, 41.7), (39.9, 21.4), (46.7, 10.6), (11.8, 31.5), (12.1, 50), (46.7, 31.7),
+                (46.8, 51.2),),
+        "letter": ((19.2, 10.2), (23.4, 10.4),),
+    },
+}  # fmt: skip
+
 
 def _words(difficulty: dict[str, float]) -> tuple[tuple[str, float], ...]:
     return tuple(sorted(difficulty.items()))
@@ -173,6 +228,11 @@ def look() -> list[Case]:
     return [Case("by eye", "file", name) for name in LOOK]
 
 
+def marked() -> list[Case]:
+    """Grids on which places were told apart by eye: for development."""
+    return [Case("marked by eye", "file", name) for name in MARKS]
+
+
 def peers() -> list[Case]:
     """What the classic methods are compared on: every grid with true rooms, and scans from above of each sensor that sees more
     than a slice."""
@@ -182,7 +242,7 @@ def peers() -> list[Case]:
 
 GROUPS: dict[str, Callable[[], list[Case]]] = {f.__name__: f for f in (dev, simulate_scan, hard, plans, grids, ifc, pairs, look)}
 # "all" leaves these out: it holds their cases already, or they are for development.
-SELECTIONS: dict[str, Callable[[], list[Case]]] = {"peers": peers, "homes": homes}
+SELECTIONS: dict[str, Callable[[], list[Case]]] = {"peers": peers, "homes": homes, "marked": marked}
 
 
 def select_cases(names: Iterable[str], limit: int | None = None) -> list[Case]:

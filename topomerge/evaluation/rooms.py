@@ -1,14 +1,14 @@
 """Rooms, doors, edges and storeys of extracted maps against the truth: ``python evaluate.py task=rooms data=homes``.
 
-Sets: ``dev`` (training buildings, to develop on; the default), ``homes`` (development), ``all`` or some of ``simulated``,
-``hard``, ``plans``, ``grids``, ``ifc``, ``pairs``, ``look`` (test buildings). A row is measured again when
+Sets: ``dev`` (training buildings, to develop on; the default), ``homes`` and ``marked`` (for development), ``all`` or some of
+``simulated``, ``hard``, ``plans``, ``grids``, ``ifc``, ``pairs``, ``look`` (test buildings). A row is measured again when
 the scan, the preset or the code has changed. The measures are in `topomerge/metrics.py` and `datasets/simulation/floor_truth.py`.
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -23,13 +23,16 @@ from topomerge.datasets.core.builder import limit_threads
 from topomerge.datasets.pairs.edited_truth import TRUTH_SUFFIX
 from topomerge.datasets.simulation.floor_truth import evaluate_map, predict_columns
 from topomerge.errors import InputError
-from topomerge.evaluation.cases import GROUPS, SELECTIONS, select_cases
+from topomerge.evaluation.cases import GROUPS, MARKS, SELECTIONS, select_cases
 from topomerge.evaluation.documents import compute_mean, write_mean, write_table
 from topomerge.evaluation.scans import EDITED_SOURCE, Case, Scan, load_scan
 from topomerge.evaluation.tasks import Row, TaskSettings, find_optional_data, limit_cases, measure_missing
+from topomerge.extraction.attributes import find_rooms_at
 from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS
-from topomerge.types import LogFn
+from topomerge.extraction.zones import cut_zones
+from topomerge.io.listing import describe_room
+from topomerge.types import LogFn, TopometricMap
 
 MAKERS = ("topomerge.extraction.extract", "topomerge.metrics", "topomerge.evaluation.scans")
 VOXEL = 0.1  # m, edge of the cells
@@ -44,6 +47,8 @@ COLUMNS = {
 }  # fmt: skip
 WITH_INTERVAL = ("iou", "mcc")
 FAILED = 0.5  # mean IoU
+ZONED = ("home", "ipa", "gdc")  # sources of real grids, whose zones are scored beside their rooms
+STATES = ("room", "glimpsed", "outside", "no room")  # what a map says of a marked place
 LISTED = ("dev", "homes", "grids", "look")  # sets whose cases are listed
 HEADLINES = {  # set of cases -> figure of the README
     "ordinary": "rooms-simulated",
@@ -146,14 +151,32 @@ def measure_case(case: Case, preset: str, scans: Path, data: Path | None, pictur
         row |= {"seconds": process_time() - began, "found": int((~extracted.rooms["glimpsed"]).sum())}
         row |= {"points": len(scan.cloud), "levels_found": len(extracted.storeys)}
         picture = Path(pictures) / f"{case.name}-{preset}.png" if pictures else None
+        if case.building in MARKS:
+            row |= {"marks": count_marks(extracted, MARKS[case.building])}
         if scan.truth is not None:
-            row |= score_map(scan, extracted, f"{case.name}  {preset}", picture)
+            row |= score_map(scan, extracted, f"{case.name}  {preset}", picture, case.source in ZONED)
         elif picture:
             from topomerge.viz.figures import save_figure
 
             picture.parent.mkdir(parents=True, exist_ok=True)
             save_figure(extracted, picture)
     return {k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()}
+
+
+def count_marks(map: TopometricMap, marks: Mapping[str, Sequence[tuple[float, float]]]) -> dict[str, dict[str, int]]:
+    """Count of each kind of marked places how many lie in a room, in what is outside or only looked into, and in no room.
+
+    Args:
+        marks: kind -> places (x, y), m.
+    """
+    floor = float(map.storeys["floor"][0]) if len(map.storeys) else 0.0
+    counts = {}
+    for kind, places in marks.items():
+        room = find_rooms_at(map, np.column_stack([np.array(places, float), np.full(len(places), floor)]))
+        about = [map.rooms[r] if r >= 0 else None for r in room.tolist()]
+        states = ["no room" if a is None else next((w for w in describe_room(a) if w in STATES), "room") for a in about]
+        counts[kind] = {state: states.count(state) for state in STATES}
+    return counts
 
 
 @cache
@@ -166,8 +189,8 @@ def load_compiled(preset: str) -> None:
         extract(np.concatenate([*box, *(b[:, [1, 0, 2]] for b in box[2:])]), preset=preset)
 
 
-def score_map(scan: Scan, extracted: Any, name: str, picture: Path | None) -> Row:
-    """Score the rooms, doors, edges and storeys of a map; draw them where a file is named."""
+def score_map(scan: Scan, extracted: Any, name: str, picture: Path | None, zones: bool = False) -> Row:
+    """Score the rooms, doors, edges and storeys of a map, and its zones where asked; draw them where a file is named."""
     assert scan.truth is not None
     columns = predict_columns(extracted, scan.truth)
     verdict = evaluate_map(extracted, scan.truth, columns)
@@ -176,6 +199,11 @@ def score_map(scan: Scan, extracted: Any, name: str, picture: Path | None) -> Ro
     row |= {"door_precision": doors.precision, "door_recall": doors.recall}
     row |= {"edge_precision": edges.precision, "edge_recall": edges.recall, "storeys": float(verdict.storeys)}
     row |= {"rooms": verdict.true_rooms, "doors": doors.true, "levels": verdict.true_storeys}
+    if zones:
+        finer = cut_zones(extracted)
+        zoned = evaluate_map(finer, scan.truth).rooms
+        row |= {"zones": len(finer.rooms), "zone_iou": zoned.iou}
+        row["better_iou"] = float(np.maximum(rooms.each, zoned.each).sum() / max(verdict.true_rooms, 1))
     order = [i for i in np.argsort(rooms.each, kind="stable") if scan.truth.visited[i]][:4]
     row["worst"] = {scan.rooms[i].name or str(i): round(float(rooms.each[i]), 2) for i in order}
     if picture:
@@ -197,6 +225,13 @@ def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
     simulated = [r for r in judged if r["set"].startswith("by ")]
     if simulated:
         parts += ["The same simulated buildings by kind:", tabulate_groups(simulated, "kind", "building")]
+    if any("zone_iou" in r for r in judged):
+        parts += [
+            "Two cuts of one tree: rooms, and their zones. Better: of each true room the better of the two.",
+            tabulate_levels(judged),
+        ]
+    if any("marks" in r for r in rows):
+        parts.append(tabulate_marks(rows))
     if name in LISTED:
         parts.append(tabulate_cases(rows))
     return {block: "\n\n".join([*parts, list_failures(judged)])}
@@ -215,6 +250,24 @@ def tabulate_groups(rows: Sequence[Row], key: str, title: str) -> str:
         means = [write_mean(these, k) if k in WITH_INTERVAL else compute_mean(these, k) for k in COLUMNS]
         lines.append([group, preset, len(these), *means])
     return write_table((title, "preset", "maps", *COLUMNS.values()), lines)
+
+
+def tabulate_levels(rows: Sequence[Row]) -> str:
+    """Tabulate the IoU of rooms, of their zones, and of the better of the two for each true room."""
+    lines = []
+    for group, preset in dict.fromkeys((r["set"], r["preset"]) for r in rows if "zone_iou" in r):
+        these = [r for r in rows if (r["set"], r["preset"]) == (group, preset)]
+        lines.append([group, preset, len(these), *(write_mean(these, key) for key in ("iou", "zone_iou", "better_iou"))])
+    return write_table(("set", "preset", "maps", "IoU of rooms", "of zones", "of the better"), lines)
+
+
+def tabulate_marks(rows: Sequence[Row]) -> str:
+    """Tabulate what maps say of the places that were told apart by eye."""
+    lines = []
+    for kind, title in (("fan", "fans of rays"), ("letter", "painted letters"), ("room", "rooms")):
+        counts = [r["marks"][kind] for r in rows if kind in r.get("marks", {})]
+        lines.append([title, sum(sum(c.values()) for c in counts), *(sum(c[state] for c in counts) for state in STATES)])
+    return write_table(("marked as", "places", "a room", "only looked into", "outside", "no room"), lines)
 
 
 def tabulate_cases(rows: Sequence[Row]) -> str:

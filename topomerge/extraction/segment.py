@@ -26,7 +26,7 @@ from topomerge.extraction.plans.passages import (
 )
 from topomerge.extraction.plans.plan import build_storey_plan, locate_columns, remove_upper_sides
 from topomerge.extraction.plans.plan_network import LOOKS, compute_column_probabilities, load_weights, remove_furniture
-from topomerge.extraction.plans.storey_plan import ClassifiedStorey, StoreyPlan
+from topomerge.extraction.plans.storey_plan import ClassifiedStorey, Merge, StoreyPlan
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.slices import is_raised
 from topomerge.extraction.storeys import NOWHERE, find_storeys, measure_floor_to_ceiling
@@ -275,6 +275,7 @@ class PartitionedStorey:
         room_of_area: (A,).
         room_of_segment: (n,) -1 none.
         door_probability: that a door parts two neighbouring rooms.
+        merges: of areas into rooms, in their order: one area of each side, and the probability of a door between the two sides.
     """
 
     number: int
@@ -285,6 +286,7 @@ class PartitionedStorey:
     room_of_area: Array
     room_of_segment: Array
     door_probability: dict[Pair, float]
+    merges: tuple[Merge, ...]
 
 
 def partition_rooms(storey: SegmentedStorey, score: Scorer, door: float, least: float = LEAST_ROOM) -> PartitionedStorey:
@@ -297,9 +299,12 @@ def partition_rooms(storey: SegmentedStorey, score: Scorer, door: float, least: 
     """
     segment, edge = storey.segment, storey.plan.edge
     rooms = GrowingRooms(segment, storey.clearance, storey.passages, edge, score)
+    merges: list[Merge] = []
     while rooms.door_probability and rooms.door_probability[pair := rooms.weakest()] <= door:
+        merges.append((*pair, rooms.door_probability[pair]))
         rooms.merge(pair)
     while (small := find_too_small(rooms, least)) is not None:
+        merges.append((*small, rooms.door_probability[small]))
         rooms.merge(small)
     large = np.unique(rooms.of_region)
     large = large[rooms.area[large] >= least]
@@ -322,6 +327,7 @@ def partition_rooms(storey: SegmentedStorey, score: Scorer, door: float, least: 
         room_of_segment[kept],
         room_of_segment,
         doors,
+        tuple((int(area_of_segment[a]), int(area_of_segment[b]), p) for a, b, p in merges if area_of_segment[a] >= 0),
     )
 
 

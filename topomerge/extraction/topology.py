@@ -14,6 +14,7 @@ from topomerge.extraction.convolution import build_sphere
 from topomerge.extraction.morphology import label_components
 from topomerge.extraction.plans.storey_plan import Floor
 from topomerge.extraction.storeys import estimate_ceiling_height, measure_floor_to_ceiling
+from topomerge.extraction.zones import compute_merge_levels
 from topomerge.kernels.rasters import count_steps
 from topomerge.types import AREA_DTYPE, EDGE_DTYPE, ROOM_DTYPE, Array, TopometricMap, VoxelGrid, select_lowest_of_column
 
@@ -303,9 +304,10 @@ def build_topometric_map(grid: VoxelGrid, floor: Floor, body_height: float, know
         a, b = old_number[edge["rooms"]].tolist()
         edge["confidence"] = floor.door_probability.get((min(a, b), max(a, b)), 1.0)
     area = np.where(number[floor.room_of_area][floor.area] >= 0, floor.area, -1) if len(floor.room_of_area) else floor.area
-    areas, area = _build_areas(floor, label, area)
+    areas, area, old_area = _build_areas(floor, label, area)
     owner = areas["room"]
     narrows = find_edges(floor, area, storey[owner], above, lambda a, b: (owner[a] == owner[b]) & fresh[owner[a]])
+    narrows["confidence"] = compute_merge_levels(floor.merges, old_area[narrows["rooms"]])
     return TopometricMap(grid, room, floor.cells, label, rooms, edges, floor.storeys, areas, area, narrows)
 
 
@@ -315,8 +317,8 @@ def select_rooms_with_floor(floor: Floor) -> Array:
     return np.unique(lowest[lowest >= 0])
 
 
-def _build_areas(floor: Floor, label: Array, area: Array) -> tuple[Array, Array]:
-    """(A,) AREA_DTYPE and the areas renumbered."""
+def _build_areas(floor: Floor, label: Array, area: Array) -> tuple[Array, Array, Array]:
+    """(A,) AREA_DTYPE, the areas renumbered, and (A,) the numbers that they had."""
     numbers = np.unique(area[area >= 0])
     number = np.append(np.searchsorted(numbers, np.arange(int(area.max(initial=-1)) + 1)), -1)
     area = number[area].astype(np.int32)
@@ -330,7 +332,7 @@ def _build_areas(floor: Floor, label: Array, area: Array) -> tuple[Array, Array]
             floor.cells.compute_centroids(floor.cells.cells[rows]).mean(axis=0),
             len(rows) * floor.cells.edge**2,
         )
-    return areas, area
+    return areas, area, numbers
 
 
 def _measure_rooms(grid: VoxelGrid, room: Array, floor: Floor, label: Array, above: Array, numbers: Array) -> Array:

@@ -338,7 +338,8 @@ def _add_fresh_rooms(cut: CutFloor, columns: _Columns, owner: Array, parts: Sequ
 def _build_floor(cut: CutFloor, columns: _Columns, carried: int) -> Floor:
     """The floor as one grid; of its rooms the first ones are carried over."""
     floor, storeys, of_cell = join_floor(columns.grid, columns.storeys, cut.cells, cut.tables)
-    doors = cut.fresh.door_probability if cut.fresh else {}
+    doors, merges = (cut.fresh.door_probability, cut.fresh.merges) if cut.fresh else ({}, ())
+    first = len(cut.room_of_area) - (len(cut.fresh.room_of_area) if cut.fresh else 0)
     return Floor(
         cells=floor,
         storeys=storeys,
@@ -348,6 +349,7 @@ def _build_floor(cut: CutFloor, columns: _Columns, carried: int) -> Floor:
         room_of_area=cut.room_of_area.astype(np.int32),
         label=cut.label.astype(np.int32),
         door_probability={(a + carried, b + carried): p for (a, b), p in doors.items()},
+        merges=tuple((a + first, b + first, p) for a, b, p in merges),
         completeness=cut.completeness,
         classified_storeys=cut.fresh.classified_storeys if cut.fresh else (),
     )

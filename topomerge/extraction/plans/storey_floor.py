@@ -10,7 +10,7 @@ from scipy import ndimage
 from topomerge.extraction.completeness import measure_seen_outline
 from topomerge.extraction.plans.passages import Pair
 from topomerge.extraction.plans.plan import locate_columns
-from topomerge.extraction.plans.storey_plan import Floor, StoreyPlan
+from topomerge.extraction.plans.storey_plan import Floor, Merge, StoreyPlan
 from topomerge.extraction.segment import PartitionedStorey
 from topomerge.types import Array, VoxelGrid, select_lowest_of_column
 
@@ -36,6 +36,7 @@ def build_floor(
     label = np.full(len(grid), -1, np.int32)
     cells, properties, room_of_area, seen = [], [], [], []
     probability: dict[Pair, float] = {}
+    merges: list[Merge] = []
     rooms = areas = 0
     for part in cut:
         room = np.where(part.room >= 0, part.room + rooms, -1)
@@ -45,6 +46,7 @@ def build_floor(
         cells.append(places)
         properties.append((standing, np.full(len(places), part.number), room[tuple(at.T)], area[tuple(at.T)]))
         probability |= {(a + rooms, b + rooms): p for (a, b), p in part.door_probability.items()}
+        merges += [(a + areas, b + areas, p) for a, b, p in part.merges]
         room_of_area.append(part.room_of_area + rooms)
         seen.append(measure_seen_outline(part.room, part.plan.inside, part.plan.wall, part.plan.edge))
         rooms, areas = rooms + int(part.room.max(initial=-1)) + 1, areas + len(part.room_of_area)
@@ -62,6 +64,7 @@ def build_floor(
         np.concatenate(room_of_area).astype(np.int32),
         label,
         door_probability=probability,
+        merges=tuple(merges),
         completeness=np.concatenate(seen),
         classified_storeys=tuple(part.classes for part in cut),
         plans=tuple(part.plan for part in cut),

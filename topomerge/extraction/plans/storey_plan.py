@@ -243,6 +243,8 @@ def _crop_around(storey: ClassifiedStorey, centre: Array, reach: float) -> Array
     return near
 
 
+Merge = tuple[int, int, float]  # two areas whose sides became one, and the probability of a door between these
+
 # The floors of a map cut into rooms: what rooms of plans and rooms of views become before the graph is made (seeds 2.7).
 
 
@@ -259,6 +261,7 @@ class Floor:
         label: (n,) int32 room of each occupied cell of the grid, -1 none.
         body_width: m, how much wider than its cells a passage is: where they tell where a body's middle may be, the body's width.
         door_probability: that a door parts two rooms, where it was judged.
+        merges: of areas into rooms, in their order.
         completeness: (R,) share of each room's outline at which a wall was seen, where the plans tell it.
         classified_storeys: what probably stands in the columns of the storeys' plans.
         plans: these plans, without furniture.
@@ -274,6 +277,7 @@ class Floor:
     label: Array
     body_width: float = 0.0
     door_probability: dict[tuple[int, int], float] = field(default_factory=dict)
+    merges: tuple[Merge, ...] = ()
     completeness: Array | None = None
     classified_storeys: tuple[ClassifiedStorey, ...] = ()
     plans: tuple[StoreyPlan, ...] = ()
