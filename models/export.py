@@ -45,7 +45,10 @@ def export_network(module: nn.Module, signature: Signature, sample: Sequence[Ten
         if isinstance(module, Branches):
             model = _joined([_traced(branch, signature, sample, 1) for branch in module.branches], next(iter(signature.inputs)))
         else:
+            from topomerge.models.rewriting import rewrite_graph  # which imports onnx
+
             model = _traced(module, signature, sample)
+            rewrite_graph(model.graph)
         temporary.write_bytes(model.SerializeToString(deterministic=True))
 
 

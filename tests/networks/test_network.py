@@ -116,6 +116,29 @@ def test_a_network_that_was_trained_is_exported_as_it_is_and_always_to_the_same_
     assert not (tmp_path / "nan.onnx").exists()
 
 
+def test_what_is_exported_normalises_enlarges_and_turns_nothing(tmp_path: Path) -> None:
+    """The processor runs convolutions alone (docs/adr/0044); the function and the names of the weights stay."""
+    torch, onnx = pytest.importorskip("torch"), pytest.importorskip("onnx")
+    from topomerge.models.convolutional import PlanProbabilities, PlanUNet
+    from topomerge.models.export import export_network, read_weights, run_with_torch
+
+    torch.manual_seed(0)
+    net = PlanUNet([4, 6, 6, 8, 6, 5, 4, 3])
+    net.train()
+    net(torch.rand(4, 11, 32, 48))  # gives the normalisation something to know
+    module, path = PlanProbabilities(net), tmp_path / "plan.onnx"
+    export_network(module, PLAN_SIGNATURE, [torch.rand(2, 11, 64, 48)], path)
+    kinds = [node.op_type for node in onnx.load(path).graph.node]
+    assert not {"BatchNormalization", "Resize", "Softmax"} & set(kinds) and kinds.count("DepthToSpace") == 4
+    assert all(torch.equal(value, net.state_dict()[name.removeprefix("network.")]) for name, value in read_weights(path).items()
+               if name.startswith("network."))  # fmt: skip
+    (tmp_path / "plan.card.json").write_text(json.dumps({"sha256": hashlib.sha256(path.read_bytes()).hexdigest()}))
+    network, peer = load_network(path, PLAN_SIGNATURE), run_with_torch(module, PLAN_SIGNATURE)
+    for shape in ((1, 11, 16, 16), (2, 11, 80, 144)):
+        (ours,), (theirs,) = (run(evidence=random(*shape)) for run in (network, peer))
+        assert ours.shape == theirs.shape and np.abs(ours - theirs).max() < 1e-5
+
+
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_card_tells_what_the_network_does(name: str) -> None:
     card, (signature, _) = read_card(file_of(name)), SHIPPED[name]
