@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from topomerge.extraction.extract import extract as extract
     from topomerge.extraction.parameters import PRESETS as PRESETS
     from topomerge.extraction.voxels import voxelise as voxelise
+    from topomerge.extraction.zones import cut_zones as cut_zones
     from topomerge.fusion.atlas.find import find as find
     from topomerge.fusion.atlas.locate import locate as locate
     from topomerge.fusion.atlas.result import AtlasResult as AtlasResult
@@ -77,6 +78,7 @@ _HOMES = {
     "VoxelGrid": "topomerge.types",
     "build_atlas": "topomerge.fusion.atlas.solve",
     "render_atlas_html": "topomerge.viz.atlas_report",
+    "cut_zones": "topomerge.extraction.zones",
     "extract": "topomerge.extraction.extract",
     "load_embedder": "topomerge.embedding.learned",
     "load_map": "topomerge.io.maps",

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib
+from dataclasses import replace
 
 import pytest
 
+from tests.scenes_map import building
 from topomerge.errors import InputError
 from topomerge.evaluation.documents import read_stamp
 from topomerge.evaluation.tasks import run_task
@@ -34,6 +36,18 @@ def test_a_set_or_a_preset_that_is_not_there_is_named(tmp_path) -> None:
     for words, said in ((["data=nowhere"], "data.set=nowhere"), (["presets=best"], "presets=best"), (["limit=3"], "limit")):
         with pytest.raises(InputError, match=said):
             run_task("rooms", [*words, f"folder={tmp_path}", f"cache={tmp_path}"], lambda text: None)
+
+
+def test_marked_places_are_counted_by_what_the_map_says(benchmark) -> None:
+    map = building(2)
+    rooms = map.rooms.copy()
+    rooms["glimpsed"], rooms["outside"] = [False, True, True, False, False], [0, 0, 0.7, 0, 0]
+    at = [tuple(map.rooms["centroid"][r, :2].tolist()) for r in range(4)]
+    counts = benchmark.count_marks(replace(map, rooms=rooms), {"fan": [*at[1:3], (-50.0, 0.0)], "room": [at[0], at[3]]})
+    assert counts["fan"] == {"room": 0, "glimpsed": 1, "outside": 1, "no room": 1}
+    assert counts["room"] == {"room": 2, "glimpsed": 0, "outside": 0, "no room": 0}
+    table = benchmark.tabulate_marks([{"marks": counts}, {"marks": counts}, {}])
+    assert "| fans of rays | 6 | 0 | 2 | 2 | 2 |" in table and "| painted letters | 0 | 0 | 0 | 0 | 0 |" in table
 
 
 def test_sets_keep_to_their_buildings(benchmark) -> None:

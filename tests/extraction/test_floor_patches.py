@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.scenes_map import building
-from topomerge.extraction.attributes import PATCH_AREA, remove_patches
+from topomerge.extraction.attributes import PATCH_AREA, remove_patches, remove_unfit_rooms
+from topomerge.extraction.extract import extract
+from topomerge.io.points import read_points
 from topomerge.types import EDGE_DTYPE, WINDOW_DTYPE, TopometricMap
 
 NOWHERE = np.zeros((0, 3))
@@ -78,3 +82,34 @@ def test_patches_of_a_storey_that_has_nothing_else_stay():
     edges = map.edges[~upper[map.edges["rooms"]].any(axis=1)]
     other = remove_patches(replace(map, rooms=rooms, edges=edges), NOWHERE)
     assert (other.rooms["storey"] == 1).sum() == upper.sum() and len(other.rooms) == len(map.rooms) - 1
+
+
+def test_floor_where_nobody_fits_is_no_room():
+    map = building(2)
+    standing = map.navigable_room != 1
+    stroke = replace(map, navigable=replace(map.navigable, properties={"standing": standing}))
+    other = remove_unfit_rooms(stroke)
+    assert np.array_equal(other.rooms, np.delete(map.rooms, 1)) and (other.navigable_room[map.navigable_room == 1] == -1).all()
+    some = standing | (np.arange(len(standing)) % 10 == 0)  # a tenth of it is wide enough
+    for whole in (map, replace(map, navigable=replace(map.navigable, properties={"standing": some}))):
+        assert remove_unfit_rooms(whole) is whole
+    nowhere = replace(map, navigable=replace(map.navigable, properties={"standing": np.zeros(len(standing), bool)}))
+    assert remove_unfit_rooms(nowhere) is nowhere, "a storey keeps its rooms"
+
+
+def test_a_letter_painted_on_a_grid_is_no_room(tmp_path: Path):
+    """The stroke of a large O beside the rooms, 45 cm wide and free within, as the number of a storey on a robot's map."""
+    image = np.full((120, 200), 205, np.uint8)
+    image[10:110, 10:130] = 0
+    image[12:108, 12:68] = image[12:108, 72:128] = image[50:68, 66:74] = 254
+    x, y = np.meshgrid(np.arange(200) - 165, np.arange(120) - 60)
+    away = np.hypot(x, y)
+    image[(away >= 14) & (away <= 27)] = 0
+    image[(away >= 16) & (away <= 25)] = 254
+    Image.fromarray(image).save(tmp_path / "map.png")
+    (tmp_path / "map.yaml").write_text(
+        "image: map.png\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+    )
+    map = extract(read_points(tmp_path / "map.yaml"))
+    beside = map.navigable.compute_centroids()[:, 0] > 6.6
+    assert len(map.rooms) == 2 and not (map.navigable_room[beside] >= 0).any()

@@ -14,7 +14,7 @@ from topomerge.extraction.elevations.windows import add_windows
 from topomerge.extraction.plans.storey_plan import Floor
 from topomerge.extraction.room_odds import add_room_probabilities
 from topomerge.extraction.scan import Scan
-from topomerge.types import EDGE_DTYPE, Array, TopometricMap, select_rooms
+from topomerge.types import EDGE_DTYPE, Array, TopometricMap, select_lowest_of_column, select_rooms
 
 # A doorway joins the two rooms that lie across it, once (beyond the thesis).
 #
@@ -226,6 +226,23 @@ def remove_patches(map: TopometricMap, places: Array) -> TopometricMap:
     return map if stays.all() else select_rooms(map, stays)
 
 
+# Floor where nobody fits is no room of a grid: strokes of letters painted on it, single rays through a window (docs/adr/0047).
+
+LEAST_STANDING = 0.05  # share of a room's floor where a body fits; of entered rooms of real grids .4 and more
+
+
+def remove_unfit_rooms(map: TopometricMap) -> TopometricMap:
+    """Return the map without the rooms in which no body fits. One that is alone on its storey stays."""
+    lowest = select_lowest_of_column(map.navigable)
+    lowest = lowest[map.navigable_room[lowest] >= 0]
+    standing = np.asarray(map.navigable.properties.get("standing", np.ones(len(map.navigable))), float)[lowest]
+    room, storey = map.navigable_room[lowest], map.rooms["storey"]
+    count = np.bincount(room, minlength=len(map.rooms))
+    stays = np.bincount(room, standing, len(map.rooms)) >= LEAST_STANDING * np.maximum(count, 1)
+    stays |= ~np.isin(storey, storey[stays])
+    return map if stays.all() else select_rooms(map, stays)
+
+
 # Attributes of a map, once its rooms are cut: odds of rooms, doors with their kinds and states, windows (beyond the thesis).
 
 
@@ -244,6 +261,8 @@ def estimate_attributes(
         map = add_wall_doors(map, floor.classified_storeys, walls)
     map, doubt = add_walked_doors(map, scan.places)
     map = select_distinct_doors(map)
+    if scan.raised:
+        map = remove_unfit_rooms(map)
     if walls is not None:
         map = remove_patches(add_windows(map, walls.elevations, walls.classes), scan.places)
     return map, [doubt] if doubt else []

@@ -439,13 +439,17 @@ def _render_graph(map: TopometricMap, sheet: Sheet, storey: int, named: dict[int
 
 
 def _render_narrows(map: TopometricMap, sheet: Sheet, storey: int) -> list[Markup]:
-    """Where rooms narrow: thin dashed lines between their areas."""
+    """Where rooms narrow: thin dashed lines between their areas, with the probability that these are two rooms."""
     if not len(map.narrows):
         return []
     rooms = map.rooms[map.areas["room"][map.narrows["rooms"][:, 0]]]
     shown = [(edge, room) for edge, room in zip(map.narrows, rooms, strict=True) if room["storey"] == storey]
     return [
-        _render_line(sheet, *_compute_jambs(edge), class_="narrow", data_sure=format_room_confidence(room))
+        build_element(
+            "g",
+            build_element("title", f"zones of one room; two rooms with a probability of {edge['confidence']:.2f}"),
+            _render_line(sheet, *_compute_jambs(edge), class_="narrow", data_sure=format_room_confidence(room)),
+        )
         for edge, room in shown
     ]
 
