@@ -17,10 +17,9 @@ from benchmarks.peers.methods import EVALUATED_WITHIN
 from benchmarks.peers.pairs import AREA_BINS, ORDINARY, OVERLAP_BINS, PAIR_CLASSES, find_bin
 from benchmarks.peers.run import read_result_rows
 from benchmarks.peers.thresholds import PeerVerdict, apply_refinement, is_possible, load_verdicts
-from topomerge.evaluation.documents import build_stamp, write_blocks
+from topomerge.evaluation.documents import FIGURES, build_stamp, write_blocks, write_headline
 from topomerge.evaluation.documents import write_table as table
 from topomerge.evaluation.false_merges import Row, classify_negative, is_false_merge, is_good
-from topomerge.evaluation.headline import FIGURES, write_headline
 from topomerge.evaluation.merge_report import format_share, modality
 from topomerge.evaluation.merges import FINE
 from topomerge.statistics import compute_precision_recall

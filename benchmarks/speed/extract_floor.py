@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.speed.bench import STOREY_HEIGHT, WIDTH, print_line, storey
-from topomerge.evaluation.documents import build_stamp
-from topomerge.evaluation.headline import FIGURES, write_headline
+from topomerge.evaluation.documents import FIGURES, build_stamp, write_headline
 
 STOREY_GAP = 0.4  # m
 STEPS = {"beside": (WIDTH + 1, 0, 0), "above": (0, 0, STOREY_HEIGHT + STOREY_GAP), "apart": (WIDTH + 95, 0, 0)}  # m

@@ -10,7 +10,7 @@ import pytest
 
 from topomerge.code_digest import compute_code_digest
 from topomerge.errors import InputError
-from topomerge.evaluation import documents, headline, results_check, tasks
+from topomerge.evaluation import documents, results_check, tasks
 
 MODULES = ("topomerge.metrics",)
 COMMAND = "python evaluate.py task=rooms data=dev data.limit=1"
@@ -69,13 +69,13 @@ def test_inputs_of_a_command_follow_what_it_measures() -> None:
 
 
 def test_figures_are_written_with_what_made_them(tmp_path: Path) -> None:
-    path = tmp_path / "headline.json"
-    path.write_text(headline.FIGURES.read_text(encoding="utf-8"), encoding="utf-8")
-    headline.write_headline(path, {"rooms-homes": ("0.71", "13 maps"), "nothing": ("1", "2")}, fresh_stamp())
+    path = tmp_path / "documents.json"
+    path.write_text(documents.FIGURES.read_text(encoding="utf-8"), encoding="utf-8")
+    documents.write_headline(path, {"rooms-homes": ("0.71", "13 maps"), "nothing": ("1", "2")}, fresh_stamp())
     entries = {e["name"]: e for e in json.loads(path.read_text(encoding="utf-8"))["figures"]}
     assert entries["rooms-homes"]["result"] == "0.71" and "nothing" not in entries
     assert documents.read_stamp(entries["rooms-homes"]["stamp"]) == fresh_stamp()
-    line = next(line for line in headline.tabulate_headline(path).splitlines() if "real homes" in line)
+    line = next(line for line in documents.tabulate_headline(path).splitlines() if "real homes" in line)
     assert line.endswith("| 0.71 | 13 maps |")
 
 
@@ -83,8 +83,8 @@ def test_every_figure_of_the_readme_has_a_source() -> None:
     """The block is what the file says, each entry of which names what made it; no other result stands in the README."""
     text = (documents.ROOT / "README.md").read_text(encoding="utf-8")
     ((_, block),) = [found for found in documents.BLOCK.findall(text) if found[0] == "headline"]
-    assert block.strip() == headline.tabulate_headline().strip()
-    for entry in headline.read_headline():
+    assert block.strip() == documents.tabulate_headline().strip()
+    for entry in documents.read_headline():
         assert documents.read_stamp(entry["stamp"]) or documents.OLD_STAMP.match(entry["stamp"]), entry["name"]
         assert (documents.ROOT / entry["page"]).is_file()
     prose = re.sub(r"(?s)```.*?```|`[^`]*`", "", documents.BLOCK.sub("", text))

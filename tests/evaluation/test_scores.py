@@ -10,7 +10,6 @@ import pytest
 from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, find_twins
 
 from topomerge.errors import InputError
-from topomerge.evaluation.groups import compute_gain, compute_value, count_hit_buildings, draw_buildings
 from topomerge.evaluation.predict import match_mutually
 from topomerge.evaluation.score import (
     classify_modality,
@@ -23,7 +22,7 @@ from topomerge.evaluation.score import (
     measure_pose_error,
     rank_partners,
 )
-from topomerge.evaluation.tables import format_value
+from topomerge.evaluation.tables import compute_gain, compute_value, count_hit_buildings, draw_buildings, format_value
 from topomerge.types import Sim3, TrueRoom
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from topomerge.datasets.real.wifi_malls import build_walk_map
 
-from topomerge.landmarks.pressure import FALL, score_pressure
+from topomerge.landmarks.evidence import FALL, score_pressure
 from topomerge.landmarks.radio import MOST_RATIO
 from topomerge.types import Landmarks, Sim3, TopometricMap, build_landmarks
 

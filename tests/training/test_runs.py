@@ -24,7 +24,7 @@ from topomerge.errors import InputError
 from topomerge.statistics import estimate_mean
 from topomerge.training.__main__ import main
 from topomerge.training.embedding import fit
-from topomerge.training.provenance import compare_settings, describe_provenance, read_run
+from topomerge.training.run_folder import compare_settings, describe_provenance, read_run
 from topomerge.training.settings import Training, convert_to_dict
 from topomerge.training.table import write_table
 from topomerge.training.tasks import compose_settings, train

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topomerge.training.success import estimate_pose, is_pose_right
+from topomerge.training.validate import estimate_pose, is_pose_right
 from topomerge.types import Array, Sim3
 
 ROOMS = 8

@@ -17,10 +17,8 @@ from topomerge.datasets.pairs.items import Recipe
 from topomerge.datasets.pairs.own_pairs import build_own_sets, check_own_path
 from topomerge.datasets.real.maps import build_real_pairs
 from topomerge.errors import InputError
-from topomerge.evaluation.documents import build_stamp
+from topomerge.evaluation.documents import build_stamp, write_headline
 from topomerge.evaluation.figures import save_figures
-from topomerge.evaluation.groups import compute_value
-from topomerge.evaluation.headline import write_headline
 from topomerge.evaluation.merge_tables import (
     select_last_variant,
     tabulate_descriptor_effect,
@@ -35,6 +33,7 @@ from topomerge.evaluation.settings import Evaluation, check, collect_prediction_
 from topomerge.evaluation.tables import (
     BY,
     Table,
+    compute_value,
     format_value,
     group_by_variant,
     iter_long_rows,

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from topomerge.archive import replace_on_success
-from topomerge.evaluation.groups import compute_value
 from topomerge.evaluation.merge_tables import select_last_variant
 from topomerge.evaluation.score import OVERLAPS, Row
+from topomerge.evaluation.tables import compute_value
 from topomerge.statistics import measure_calibration
 
 ROUNDS = 500

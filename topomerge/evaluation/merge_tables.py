@@ -7,10 +7,19 @@ from itertools import combinations
 
 import numpy as np
 
-from topomerge.evaluation.groups import compute_value, count_hit_buildings
 from topomerge.evaluation.score import Row
 from topomerge.evaluation.settings import Evaluation
-from topomerge.evaluation.tables import BY, MERGING, METRIC_NAMES, Table, format_value, group_by, group_by_variant
+from topomerge.evaluation.tables import (
+    BY,
+    MERGING,
+    METRIC_NAMES,
+    Table,
+    compute_value,
+    count_hit_buildings,
+    format_value,
+    group_by,
+    group_by_variant,
+)
 from topomerge.statistics import Calibration, measure_calibration
 
 ORIGINS = ("procedural", "real plans", "real maps")  # of the places that maps are of

@@ -8,8 +8,17 @@ from pathlib import Path
 
 from topomerge.code_digest import compute_code_digest
 from topomerge.errors import InputError
-from topomerge.evaluation.documents import BLOCK, OLD_STAMP, ROOT, Stamp, digest_inputs, list_pages, read_stamp
-from topomerge.evaluation.headline import FIGURES, read_headline
+from topomerge.evaluation.documents import (
+    BLOCK,
+    FIGURES,
+    OLD_STAMP,
+    ROOT,
+    Stamp,
+    digest_inputs,
+    list_pages,
+    read_headline,
+    read_stamp,
+)
 from topomerge.evaluation.tasks import list_inputs_of
 
 

@@ -44,11 +44,10 @@ from topomerge.datasets.public.sources import iter_public_pairs
 from topomerge.datasets.simulation.floor_truth import evaluate_map
 from topomerge.embedding.learned import build_embedder
 from topomerge.errors import InputError
-from topomerge.evaluation.groups import compute_value
 from topomerge.evaluation.merges import compare_pose, time_registration
 from topomerge.evaluation.scans import Case, make_scan, simulate_case
 from topomerge.evaluation.score import count_ranks
-from topomerge.evaluation.tables import format_value
+from topomerge.evaluation.tables import compute_value, format_value
 from topomerge.extraction.extract import extract
 from topomerge.matching.assignment import compute_descriptor_costs
 from topomerge.statistics import compute_exact_interval, format_interval

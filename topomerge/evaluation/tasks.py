@@ -29,8 +29,7 @@ from topomerge.datasets.pairs.grid_pairs import GridPair, build_grids, draw_grid
 from topomerge.datasets.pairs.lookalikes import LookalikeRecipe, build_lookalikes
 from topomerge.datasets.real.maps import iter_real_grid_pairs
 from topomerge.errors import InputError
-from topomerge.evaluation.documents import build_stamp, write_blocks
-from topomerge.evaluation.headline import write_headline
+from topomerge.evaluation.documents import build_stamp, write_blocks, write_headline
 from topomerge.training.tasks import compose_settings
 from topomerge.types import Array, LogFn, Sim3
 

@@ -37,8 +37,7 @@ from topomerge.training.loop import (
 )
 from topomerge.training.packed_pairs import EXTRAS, GraphPair, hold_out, load_pairs
 from topomerge.training.processes import FabricProcesses, find_precision, start_fabric
-from topomerge.training.provenance import compare_settings, describe_provenance
-from topomerge.training.run_folder import MetricsLog, begin_run, export_files
+from topomerge.training.run_folder import MetricsLog, begin_run, compare_settings, describe_provenance, export_files
 from topomerge.training.settings import (
     FREEZE,
     VALIDATION,

@@ -19,7 +19,7 @@ from lightning_fabric.loggers import Logger, TensorBoardLogger
 
 from topomerge.archive import replace_on_success
 from topomerge.errors import InputError
-from topomerge.training.provenance import read_run
+from topomerge.training.run_folder import read_run
 
 PROJECT = "topomerge"  # of W&B and MLflow, where the environment names no other
 MODULES = {"tensorboard": ("tensorboard", "learn"), "wandb": ("wandb", "wandb"), "mlflow": ("mlflow", "mlflow")}

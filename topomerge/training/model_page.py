@@ -17,7 +17,7 @@ import yaml
 
 from topomerge.archive import replace_on_success
 from topomerge.errors import InputError
-from topomerge.training.provenance import read_run
+from topomerge.training.run_folder import read_run
 from topomerge.training.table import format_table, gather_seeds, read_best_epoch
 
 SHOWN = ("geometry", "node", "edges", "loss", "seeds", "recall@1", "recall@5", "f1", "merged")

@@ -19,7 +19,7 @@ from topomerge.archive import replace_on_success
 from topomerge.errors import InputError
 from topomerge.registry import TASKS, load_plugins
 from topomerge.statistics import estimate_mean
-from topomerge.training.provenance import MAY_CHANGE
+from topomerge.training.run_folder import MAY_CHANGE
 from topomerge.training.tasks import DEFAULT_TASK
 from topomerge.types import Array
 

@@ -153,7 +153,7 @@ def check_start(settings: Any) -> None:
     Raises:
         InputError: a score to watch that there is not, an accelerator that is not here, a folder that holds another run.
     """
-    from topomerge.training.provenance import check_folder
+    from topomerge.training.run_folder import check_folder
 
     possible = TASKS[settings.task].scores
     if settings.watch not in possible:
