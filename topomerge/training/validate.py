@@ -196,7 +196,7 @@ def validate(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu")
     """Scores over all rooms with a partner, of both maps: recall@1, recall@5 and MRR, apart for those with and without a
     near-identical twin; precision, recall and F1 of the assignment in which a room may stay alone, at the certainty
     (`least`) that is best; and of the pairs with rooms in common (`mergeable`) the share whose matches give the true transform
-    within 0.5 m and 5 degrees (`merged`: `training.success`)."""
+    within 0.5 m and 5 degrees (`merged`: `is_pose_right`)."""
     each = score_pairs(network, pairs, device)
     right = [good for one in each for good in one.right]
     merged = {"merged": float(np.mean(right)) if right else 0.0, "mergeable": float(len(right))}
