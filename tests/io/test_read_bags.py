@@ -316,6 +316,7 @@ def test_cut_bags(tmp_path: Path, walk: Walk, kind: str) -> None:
 
 
 @pytest.mark.longer
+@pytest.mark.usefixtures("bags_here")
 @pytest.mark.parametrize("kind", ["bag", "db3", "mcap"])
 def test_damaged_bags(tmp_path: Path, walk: Walk, kind: str) -> None:
     """Points or one line, whatever is flipped."""
