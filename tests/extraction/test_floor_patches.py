@@ -10,10 +10,10 @@ import pytest
 from PIL import Image
 
 from tests.scenes_map import building
-from topomerge.extraction.attributes import PATCH_AREA, remove_patches, remove_unfit_rooms
+from topomerge.extraction.attributes import PATCH_AREA, remove_patches, remove_strokes
 from topomerge.extraction.extract import extract
 from topomerge.io.points import read_points
-from topomerge.types import EDGE_DTYPE, WINDOW_DTYPE, TopometricMap
+from topomerge.types import EDGE_DTYPE, WINDOW_DTYPE, TopometricMap, select_rooms
 
 NOWHERE = np.zeros((0, 3))
 
@@ -84,17 +84,21 @@ def test_patches_of_a_storey_that_has_nothing_else_stay():
     assert (other.rooms["storey"] == 1).sum() == upper.sum() and len(other.rooms) == len(map.rooms) - 1
 
 
-def test_floor_where_nobody_fits_is_no_room():
-    map = building(2)
-    standing = map.navigable_room != 1
-    stroke = replace(map, navigable=replace(map.navigable, properties={"standing": standing}))
-    other = remove_unfit_rooms(stroke)
-    assert np.array_equal(other.rooms, np.delete(map.rooms, 1)) and (other.navigable_room[map.navigable_room == 1] == -1).all()
-    some = standing | (np.arange(len(standing)) % 10 == 0)  # a tenth of it is wide enough
-    for whole in (map, replace(map, navigable=replace(map.navigable, properties={"standing": some}))):
-        assert remove_unfit_rooms(whole) is whole
-    nowhere = replace(map, navigable=replace(map.navigable, properties={"standing": np.zeros(len(standing), bool)}))
-    assert remove_unfit_rooms(nowhere) is nowhere, "a storey keeps its rooms"
+@pytest.mark.parametrize("why", ["stroke", "door", "wide", "alone"])
+def test_narrow_floor_to_which_no_door_leads_is_no_room(why: str):
+    map = building(2) if why == "door" else with_patch()
+    at = map.navigable.cells[:, 0] - map.navigable.cells[map.navigable_room == 1, 0].min()
+    stays = (map.navigable_room != 1) | (at < (7 if why == "wide" else 5))  # cells of 0.1 m
+    map = replace(map, navigable=map.navigable.select_cells(stays), navigable_room=map.navigable_room[stays], navigable_area=None)
+    if why == "alone":  # the storey keeps its rooms
+        map = select_rooms(replace(map, edges=map.edges[:0]), np.arange(len(map.rooms)) == 1)
+    other = remove_strokes(map)
+    if why != "stroke":
+        assert other is map
+    else:
+        assert (
+            np.array_equal(other.rooms, np.delete(map.rooms, 1)) and (other.navigable_room[map.navigable_room == 1] == -1).all()
+        )
 
 
 def test_a_letter_painted_on_a_grid_is_no_room(tmp_path: Path):

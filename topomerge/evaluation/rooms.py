@@ -221,7 +221,7 @@ def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
     judged = [r for r in rows if "iou" in r]
     name = settings.data.set or "dev"
     block = {"all": "extraction"}.get(name, name.replace(",", "-")) if settings.presets == "default" else "thesis"
-    parts = [count_places(judged), tabulate_groups(judged, "set", "set")]
+    parts = [count_places(judged), tabulate_groups(judged, "set", "set")] if judged or name != "marked" else []
     simulated = [r for r in judged if r["set"].startswith("by ")]
     if simulated:
         parts += ["The same simulated buildings by kind:", tabulate_groups(simulated, "kind", "building")]
@@ -234,7 +234,7 @@ def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
         parts.append(tabulate_marks(rows))
     if name in LISTED:
         parts.append(tabulate_cases(rows))
-    return {block: "\n\n".join([*parts, list_failures(judged)])}
+    return {block: "\n\n".join([*parts, *([list_failures(judged)] if judged or name != "marked" else [])])}
 
 
 def count_places(rows: Sequence[Row]) -> str:

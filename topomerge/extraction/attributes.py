@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import edt
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -14,7 +15,7 @@ from topomerge.extraction.elevations.windows import add_windows
 from topomerge.extraction.plans.storey_plan import Floor
 from topomerge.extraction.room_odds import add_room_probabilities
 from topomerge.extraction.scan import Scan
-from topomerge.types import EDGE_DTYPE, Array, TopometricMap, select_lowest_of_column, select_rooms
+from topomerge.types import EDGE_DTYPE, Array, TopometricMap, select_rooms
 
 # A doorway joins the two rooms that lie across it, once (beyond the thesis).
 #
@@ -226,19 +227,22 @@ def remove_patches(map: TopometricMap, places: Array) -> TopometricMap:
     return map if stays.all() else select_rooms(map, stays)
 
 
-# Floor where nobody fits is no room of a grid: strokes of letters painted on it, single rays through a window (docs/adr/0047).
+# Strokes of letters painted on a grid are free floor between walls, too: narrow, and no door leads there (docs/adr/0047).
 
-LEAST_STANDING = 0.05  # share of a room's floor where a body fits; of entered rooms of real grids .4 and more
+STROKE_HALF_WIDTH = 0.35  # m to the middle of the next wall cell, that no place of a stroke has: strokes are up to 0.6 m wide
 
 
-def remove_unfit_rooms(map: TopometricMap) -> TopometricMap:
-    """Return the map without the rooms in which no body fits. One that is alone on its storey stays."""
-    lowest = select_lowest_of_column(map.navigable)
-    lowest = lowest[map.navigable_room[lowest] >= 0]
-    standing = np.asarray(map.navigable.properties.get("standing", np.ones(len(map.navigable))), float)[lowest]
-    room, storey = map.navigable_room[lowest], map.rooms["storey"]
-    count = np.bincount(room, minlength=len(map.rooms))
-    stays = np.bincount(room, standing, len(map.rooms)) >= LEAST_STANDING * np.maximum(count, 1)
+def remove_strokes(map: TopometricMap) -> TopometricMap:
+    """Return the map without the rooms that are as narrow as a stroke everywhere and to which no door leads. Rooms that are alone
+    on their storey stay."""
+    count, storey = len(map.rooms), map.rooms["storey"]
+    stays = np.isin(np.arange(count), map.edges["rooms"])
+    for room in np.flatnonzero(~stays).tolist():
+        at = map.navigable.cells[map.navigable_room == room][:, :2].astype(np.int64)
+        low = at.min(axis=0) - 1
+        floor = np.zeros(at.max(axis=0) - low + 2, np.uint8)
+        floor[tuple((at - low).T)] = 1
+        stays[room] = edt.edt(floor, parallel=1).max() * map.navigable.edge >= STROKE_HALF_WIDTH
     stays |= ~np.isin(storey, storey[stays])
     return map if stays.all() else select_rooms(map, stays)
 
@@ -262,7 +266,7 @@ def estimate_attributes(
     map, doubt = add_walked_doors(map, scan.places)
     map = select_distinct_doors(map)
     if scan.raised:
-        map = remove_unfit_rooms(map)
+        map = remove_strokes(map)
     if walls is not None:
         map = remove_patches(add_windows(map, walls.elevations, walls.classes), scan.places)
     return map, [doubt] if doubt else []
