@@ -1,4 +1,5 @@
-"""Sets for `locate`: maps of buildings, single scans and short walks in them at a later session, and scans of other buildings.
+"""Sets for `locate`: maps of buildings, single scans and short walks in them at a later session, scans of other buildings, and
+robots that map at the same time.
 
 Furniture has moved between the sessions."""
 
@@ -174,3 +175,23 @@ def load_located_map(path: Path) -> LocatedMap:
     """Load the truth of a map that was made."""
     arrays = archive.read(path.with_suffix(".truth.npz"))
     return LocatedMap(path, Sim3.from_matrix(arrays["frame"]), arrays["places"], arrays["moved"])
+
+
+def simulate_robot(
+    building: Building, rooms: Sequence[int], frame: Sim3, rng: np.random.Generator, step: float = 2.0, rays: int = 5000
+) -> list[tuple[float, Array, Array]]:
+    """Simulate what a robot sees on its way through rooms: m driven, pose (4, 4) in its frame and points (n, 3) of its lidar.
+
+    Args:
+        frame: takes places of the building into that of the robot.
+        step: m between two scans.
+        rays: of a scan.
+    """
+    sensor = get_sensor("lidar")
+    walk = plan_walk(building, list(rooms), rng, 0.0)
+    poses, along = simulate_sensor_poses(walk, sensor, range(len(building.rooms)), rng)
+    kept = np.unique(np.floor(along / step), return_index=True)[1]
+    chosen = poses[kept]
+    points, of = scan_from_poses(building, sensor, chosen, rays, rng)
+    seen = [(points[of == n] - pose[:3, 3]) @ pose[:3, :3] for n, pose in enumerate(chosen)]
+    return [(float(along[k]), frame.matrix @ pose, part) for k, pose, part in zip(kept, chosen, seen, strict=True)]

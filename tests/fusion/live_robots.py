@@ -9,33 +9,23 @@ from typing import Any
 
 import numpy as np
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.simulation.scanner import scan_from_poses, simulate_sensor_poses
-from topomerge.datasets.simulation.sensors import get_sensor
-from topomerge.datasets.simulation.walk import plan_walk, sample_part
+from topomerge.datasets.pairs.localisation import simulate_robot
+from topomerge.datasets.simulation.walk import sample_part
 
 from topomerge.types import Array, Sim3
 
 FRAMES = {"a": Sim3(), "b": Sim3(2.1, (7.0, -3.0, 0.0))}  # of the building in the frame of each
 SEED = 800_123
 ROOMS = 6  # that both visit
-STEP = 2.0  # m between two scans
-RAYS = 5000  # of a scan
 
 
 @cache
 def list_scans(name: str) -> list[tuple[float, Array, Array]]:
     """Time, pose (4, 4) in the robot's frame and points (n, 3) of the sensor, along a walk through the same rooms."""
     building = make_building("office", SEED)
-    rng = np.random.default_rng([ord(name), 54])
     rooms = sample_part(building, ROOMS, np.random.default_rng(54))
-    walk = plan_walk(building, rooms.tolist(), rng, 0.0)
-    sensor = get_sensor("lidar")
-    poses, along = simulate_sensor_poses(walk, sensor, range(len(building.rooms)), rng)
-    kept = np.unique(np.floor(along / STEP), return_index=True)[1]
-    chosen = poses[kept]
-    points, of = scan_from_poses(building, sensor, chosen, RAYS, rng)
-    seen = [(points[of == n] - pose[:3, 3]) @ pose[:3, :3] for n, pose in enumerate(chosen)]
-    return [(0.1 * n, FRAMES[name].matrix @ pose, part) for n, (pose, part) in enumerate(zip(chosen, seen, strict=True))]
+    scans = simulate_robot(building, rooms.tolist(), FRAMES[name], np.random.default_rng([ord(name), 54]))
+    return [(0.1 * n, pose, points) for n, (_, pose, points) in enumerate(scans)]
 
 
 def stamp(time: float) -> dict[str, int]:

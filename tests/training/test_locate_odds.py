@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from topomerge.archive import find_weights_file
-from topomerge.fusion.atlas.locate import FEATURES, JudgedPose, compute_probabilities, load_odds
+from topomerge.fusion.atlas.locate import JudgedPose, compute_nowhere, compute_probabilities, load_odds
+from topomerge.fusion.atlas.place_search import FEATURES
 from topomerge.training.locate_odds import LocateRows, fit_choice, score_choices
 from topomerge.types import Sim3
 
@@ -28,9 +29,9 @@ def draw_rows(count: int, seed: int) -> list[LocateRows]:
 
 
 def test_a_choice_is_learned_and_holds_on_other_scans() -> None:
-    weights, nowhere = fit_choice(draw_rows(90, 0))
-    assert weights[0] > 1.0 and np.abs(weights[1:]).max() < 0.3 * weights[0] and nowhere > 0
-    scores = score_choices(draw_rows(60, 1), weights, nowhere)
+    found = fit_choice(draw_rows(90, 0))
+    assert found.weight[0] > 1.0 and np.abs(found.weight[1:]).max() < 0.3 * found.weight[0] and found.nowhere > 0
+    scores = score_choices(draw_rows(60, 1), found)
     assert scores["log_loss"] < 0.5 and scores["right"] > 0.4 and scores["wrong"] <= 0.05
 
 
@@ -40,6 +41,13 @@ def test_the_weights_that_ship_are_of_these_features() -> None:
     assert json.loads(find_weights_file("topomerge.fusion.atlas", "locate_odds.json").read_text()) == held
     weight = dict(zip(held["names"], held["weight"], strict=True))
     assert weight["sharp"] > 0 and weight["agree"] > 0 and weight["conflict"] < 0 and weight["off"] < 0
+
+
+def test_nowhere_is_likelier_where_all_poses_are_good() -> None:
+    """A pose that stands out is believed; the same one among many that are nearly as good is not."""
+    out, among = ([JudgedPose(0, Sim3(), np.zeros(len(FEATURES)), o) for o in [14.0, *[rest] * 23]] for rest in (3.0, 13.0))
+    assert compute_nowhere(out) < compute_nowhere(among)
+    assert compute_nowhere(out[:1]) == pytest.approx(load_odds()["nowhere"] + load_odds()["chance"] * load_odds()["usual"])
 
 
 def test_probabilities_of_poses_and_of_nowhere_sum_to_one() -> None:

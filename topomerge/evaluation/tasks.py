@@ -47,6 +47,7 @@ MODULES = {
     "retrieval": "retrieval",
     "radio": "radio",
     "locate": "locate",
+    "live": "live",
     "landmarks": "landmarks",
     "edits": "edits",
     "changes": "changes",

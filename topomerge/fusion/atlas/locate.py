@@ -29,7 +29,7 @@ from topomerge.fusion.atlas.place_index import (
     open_index,
     turn_points,
 )
-from topomerge.fusion.atlas.place_search import score_roughly, search_coarsely
+from topomerge.fusion.atlas.place_search import compute_features, score_roughly, search_coarsely
 from topomerge.io.maps import load_map
 from topomerge.io.points import read_chunks
 from topomerge.landmarks.evidence import LandmarkScorer
@@ -42,12 +42,10 @@ from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, Array, Sim3, T
 
 TALL = (1.5, 2.0)  # m above the floor: what a single scan shows up there is taken for a wall
 LEAST_WALLS = 10  # columns of walls; a scan with fewer tells nothing
-FEATURES = (
-    "sharp", "agree", "opposed", "conflict", "off", "missed", "blocked", "unlike_ceiling", "furniture", "moved", "level",
-)  # fmt: skip
+TELLING = 160  # ...; of the validation's scans none with fewer is believed, so that they are never "not here", either
 NEAR, TURNED = 0.8, np.radians(8.0)  # m and rad: poses that are nearer are one
 PLACE_SIGMA, INDEPENDENT = 0.08, 0.1  # m that a wall is off, and share of its columns that count
-MOST_COLUMNS = 400.0  # of walls, of which more tell no more
+FEW = 4.0  # poses, as which what is usual counts among those of a scan
 LOOSE = 5.0  # m: how far a pose may slide where no wall holds it
 
 
@@ -55,7 +53,7 @@ LOOSE = 5.0  # m: how far a pose may slide where no wall holds it
 class LocateSettings:
     """Args:
     sure: probability from which on a place, or a few places together, is told.
-    absent: probability from which on "not here" is told.
+    absent: probability, against the likeliest place alone, from which on "not here" is told.
     coarse: poses that are refined.
     coarse_of_storey: … of one storey.
     sample: columns of the scan by which these are refined and ranked.
@@ -305,34 +303,16 @@ def _judge(judge: Judge, storey: int, hypothesis: PoseHypothesis, scorer: Landma
 
 
 def load_odds() -> dict[str, Any]:
-    """Load the weights of `FEATURES` and the odds of "nowhere" (`train.py task=locate_odds`)."""
+    """Load the weights of `FEATURES` and what makes the odds of "nowhere" (`train.py task=locate_odds`)."""
     return read_weights_json("topomerge.fusion.atlas", "locate_odds.json")
-
-
-def compute_features(judge: Judge, hypothesis: PoseHypothesis) -> Array:
-    """Compute (11,) `FEATURES` of a refined pose: shares of the scan's walls times the root of their number, as neighbours depend
-    on each other, and what floor, ceiling and furniture show."""
-    pose = hypothesis.transform
-    seen, back = judge.tally(pose)
-    features = judge(pose)
-    column = judge.b[0].plan.edge ** 2
-    total = max(float(seen[10]), column)
-    root = float(np.sqrt(min(total / column, MOST_COLUMNS)))
-    shares = np.array([seen[1], seen[2], seen[3], seen[0] - seen[1:4].sum(), back[0] - back[1] - back[2]]) / total
-    clutter, met = seen[6] + back[6], seen[7] + back[7]
-    by_chance = (seen[9] + back[9]) / max(float(seen[8] + back[8]), 1e-6)
-    lift = float(met - by_chance * clutter) / 0.4
-    blocked = (seen[4] - seen[5]) / max(float(seen[4]), 1e-6) * np.sqrt(min(seen[4] / column, 1000.0))
-    ceiling = min(features["ceilings"], 0.4) * min(features["ceiling_area"] / 10.0, 1.0)
-    rest = [blocked, ceiling, np.sign(lift) * np.log1p(abs(lift)), np.sqrt(max(float(clutter - met), 0.0) / 0.4)]
-    return np.array([hypothesis.score * root, *(shares * root), *rest, min(features["level"], 0.5)])
 
 
 def decide(index: PlaceIndex, query: Query, judged: Sequence[JudgedPose], settings: LocateSettings = LOCATE) -> Location:
     """Decide what to tell of judged poses."""
     if not judged:
         return Location("not here", (), 0, 1.0, "the scan fits nowhere in the atlas")
-    chances, nowhere = compute_probabilities(judged, load_odds()["nowhere"])
+    none = compute_nowhere(judged)
+    chances, nowhere = compute_probabilities(judged, none)
     places: list[tuple[Place, Array]] = []
     for pose, p in zip(judged, chances.tolist(), strict=True):
         own = index.maps[index.storeys[pose.storey].map]
@@ -345,7 +325,18 @@ def decide(index: PlaceIndex, query: Query, judged: Sequence[JudgedPose], settin
             places.append((_build_place(index, pose, query, p), there))
     ranked = sorted((p for p, _ in places), key=lambda p: -p.probability)
     shown = tuple(ranked[: settings.alike + settings.shown])
-    return _word(shown, nowhere, settings, is_telling(query, settings))
+    return _word(shown, nowhere, settings, len(query.fields.walls) >= TELLING)
+
+
+def compute_nowhere(judged: Sequence[JudgedPose]) -> float:
+    """Compute the odds of "nowhere" by the mean ones of the poses: what a scan like this reaches by chance."""
+    odds = load_odds()
+    return float(odds["nowhere"]) + float(odds["chance"]) * measure_chance([j.odds - j.testimony for j in judged], odds["usual"])
+
+
+def measure_chance(odds: Sequence[float] | Array, usual: float) -> float:
+    """Measure the mean odds of poses; of few ones together with what is usual."""
+    return float(np.sum(odds) + FEW * usual) / (len(odds) + FEW)
 
 
 def compute_probabilities(judged: Sequence[JudgedPose], none: float) -> tuple[Array, float]:
@@ -366,14 +357,6 @@ def _is_same(a: Array, b: Array) -> bool:
     return bool(np.hypot(*(a - b)[:2]) < NEAR and abs(a[2] - b[2]) < 1.5 and abs(wrap_yaw(float(a[3] - b[3]))) < TURNED)
 
 
-def is_telling(query: Query, settings: LocateSettings = LOCATE) -> bool:
-    """Does a scan show so much that it would be believed, if it fitted perfectly? Else "not here" would be a guess, too."""
-    odds = load_odds()
-    root = float(np.sqrt(min(len(query.fields.walls), MOST_COLUMNS)))
-    best = root * sum(odds["weight"][FEATURES.index(name)] for name in ("sharp", "agree"))
-    return bool(best - odds["nowhere"] >= np.log(settings.sure / (1 - settings.sure)))
-
-
 def _word(places: tuple[Place, ...], nowhere: float, settings: LocateSettings, telling: bool) -> Location:
     best = places[0]
     if best.probability >= settings.sure:
@@ -386,7 +369,7 @@ def _word(places: tuple[Place, ...], nowhere: float, settings: LocateSettings, t
         else:
             where = f"cannot tell between {told} places that look alike"
         return Location("ambiguous", places, told, nowhere, where)
-    if nowhere >= settings.absent and telling:
+    if nowhere >= settings.absent * (nowhere + best.probability) and telling:
         reason = f"not here ({nowhere:.2f}): nothing in the atlas fits well enough"
         return Location("not here", places[: settings.shown], 0, nowhere, reason)
     reason = "too many places fit about as well" if telling else "the scan shows too little"

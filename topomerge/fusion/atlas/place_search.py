@@ -1,4 +1,4 @@
-"""Poses of a single scan on the storeys of an atlas: looked for in large cells, and ranked by a few of its columns."""
+"""Poses of a single scan on the storeys of an atlas: looked for in large cells, ranked by a few of its columns, and described."""
 
 from __future__ import annotations
 
@@ -9,10 +9,16 @@ from scipy import fft, ndimage
 
 from topomerge.fusion.atlas.place_index import COARSE_CELL, IndexedStorey, draw_points, turn_points
 from topomerge.matching.poses import PlanFields, PoseHypothesis, wrap_yaw
+from topomerge.registration.judge import Judge
 from topomerge.registration.search import find_yaw_candidates
 from topomerge.types import Array, Sim3
 
 FARTHEST, CLEAR_WEIGHT, PEAKS = 30.0, 0.75, 16  # m of a scan that is searched by; of a wall on clear floor; of each yaw
+FEATURES = (
+    "sharp", "agree", "opposed", "conflict", "off", "missed", "blocked", "unlike_ceiling", "furniture", "moved", "level",
+)  # fmt: skip
+AGAINST = slice(2, 7)  # of them
+MOST_COLUMNS = 400.0  # of walls, of which more tell no more
 WALL_ON_CLEAR, CLEAR_ON_WALL = 0.5, 2.0  # of shares of columns, against walls that meet
 
 
@@ -108,3 +114,27 @@ def _measure_share(points: Array, mask: Array, fields: PlanFields, pose: Sim3) -
     cells = np.floor((at - fields.plan.origin) / fields.plan.edge).astype(np.int64)
     cells = cells[((cells >= 0) & (cells < mask.shape)).all(axis=1)]
     return float(mask[cells[:, 0], cells[:, 1]].sum()) / max(len(points), 1)
+
+
+def compute_features(judge: Judge, hypothesis: PoseHypothesis) -> Array:
+    """Compute (11,) `FEATURES` of a refined pose: shares of the scan's walls times the root of their number, as neighbours depend
+    on each other, and what floor, ceiling and furniture show.
+
+    Of what speaks against a pose logarithms count: one moved wall is as little as ten.
+    """
+    pose = hypothesis.transform
+    seen, back = judge.tally(pose)
+    features = judge(pose)
+    column = judge.b[0].plan.edge ** 2
+    total = max(float(seen[10]), column)
+    root = float(np.sqrt(min(total / column, MOST_COLUMNS)))
+    shares = np.array([seen[1], seen[2], seen[3], seen[0] - seen[1:4].sum(), back[0] - back[1] - back[2]]) / total
+    clutter, met = seen[6] + back[6], seen[7] + back[7]
+    by_chance = (seen[9] + back[9]) / max(float(seen[8] + back[8]), 1e-6)
+    lift = float(met - by_chance * clutter) / 0.4
+    blocked = (seen[4] - seen[5]) / max(float(seen[4]), 1e-6) * np.sqrt(min(seen[4] / column, 1000.0))
+    ceiling = min(features["ceilings"], 0.4) * min(features["ceiling_area"] / 10.0, 1.0)
+    rest = [blocked, ceiling, np.sign(lift) * np.log1p(abs(lift)), np.sqrt(max(float(clutter - met), 0.0) / 0.4)]
+    found = np.array([hypothesis.score * root, *(shares * root), *rest, min(features["level"], 0.5)])
+    found[AGAINST] = np.sign(found[AGAINST]) * np.log1p(np.abs(found[AGAINST]))
+    return found
