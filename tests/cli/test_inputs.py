@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -32,7 +33,7 @@ from topomerge.errors import InputError
 def clouds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Three clouds that differ, each large enough for a process."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(inputs, "LEAST_SIZE", 1)
+    monkeypatch.setattr(inputs, "LEAST_SIZE", {"fork": 1, "spawn": 1})
     points = two_rooms().points()
     for k, name in enumerate("abc"):
         np.save(f"{name}.npy", points[:: k + 1] + np.float32(k))
@@ -53,12 +54,26 @@ def began(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return here
 
 
+@pytest.fixture(params=["fork", "spawn"])
+def method(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """How processes are started: those that are forked hold what this process has, which must not matter."""
+    if request.param == "fork" and (sys.platform != "linux" or "onnxruntime" in sys.modules):
+        pytest.skip("another test opened a network in this process")
+    monkeypatch.setattr(inputs, "choose_start", lambda: request.param)
+    return str(request.param)
+
+
+def list_children(of: psutil.Process | None = None) -> list[psutil.Process]:
+    """Processes that were started, but for Python's own tracker of resources."""
+    return [child for child in (of or psutil.Process()).children() if "resource_tracker" not in " ".join(child.cmdline())]
+
+
 def choose(jobs: int, **others: Any) -> argparse.Namespace:
     return argparse.Namespace(quiet=True, jobs=jobs, **others)
 
 
 @pytest.mark.longer
-def test_any_number_of_processes_gives_the_same_maps(clouds: list[str], began: list[str]) -> None:
+def test_any_number_of_processes_gives_the_same_maps(clouds: list[str], began: list[str], method: str) -> None:
     topomerge.save_map(topomerge.extract(np.load("a.npy")), "d.tmap")
     paths = [clouds[0], "d.tmap", *clouds[1:]]
     alone = list(iter_input_maps(paths, choose(1, voxel_size=0.12, sensor="tls")))
@@ -73,20 +88,50 @@ def test_any_number_of_processes_gives_the_same_maps(clouds: list[str], began: l
             assert getattr(one.map, name).tobytes() == getattr(other.map, name).tobytes(), name
         assert np.array_equal(one.map.grid.cells, other.map.grid.cells)
         assert other.read_seconds > 0 and (other.extract_seconds > 0) == (one.extract_seconds > 0)
-    assert not psutil.Process().children()[1:]  # but for Python's own tracker of resources
+    assert not list_children()
 
 
-def test_processes_start_before_the_maps_are_asked_for(clouds: list[str], began: list[str]) -> None:
+def test_processes_start_before_the_maps_are_asked_for(clouds: list[str], began: list[str], method: str) -> None:
     """They import and read while a command checks what it was given."""
     with inputs.InputMaps(clouds[:2], choose(2)) as maps:
-        wait_for(lambda: len(psutil.Process().children()) > 1)  # Python's own tracker of resources, and the other process
-        assert not began
+        assert len(list_children()) == 1 and not began
         loaded = list(maps)
-        assert not psutil.Process().children()[1:]  # they do not wait for the end of the command
+        assert not list_children()  # they do not wait for the end of the command
     assert [one.map.source for one in loaded] == clouds[:2] and len(began) == 1
     with inputs.InputMaps(clouds[:2], choose(2)):
         pass  # a command that refuses what it was given
-    assert not psutil.Process().children()[1:]
+    assert not list_children()
+
+
+def test_forked_processes_do_not_outlive_the_first(clouds: list[str]) -> None:
+    """Each closes the ends of the others' pipes that it inherits: else it would wait for ever."""
+    code = f"""
+import argparse, os, signal
+from topomerge.cli import inputs
+inputs.LEAST_SIZE = {{"fork": 1, "spawn": 1}}
+maps = inputs.InputMaps({clouds!r}, argparse.Namespace(quiet=True, jobs=3))
+maps.__enter__()
+print(inputs.choose_start(), *(process.pid for process, _ in maps._others._started), flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False).stdout.split()
+    assert len(told) == 3
+    wait_for(lambda: not any(psutil.pid_exists(int(pid)) for pid in told[1:]))
+
+
+def test_nothing_is_forked_beside_threads_and_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.delitem(sys.modules, "onnxruntime", raising=False)
+    monkeypatch.setattr(threading, "active_count", lambda: 1)
+    assert inputs.choose_start() == "fork"
+    monkeypatch.setattr(threading, "active_count", lambda: 2)
+    assert inputs.choose_start() == "spawn"
+    monkeypatch.setattr(threading, "active_count", lambda: 1)
+    monkeypatch.setitem(sys.modules, "onnxruntime", sys)
+    assert inputs.choose_start() == "spawn"
+    monkeypatch.delitem(sys.modules, "onnxruntime")
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert inputs.choose_start() == "spawn"
 
 
 def test_what_is_needed_later_is_imported_while_another_process_works(clouds: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,14 +180,14 @@ def test_a_signal_ends_all_processes(clouds: list[str], number: int, status: int
 import sys
 from topomerge.cli import inputs
 from topomerge.cli.main import main
-inputs.LEAST_SIZE = 1
+inputs.LEAST_SIZE = {"fork": 1, "spawn": 1}
 sys.exit(main())
 """
     heard = partial(signal.signal, signal.SIGINT, signal.default_int_handler)  # a suite in the background ignores Ctrl-C
     words = [sys.executable, "-c", code, "merge", *clouds, "-o", "out", "--jobs", "2"]
     command = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, preexec_fn=heard, start_new_session=True)
     own = psutil.Process(command.pid)
-    wait_for(lambda: len(own.children()) > 1)  # its tracker of resources, and the other process
+    wait_for(lambda: len(list_children(own)) > 0)
     children = own.children()
     time.sleep(0.3)
     if number == signal.SIGINT:

@@ -1,21 +1,25 @@
 """The maps that the inputs of a command stand for: read from a .tmap, or extracted from anything else, large ones side by side.
 
 Extraction holds the interpreter's lock for most of its time, so that threads gain nothing: each core has a process of its own.
-They are spawned, as locks and threads do not survive a fork. A started process imports for about a second before it works, while
-this one imports as well: it is started before anything else is done (`InputMaps`). Very small clouds are extracted here.
+On Linux they are forked, before a thread or a network is started here, as these do not survive a fork: what this process has
+imported and loaded is theirs, too. Elsewhere they are spawned, and import for about a second. Either way they start before
+anything else is done (`InputMaps`). Very small clouds are extracted here.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 import signal
+import sys
 import threading
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -27,17 +31,18 @@ from topomerge.errors import InputError
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
-    from multiprocessing.context import SpawnProcess
+    from multiprocessing.process import BaseProcess
 
     from topomerge.types import TopometricMap
 
 # Advice of the readers that only `extract` can take: --scale and --poses of `merge` are others.
 EXTRACT_ADVICE = ("--resolution", "--poses", "--topic", "--scale", "--spacing")
-LEAST_SIZE = 5_000_000  # bytes of a cloud, from which a process for it is worth its start (docs/benchmarks.md)
+LEAST_SIZE = {"fork": 500_000, "spawn": 5_000_000}  # bytes of a cloud, from which a process is worth it (docs/benchmarks.md)
 COMPRESSION = {".laz": 6, ".e57": 2}  # of the bytes of a point, against PLY and LAS
 MEMORY_START, MEMORY_GROWTH = 600_000_000, 8  # bytes that extraction takes at most: to start with, and for each byte of the cloud
 WORKER_OPTIONS = ("voxel_size", "up", "unit", "one_frame", "sensor", "text", "tag_size", "verbose")
 EXTRACTION_MODULES = ("topomerge.extraction.extract", "topomerge.io.points")
+EXTRACTION_LOOPS = ("images", "rasters", "rays", "stencil", "voxels")  # of `topomerge.kernels`
 GRACE = 2.0  # s that a process has to end by itself
 Starter = Callable[[str], Report | None]  # title of a task -> what moves its bar
 
@@ -122,7 +127,7 @@ class InputMaps:
     def __init__(self, paths: Sequence[str], args: argparse.Namespace, ahead: Sequence[str] = ()) -> None:
         self._paths, self._args, self._ahead = list(paths), args, list(ahead)
         sizes = {path: measure_input(path) for path in paths if not is_map(path)}
-        self._large = {path for path, size in sizes.items() if size >= LEAST_SIZE}
+        self._large = {path for path, size in sizes.items() if size >= LEAST_SIZE[choose_start()]}
         large = [sizes[path] for path in self._large]
         self._processes = count_processes(large, getattr(args, "jobs", None)) if len(large) > 1 else 1
         self._stack = ExitStack()
@@ -132,8 +137,9 @@ class InputMaps:
     def __enter__(self) -> InputMaps:
         if self._processes > 1:
             with ExitStack() as stack:
-                bars = stack.enter_context(ProgressBars(enabled=not getattr(self._args, "quiet", False)))
+                bars = ProgressBars(enabled=not getattr(self._args, "quiet", False))
                 self._others = stack.enter_context(_Processes(self._processes - 1, self._args, bars))
+                stack.enter_context(bars)  # not before: they start a thread
                 self._begin(self._processes)
                 self._stack = stack.pop_all()
         return self
@@ -268,6 +274,12 @@ def estimate_free_memory(root: Path = Path("/")) -> int:
         return 2 * MEMORY_START
 
 
+def choose_start() -> str:
+    """Return how processes are started: forked, where that is safe."""
+    safe = sys.platform == "linux" and threading.active_count() == 1 and "onnxruntime" not in sys.modules
+    return "fork" if safe else "spawn"
+
+
 class _Processes:
     """Processes that extract clouds, each with a thread here that gives it work and passes on what it tells. All start with the
     context and end with it, however it is left.
@@ -280,23 +292,35 @@ class _Processes:
         self._options = argparse.Namespace(**{"verbose": 0, **collect_given(args, *WORKER_OPTIONS)}, cores=count + 1)
         self._bars = bars
         self._local = threading.local()
-        self._started: list[SpawnProcess] = []
-        self._lock = threading.Lock()
-        self._leaving = False
-        self._count = count
-        self._threads = ThreadPoolExecutor(count, "extract", _keep_interrupts_away)
+        self._started: list[tuple[BaseProcess, Connection[Any, Any]]] = []
+        self._count, self._numbers = count, itertools.count()
+        self._threads = ThreadPoolExecutor(count, "extract")
 
     def __enter__(self) -> _Processes:
-        for _ in range(self._count):
-            self._threads.submit(self._get_process)
+        method = choose_start()
+        if method == "fork":
+            _load_extraction()
+        with _hold_interrupts(method), warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of forks beside threads: those of BLAS, which ends them before
+            for _ in range(self._count):
+                self._start_process(method)
         return self
 
+    def _start_process(self, method: str) -> None:
+        from multiprocessing import get_context
+
+        ours, theirs = get_context(method).Pipe()
+        inherited = [ours, *(other for _, other in self._started)] if method == "fork" else []
+        about = (theirs, inherited, self._options, self._bars.enabled)
+        process: BaseProcess = get_context(method).Process(target=_work, args=about, daemon=True)  # type: ignore[attr-defined]
+        process.start()
+        theirs.close()  # so that its end is seen
+        self._started.append((process, ours))
+
     def __exit__(self, *_: object) -> None:
-        with self._lock:
-            self._leaving = True
-        for process in self._started:
+        for process, _connection in self._started:
             process.terminate()
-        for process in self._started:
+        for process, _connection in self._started:
             process.join(GRACE)
             process.kill()  # of one that has ended, nothing is left to kill
             process.join()
@@ -345,34 +369,55 @@ class _Processes:
             raise InputError(told)
         return told  # type: ignore[no-any-return]
 
-    def _get_process(self) -> tuple[SpawnProcess, Connection[Any, Any]]:
-        if not hasattr(self._local, "process"):
-            from multiprocessing import get_context
-
-            ours, theirs = get_context("spawn").Pipe()
-            process = get_context("spawn").Process(target=_work, args=(theirs, self._options, self._bars.enabled), daemon=True)
-            with self._lock:
-                if self._leaving:
-                    raise InterruptedError("the command ends")
-                process.start()
-                self._started.append(process)
-            theirs.close()  # so that its end is seen
-            self._local.process = process, ours
-        return self._local.process  # type: ignore[no-any-return]
+    def _get_process(self) -> tuple[BaseProcess, Connection[Any, Any]]:
+        """The process of this thread."""
+        if not hasattr(self._local, "number"):
+            self._local.number = next(self._numbers)
+        return self._started[self._local.number]
 
 
-def _keep_interrupts_away() -> None:
-    """A terminal sends Ctrl-C to all processes. Those that this thread starts do not hear it: the first one answers, and ends
+@contextmanager
+def _hold_interrupts(method: str) -> Iterator[None]:
+    """A terminal sends Ctrl-C to all processes. Those that are started meanwhile do not hear it: this one answers later, and ends
     them."""
-    if hasattr(signal, "pthread_sigmask"):  # Windows has none
+    if not hasattr(signal, "pthread_sigmask"):  # Windows has none
+        yield
+        return
+    if method == "spawn":
         from multiprocessing import resource_tracker
 
         resource_tracker.ensure_running()  # its start would let them in again
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _work(connection: Connection[Any, Any], options: argparse.Namespace, shows_progress: bool) -> None:
-    """Load the maps of the paths that come, until none comes. Back go tuples of progress, then the map or a line of error."""
+def _load_extraction() -> None:
+    """Import what extraction needs, and load its loops, which takes half as long again."""
+    from numba.core.sigutils import normalize_signature
+
+    for name in EXTRACTION_MODULES:
+        import_module(name)
+    from topomerge.kernels.ahead import load_loops
+
+    for loop, signatures in load_loops().items():
+        if loop.py_func.__module__.rpartition(".")[2] in EXTRACTION_LOOPS:
+            for signature in signatures:
+                loop.compile(normalize_signature(f"({signature},)")[0])
+
+
+def _work(
+    connection: Connection[Any, Any], inherited: Sequence[Connection[Any, Any]], options: argparse.Namespace, shows_progress: bool
+) -> None:
+    """Load the maps of the paths that come, until none comes. Back go tuples of progress, then the map or a line of error.
+
+    Args:
+        inherited: ends of the other process, closed here, so that its end is seen.
+    """
+    for other in inherited:
+        other.close()
     exit_on_signals()
     debug = options.verbose > 1 or os.environ.get("TOPOMERGE_DEBUG", "") not in ("", "0")
     show_log(options.verbose, debug)
