@@ -68,6 +68,7 @@ def make_atlas(
         sensors=tuple(sensors),
         source=source,
         building=building.name,
+        frames=tuple(frames),
     )
 
 

@@ -81,6 +81,7 @@ class Atlas:
         maps: n clouds.
         truth: n transforms T_0k; the first is the identity.
         shared: rooms (i of `maps[k].rooms`, j of `maps[l].rooms`) for each (k, l) with k < l.
+        frames: n transforms, building -> cloud.
     """
 
     name: str
@@ -90,6 +91,7 @@ class Atlas:
     sensors: tuple[str, ...]
     source: str
     building: str
+    frames: tuple[Sim3, ...] = ()
 
     def __post_init__(self) -> None:
         if not len(self.maps) == len(self.truth) == len(self.sensors) or len(self.maps) < 2:

@@ -4,6 +4,9 @@
 Sensors and kinds of building are mixed; in every second set of four or more maps the last map is of another building of the same
 kind, which must stay apart. A map is right within 0.5 m and 5 degrees of where it lies in the first map of its component, at its
 own middle; with slices, which say nothing of heights, seen from above. Rows are kept when the code changes.
+
+``data=small``: many small maps, three or four of each building, of four rooms, by depth camera or tablet; ``signs=.5``: half of
+them have read the signs at their doors.
 """
 
 from __future__ import annotations
@@ -22,17 +25,19 @@ from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.core.builder import limit_threads
 from topomerge.datasets.pairs.atlases import make_atlas
 from topomerge.datasets.pairs.evaluation_pair import convert_to_sim3
-from topomerge.datasets.pairs.pairs import Atlas
+from topomerge.datasets.pairs.pairs import Atlas, simulate_signs
 from topomerge.datasets.plans.splits import get_seed_range
+from topomerge.datasets.simulation.signs import READERS
 from topomerge.errors import InputError
 from topomerge.evaluation.documents import write_table
 from topomerge.evaluation.tasks import Row, TaskSettings, measure_missing
 from topomerge.extraction.extract import extract
+from topomerge.extraction.landmarks import add_landmarks
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.solve import build_atlas
 from topomerge.io.maps import save_map
 from topomerge.matching.poses import pose_difference
-from topomerge.types import Array, LogFn, Sim3
+from topomerge.types import Array, Landmarks, LogFn, Sim3
 
 MAKERS = ("topomerge.extraction.extract", "topomerge.fusion.atlas.solve", "topomerge.datasets.pairs.atlases")
 RIGHT = (0.5, np.radians(5.0))  # m, rad
@@ -51,6 +56,7 @@ ATLAS_COLUMNS += ("median error m",)
 ATLAS_KINDS = ("office", "hospital", "school", "hotel", "lab", "openplan")
 ATLAS_SENSORS = {"tls": 3, "lidar": 2, "depth": 3, "tablet": 1, "laser2d": 1}
 ATLAS_ROOMS = (6, 12)  # of a map, fewest and most
+SMALL, SMALL_ROOMS, SMALL_SENSORS, OF_A_BUILDING = "small", 4, ("depth", "tablet"), (3, 4)
 
 
 @dataclass
@@ -60,15 +66,19 @@ class Settings(TaskSettings):
     Args:
         sizes: numbers of maps.
         sets: of each size.
+        signs: share of the maps that have read the signs at their doors; of ``data=small`` only.
     """
 
     sizes: list[int] = field(default_factory=lambda: [2, 4])
     sets: int = 2
+    signs: float = 0.0
 
 
 def list_sets(settings: Settings) -> list[tuple[str, int, int]]:
     """List split, size and number of each set."""
-    return [(settings.data.set or "train", size, number) for size in settings.sizes for number in range(settings.sets)]
+    split = settings.data.set or "train"
+    split = f"{SMALL}-{settings.signs:g}" if split == SMALL else split
+    return [(split, size, number) for size in settings.sizes for number in range(settings.sets)]
 
 
 def list_inputs(settings: Settings) -> list[str]:
@@ -79,7 +89,10 @@ def list_inputs(settings: Settings) -> list[str]:
 def measure(settings: Settings, log_line: LogFn) -> list[Row]:
     """Measure the sets that are missing."""
     cache = Path(settings.cache) / "atlas"
-    items = {f"{size:02d}_{number:02d}": (split, size, number, cache) for split, size, number in list_sets(settings)}
+    if settings.signs and settings.data.set != SMALL:
+        raise InputError(f"signs={settings.signs:g}: needs data={SMALL}")
+    sets = list_sets(settings)
+    items = {f"{split if SMALL in split else ''}{size:02d}_{k:02d}": (split, size, k, cache) for split, size, k in sets}
     path = Path(settings.cache) / "evaluation" / f"atlases_{settings.data.set or 'train'}.jsonl"
     return measure_missing(path, items, measure_set, log_line, settings)
 
@@ -113,12 +126,37 @@ def draw_set(split: str, maps: int, number: int) -> tuple[Atlas, Atlas | None]:
     raise InputError(f"no set of {maps} maps number {number} can be made")
 
 
+def make_small_set(signs: float, count: int, number: int, folder: Path) -> None:
+    """Make small maps of many buildings of the test split, a share of which has read the signs at their doors."""
+    rng, first_seed = np.random.default_rng([count, number, 51]), get_seed_range("test")[0]
+    truth: list[Array] = []
+    sensors: list[str] = []
+    places: list[int] = []
+    while len(truth) < count:
+        place = len(set(places))
+        kind, seed = ATLAS_KINDS[place % len(ATLAS_KINDS)], first_seed + 5_000 + 1_000 * number + place
+        wanted = min(int(rng.choice(OF_A_BUILDING)), max(count - len(truth), 2))
+        building = make_building(kind, seed)
+        atlas = make_atlas(building, rng.choice(SMALL_SENSORS, wanted).tolist(), rng, SMALL_ROOMS)
+        for cloud, frame, to_first, sensor in zip(atlas.maps, atlas.frames, atlas.truth, atlas.sensors, strict=True):
+            name, read = f"map_{len(truth):04d}_{sensor}", rng.random() < signs
+            landmarks = simulate_signs(building, cloud, READERS["good"], frame)[0] if read else Landmarks()
+            save_map(add_landmarks(replace(extract(cloud), source=name), landmarks), folder / f"{name}.tmap")
+            truth, sensors, places = [*truth, to_first.matrix], [*sensors, sensor], [*places, place]
+    about = {"building": f"{len(set(places))} buildings", "sensors": sensors, "places": places}
+    (folder / "truth.json").write_text(json.dumps({**about, "truth": [t.tolist() for t in truth]}))
+
+
 def make_set(split: str, maps: int, number: int, cache: Path) -> Path:
     """Make one set, unless it is there."""
     folder = cache / split / f"{maps:02d}_{number:02d}"
     if (folder / "truth.json").exists():
         return folder
     folder.mkdir(parents=True, exist_ok=True)
+    if split.startswith(SMALL):
+        with limit_threads():
+            make_small_set(float(split.partition("-")[2]), maps, number, folder)
+        return folder
     with limit_threads():
         atlas, other = draw_set(split, maps, number)
         clouds = list(atlas.maps)
@@ -150,11 +188,12 @@ def errors(made: AtlasSet, result: AtlasResult) -> dict[int, tuple[float, float]
     """Error of each map in its component's first map, m and rad; None for maps of two buildings in one component."""
     out: dict[int, tuple[float, float] | None] = {}
     sensors: Any = made.about["sensors"]
+    places: Any = made.about.get("places", [0] * len(made.files))
     for members in result.components:
         first = members[0]
         for k in members[1:]:
             one, two = made.truth[first], made.truth[k]
-            if one is None or two is None:
+            if one is None or two is None or places[first] != places[k]:
                 out[k] = None
                 continue
             true, middle = one.inverse() @ two, result.maps[k].grid.compute_centroids().mean(axis=0)
@@ -172,16 +211,20 @@ def measure_set(split: str, maps: int, number: int, cache: Path) -> Row:
     seconds = process_time() - began
     off = errors(built, result)
     right = [k for k, e in off.items() if e is not None and e[0] < RIGHT[0] and e[1] < RIGHT[1]]
-    belong = sum(t is not None for t in built.truth)
-    best = max((sum(k in right for k in members[1:]) for members in result.components), default=0)
+    places: Any = built.about.get("places", [0] * len(built.files))
+    belonging = {p for p, t in zip(places, built.truth, strict=True) if t is not None}
+    best = dict.fromkeys(belonging, 0)  # of each building, the maps of its largest component that lie right
+    for members in result.components:
+        place = places[members[0]]
+        best[place] = max(best.get(place, 0), sum(k in right for k in members[1:]))
     return {
         "maps": len(built.files),
         "seconds": seconds,  # of one core
         "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "registered": result.registered[0],
         "pairs": result.registered[1],
-        "could": belong - 1,
-        "right": best,
+        "could": sum(t is not None for t in built.truth) - len(belonging),
+        "right": sum(best.values()),
         "wrong": len(off) - len(right),
         "components": [list(c) for c in result.components if len(c) > 1],
         "errors": {str(k): e for k, e in off.items()},
@@ -213,4 +256,5 @@ def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
             f"{np.median(off):.2f}" if off else "–",
         ]
         lines.append(cells)
-    return {"atlases": write_table(ATLAS_COLUMNS, lines)}
+    name = "atlases" if settings.data.set != SMALL else "atlases-small" + ("-signs" if settings.signs else "")
+    return {name: write_table(ATLAS_COLUMNS, lines)}
