@@ -20,7 +20,9 @@ from topomerge.extraction.extract import extract
 from topomerge.extraction.plans.plan_network import LOOKS, PLAN_NETWORK_FILE
 from topomerge.io import piece, ply
 from topomerge.io.points import read_chunks
+from topomerge.kernels import voxels
 from topomerge.networks.network import Network
+from topomerge.types import PointCloud
 
 MOST_MODULES = {"import topomerge": 120, "import topomerge.kernels": 620, "import topomerge.extraction.extract": 1020}
 
@@ -74,6 +76,21 @@ def test_each_point_is_read_once(tmp_path: Path, read: Counter[str], monkeypatch
     words = [str(tmp_path / name) for name in ("a.ply", "b.ply")]
     assert main(["merge", *words, "-o", str(tmp_path / "merged"), "--jobs", "1", "-q", "--force"]) in (0, 2)
     assert read == {"a.ply": len(points), "b.ply": len(points[::2])}
+
+
+def test_each_point_is_laid_into_cells_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cells of 10 cm are made of those of 5 cm that walls are looked at in."""
+    laid: Counter[float] = Counter()
+    before = voxels._count_in_bricks
+
+    def note(points: np.ndarray, shift: np.ndarray, edge: float, *words: Any) -> Any:
+        laid[edge] += len(points)
+        return before(points, shift, edge, *words)
+
+    monkeypatch.setattr(voxels, "_count_in_bricks", note)
+    points = two_rooms().points().astype(np.float32)
+    extract(PointCloud(part) for part in np.array_split(points, 3))
+    assert laid == {0.05: len(points)}
 
 
 def test_networks_run_once_a_look_and_once_a_strip(runs: Counter[str], monkeypatch: pytest.MonkeyPatch) -> None:

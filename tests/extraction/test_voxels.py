@@ -129,6 +129,38 @@ def test_of_more_cells_than_are_wanted_there_are_none():
     assert held.select_within(voxelise(rng.uniform(0, 4, (800, 3)).astype(np.float32))) is None
 
 
+@pytest.mark.parametrize(("away", "most"), [(0.0, 0), (3e6, 0), (0.0, 3000)])
+def test_cells_twice_as_long_are_those_of_their_points(away: float, most: int):
+    """To the bit, though no point is looked at again: also where codes do not reach, and where the shorter cells are too many."""
+    rng = np.random.default_rng(6)
+    shift = np.array([85_000.0, -447_000.0, -3.0])
+    chunks = [rng.uniform(-3, 3, (400, 3)).astype(np.float32) for _ in range(30)]
+    chunks[0][0] = np.nan
+    chunks[20][:7] += np.float32(away)
+    long, alone, short, short_alone = (LatticeCells(edge, most if edge < 0.1 else 0) for edge in (0.1, 0.1, 0.05, 0.05))
+    short.twice = long
+    for chunk in chunks:
+        for held in (alone, short, short_alone):
+            held.add(PointCloud(chunk, shift))
+    assert short.too_many == short_alone.too_many == bool(most)
+    for one, other in ((long, alone), (short, short_alone))[: 1 if most else 2]:
+        both = [[part[np.lexsort(held[0].T)] for part in held] for held in (one.get_cells(), other.get_cells())]
+        assert all(np.array_equal(a, b) for a, b in zip(*both, strict=True)) and len(both[0][0]) > 5000
+
+
+def test_sums_in_cubes_are_those_of_numpy():
+    points = np.random.default_rng(7).normal(0, 2, (3000, 3))
+    points[:3] *= 1e7
+    cubes = np.floor(points / 0.7)
+    near = (np.abs(cubes) < kernel.CUBE_LIMIT).all(axis=1)
+    _, of, number = np.unique(cubes[near], axis=0, return_inverse=True, return_counts=True)
+    at = points[near] - (cubes[near] + 0.5) * 0.7
+    columns = [np.bincount(of.ravel(), at[:, i]) for i in range(3)]
+    columns += [np.bincount(of.ravel(), at[:, i] * at[:, j]) for i, j in kernel.MOMENTS]
+    assert near.sum() == 2997 and np.array_equal(kernel.sum_in_cubes(points, 0.7), np.column_stack([number, *columns]))
+    assert kernel.sum_in_cubes(np.zeros((0, 3)), 0.4).shape == (0, 10)
+
+
 def test_shift_moves_the_origin_exactly():
     points = np.random.default_rng(0).uniform(0, 5, (1000, 3)).astype(np.float32)
     near, far = voxelise(PointCloud(points)), voxelise(PointCloud(points, np.array([85_000.0, 447_000.0, 0.0])))

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from topomerge.kernels.voxels import MOMENTS, sum_in_cubes
 from topomerge.types import Array, PointCloud, VoxelGrid, transform_landmarks, transform_points
 
 # Which way is up in a cloud: the normals of its floors and ceilings say so, and its walls are the witnesses (beyond the thesis).
@@ -106,19 +107,13 @@ def _sample_points(points: Array) -> Array:
 
 def _fit_planes(points: Array, edge: float) -> Array:
     """The normals of the planes in cubes of one edge length, m; points lie around the origin."""
-    cells = np.floor(points / edge)
-    near = (np.abs(cells) < 1 << 20).all(axis=1)
-    local = points[near] - (cells[near] + 0.5) * edge
-    x, y, z = (cells[near].astype(np.int64) + (1 << 20)).T
-    codes, of_cube, count = np.unique((x << 42) | (y << 21) | z, return_inverse=True, return_counts=True)
-    of_cube, number = of_cube.ravel(), len(codes)
-    mean = np.column_stack([np.bincount(of_cube, v, number) for v in local.T]) / count[:, None]
-    covariance = np.empty((number, 3, 3))
-    for i in range(3):
-        for j in range(i, 3):
-            product = np.bincount(of_cube, local[:, i] * local[:, j], number) / count
-            covariance[:, i, j] = covariance[:, j, i] = product - mean[:, i] * mean[:, j]
-    values, vectors = np.linalg.eigh(covariance[count >= LEAST_POINTS])
+    sums = sum_in_cubes(points, edge)
+    sums = sums[sums[:, 0] >= LEAST_POINTS]
+    moments = sums[:, 1:] / sums[:, :1]
+    covariance = np.empty((len(sums), 3, 3))
+    for k, (i, j) in enumerate(MOMENTS):
+        covariance[:, i, j] = covariance[:, j, i] = moments[:, 3 + k] - moments[:, i] * moments[:, j]
+    values, vectors = np.linalg.eigh(covariance)
     thick, wide, long = np.sqrt(np.maximum(values, 0)).T
     is_plane = (thick <= FLATNESS * edge) & (thick < THINNESS * wide) & (wide >= ROUNDNESS * long)
     return np.asarray(vectors[is_plane][:, :, 0])

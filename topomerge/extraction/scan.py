@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,7 +13,6 @@ from topomerge.errors import InputError
 from topomerge.extraction.cleaning import COARSEST_CELL, coarsen_until_dense
 from topomerge.extraction.levelling import LevelledChunks
 from topomerge.extraction.voxels import LatticeCells, voxelise
-from topomerge.kernels import count_threads
 from topomerge.types import Array, Landmarks, PointCloud, VoxelGrid, join_landmarks
 
 FINEST_CELL = 0.02  # m
@@ -99,9 +97,9 @@ def read_scan(
     fine = LatticeCells(edge / parts, MOST_FINE_CELLS) if parts > 1 else None
     clouds = [_build_cloud(source)] if isinstance(source, np.ndarray) else [source] if isinstance(source, PointCloud) else source
     levelled = LevelledChunks(clouds) if level else None
-    chunks = _Chunks(clouds if levelled is None else levelled, fine)
+    chunks = _Chunks(clouds if levelled is None else levelled)
     with add_reasons(chunks.warnings):
-        grid = voxelise(chunks, edge, chunks.warnings)
+        grid = voxelise(chunks, edge, chunks.warnings, fine)
         if len(grid) * edge < SHORTEST_ROW:
             cells = f"{len(grid)} cell{'s' * (len(grid) != 1)} of {edge:g} m"
             raise InputError(f"too few points, or all in one place: they lie in {cells}; check the file and --unit")
@@ -137,9 +135,8 @@ def add_reasons(warnings: Sequence[str]) -> Iterator[None]:
 class _Chunks:
     """The chunks of a cloud, to be read once; it gathers what they know beside their points."""
 
-    def __init__(self, chunks: Iterable[PointCloud], fine: LatticeCells | None) -> None:
+    def __init__(self, chunks: Iterable[PointCloud]) -> None:
         self.chunks = chunks
-        self.fine = fine
         self.source = ""
         self.free: VoxelGrid | None = None
         self.warnings: list[str] = []
@@ -148,24 +145,7 @@ class _Chunks:
         self._step = 1  # of the rays, every one or every second, fourth ... is held
 
     def __iter__(self) -> Iterator[PointCloud]:
-        """Yield the chunks; the fine cells of one are found in a thread while it is used and the next one is read."""
-        if self.fine is None or count_threads() == 1:
-            for chunk in self._take_in():
-                if self.fine is not None:
-                    self.fine.add(chunk)
-                yield chunk
-            return
-        with ThreadPoolExecutor(1) as temporary:
-            before: Future[None] | None = None
-            for chunk in self._take_in():
-                if before is not None:
-                    before.result()
-                before = temporary.submit(self.fine.add, chunk)
-                yield chunk
-            if before is not None:
-                before.result()
-
-    def _take_in(self) -> Iterator[PointCloud]:
+        """Yield the chunks."""
         for chunk in self.chunks:
             if not isinstance(chunk, PointCloud):
                 kind = type(chunk).__name__

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from numbers import Real
 
 import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.extraction.cleaning import compute_box_volume, select_largest_place, select_without_strays
-from topomerge.kernels import voxels
+from topomerge.kernels import count_threads, voxels
 from topomerge.kernels import voxels as kernel
 from topomerge.types import Array, PointCloud, VoxelGrid
 
@@ -19,6 +20,7 @@ from topomerge.types import Array, PointCloud, VoxelGrid
 RUN_RATIO = 4  # a run is united with the one before it unless that is more than so many times as long
 FAR_RATIO = 2  # likewise for cells that no code numbers
 BLOCK = 1_000_000  # cells that are looked at together
+ORIGIN_POINTS = 10_000  # about the middle of which cells are numbered
 _Cells = tuple[
     Array, Array, Array
 ]  # cells (n, 3) or their codes (n,), counts (n,), sums (n, 3): `kernels.voxelise.find_occupied_cells`
@@ -33,10 +35,11 @@ class LatticeCells:
     Args:
         edge: of a cell, m.
         most: cells that are held; of a larger cloud there are none. 0: any number.
+        twice: a lattice of cells twice as long, which takes in each chunk with this one: its cells are made of these.
     """
 
-    def __init__(self, edge: float, most: int = 0) -> None:
-        self.edge, self.most = edge, most
+    def __init__(self, edge: float, most: int = 0, twice: LatticeCells | None = None) -> None:
+        self.edge, self.most, self.twice = edge, most, twice
         self.too_many = False
         self._origin: Array | None = None
         self._runs: list[_Cells] = []  # by ascending codes, each run far longer than the next one
@@ -44,16 +47,30 @@ class LatticeCells:
 
     def add(self, chunk: PointCloud) -> None:
         """Take in the cells of a chunk."""
-        if self.too_many:
-            return
-        base, cells, counts, sums = kernel.find_occupied_cells(chunk.points, np.asarray(chunk.shift, np.float64), self.edge)
-        if not len(cells):
-            return
-        cells += base
+        shift = np.asarray(chunk.shift, np.float64)
         if self._origin is None:
-            self._origin = np.median(cells, axis=0).astype(np.int64) - voxels.AXIS_LIMIT // 2
+            self._origin = _choose_origin(chunk.points, shift, self.edge)
+            if self._origin is None:
+                return
+            if self.twice is not None:
+                self.twice._origin = self._origin // 2
+        if self.too_many:
+            run = None
+        else:
+            run = kernel.find_occupied_codes(chunk.points, shift, self.edge, self._origin, self.twice is not None)
+            if run is None:
+                self._add_cells(*kernel.find_occupied_cells(chunk.points, shift, self.edge))
+        if self.twice is not None:
+            self.twice.add(chunk) if run is None else self.twice._add_run(kernel.double_cells(run))
+        if run is not None:
+            self._add_run((run[0], run[1], np.ascontiguousarray(run[2][:, :3])))
+
+    def _add_cells(self, base: Array, cells: Array, counts: Array, sums: Array) -> None:
+        """Take in cells (n, 3), in any order and at any place."""
+        assert self._origin is not None
+        cells += base
         numbers = cells - self._origin
-        near = bool(numbers.min() >= 0 and numbers.max() < voxels.AXIS_LIMIT)
+        near = bool(numbers.min(initial=0) >= 0 and numbers.max(initial=0) < voxels.AXIS_LIMIT)
         if not near:
             inside = ((numbers >= 0) & (numbers < voxels.AXIS_LIMIT)).all(axis=1)
             self._far.append((cells[~inside], counts[~inside], sums[~inside]))
@@ -62,7 +79,11 @@ class LatticeCells:
             numbers, counts, sums = numbers[inside], counts[inside], sums[inside]
         codes = voxels.encode(numbers)
         order = voxels.find_unique_rows(codes)
-        self._runs.append((codes[order], counts[order], sums[order]))
+        self._add_run((codes[order], counts[order], sums[order]))
+
+    def _add_run(self, run: _Cells) -> None:
+        """Take in cells by ascending codes."""
+        self._runs.append(run)
         while len(self._runs) > 1 and len(self._runs[-2][0]) <= RUN_RATIO * len(self._runs[-1][0]):
             self._runs[-2:] = [kernel.unite_runs(self._runs[-2], self._runs[-1])]
         if self.most and len(self._runs[0][0]) > self.most:
@@ -105,6 +126,17 @@ class LatticeCells:
         return self._runs[0]
 
 
+def _choose_origin(points: Array, shift: Array, edge: float) -> Array | None:
+    """(3,) cell far below the middle of a chunk, a multiple of 16; None of a chunk without a finite point."""
+    for step in (max(len(points) // ORIGIN_POINTS, 1), 1):
+        some = points[::step]
+        some = some[np.isfinite(some).all(axis=1)]
+        if len(some):
+            middle = np.floor((np.median(some.astype(np.float64), axis=0) + shift) / edge).astype(np.int64)
+            return (middle >> 4 << 4) - voxels.AXIS_LIMIT // 2
+    return None
+
+
 def _unite_cells(parts: list[_Cells]) -> _Cells:
     """Cells that may be in several parts, each once."""
     cells, counts, sums = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
@@ -117,7 +149,12 @@ def _unite_cells(parts: list[_Cells]) -> _Cells:
 log = logging.getLogger(__name__)
 
 
-def voxelise(cloud: PointCloud | Array | Iterable[PointCloud], edge: float = 0.1, warnings: list[str] | None = None) -> VoxelGrid:
+def voxelise(
+    cloud: PointCloud | Array | Iterable[PointCloud],
+    edge: float = 0.1,
+    warnings: list[str] | None = None,
+    fine: LatticeCells | None = None,
+) -> VoxelGrid:
     """Occupied cells of a point cloud, with the properties ``count``, the number of points in each, and ``offset``, where in it
     they lie on average (`cell_means`).
 
@@ -127,6 +164,7 @@ def voxelise(cloud: PointCloud | Array | Iterable[PointCloud], edge: float = 0.1
         cloud: a cloud, (N, 3) points in metres, or chunks of one cloud.
         edge: edge length of a cell, m.
         warnings: what the user should know is appended here.
+        fine: takes in the same chunks.
 
     Raises:
         InputError: no finite point, or an extent that no building has.
@@ -140,8 +178,11 @@ def voxelise(cloud: PointCloud | Array | Iterable[PointCloud], edge: float = 0.1
     else:
         chunks = cloud
     lattice = LatticeCells(edge)
-    for chunk in chunks:
-        lattice.add(chunk)
+    if fine is not None and 2 * fine.edge == edge:
+        fine.twice = lattice
+        _add_chunks(chunks, [fine])
+    else:
+        _add_chunks(chunks, [lattice] if fine is None else [lattice, fine])
     cells, counts, sums = lattice.get_cells()
     if not len(cells):
         raise InputError("no finite point: nothing to voxelise")
@@ -157,6 +198,23 @@ def voxelise(cloud: PointCloud | Array | Iterable[PointCloud], edge: float = 0.1
     size = (int(shape[0]), int(shape[1]), int(shape[2]))
     offset = (sums + counts[:, None] // 2) // counts[:, None]
     return VoxelGrid.from_cells(cells - base, base * edge, edge, size, {"count": counts, "offset": offset.astype(np.uint8)})
+
+
+def _add_chunks(chunks: Iterable[PointCloud], lattices: Sequence[LatticeCells]) -> None:
+    """Add chunks to lattices, each in a thread while the next chunk is read."""
+    if count_threads() == 1:
+        for chunk in chunks:
+            for lattice in lattices:
+                lattice.add(chunk)
+        return
+    with ThreadPoolExecutor(len(lattices)) as temporary:
+        before: list[Future[None]] = []
+        for chunk in chunks:
+            for done in before:
+                done.result()
+            before = [temporary.submit(lattice.add, chunk) for lattice in lattices]
+        for done in before:
+            done.result()
 
 
 def _compute_box(cells: Array) -> tuple[Array, Array]:

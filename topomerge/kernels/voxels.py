@@ -139,7 +139,7 @@ def _locate_cell(points, i, shift, edge):  # type: ignore[no-untyped-def]  # pra
     )
 
 
-@compile_ahead("f8", error_model="numpy")
+@njit(cache=True, inline="always")
 def _find_part(place):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Which of the `OFFSET_STEPS` parts of its cell a place, in cells, lies in: exact: a power of 2."""
     return np.int64(np.floor(place * OFFSET_STEPS)) & (OFFSET_STEPS - 1)
@@ -167,7 +167,7 @@ def mark(first, last, points, shift, edge, base, table):  # type: ignore[no-unty
             table[(x - base[0]) >> 3, (y - base[1]) >> 3, (z - base[2]) >> 3] = 1
 
 
-@compile_ahead("i8, i8, i8")
+@njit(cache=True, inline="always")
 def _encode_place(x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Place of a cell in its brick, in Morton order."""
     x3, y3, z3 = x & 7, y & 7, z & 7
@@ -197,13 +197,35 @@ def count(points, shift, edge, base, table, counts, places):  # type: ignore[no-
 
 @compile_ahead("i8[::1], u4[::1], i8[:,::1]", error_model="numpy")
 def add_parts(places, rows, sums):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Third pass: sums (n, 3) of the parts of their cells that points lie in; rows: number of the cell at each place."""
+    """Third pass: sums (n, 3) of the parts of their cells that points lie in, or (n, 6): with how many of them are odd; rows:
+    number of the cell at each place."""
     for place in places:
         if place >= 0:
             row = rows[place >> 24]
-            sums[row, 0] += (place >> 16) & 255
-            sums[row, 1] += (place >> 8) & 255
-            sums[row, 2] += place & 255
+            x, y, z = (place >> 16) & 255, (place >> 8) & 255, place & 255
+            sums[row, 0] += x
+            sums[row, 1] += y
+            sums[row, 2] += z
+            if sums.shape[1] == 6:
+                sums[row, 3] += x & 1
+                sums[row, 4] += y & 1
+                sums[row, 5] += z & 1
+
+
+@compile_ahead("u8[::1], i8[::1], i8[:,::1], u8[::1], i8[::1], i8[:,::1]")
+def _double(codes, counts, sums, out, out_counts, out_sums):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    row = -1
+    for i in range(len(codes)):
+        code = codes[i] >> uint64(3)
+        if row < 0 or out[row] != code:
+            row += 1
+            out[row], out_counts[row] = code, 0
+            out_sums[row, 0] = out_sums[row, 1] = out_sums[row, 2] = 0
+        out_counts[row] += counts[i]
+        for k in range(3):
+            upper = np.int64((codes[i] >> uint64(k)) & uint64(1))
+            out_sums[row, k] += (sums[i, k] - sums[i, 3 + k]) // 2 + upper * counts[i] * (OFFSET_STEPS // 2)
+    return row + 1
 
 
 @compile_ahead("u8[::1], u8[::1]")
@@ -249,7 +271,37 @@ def unite_runs(first: Run, second: Run) -> Run:
     return out
 
 
+def double_cells(run: Run) -> Run:
+    """Return the run of cells twice as long, to the bit that of their points: half a part of a cell is a whole one of its half.
+
+    Args:
+        run: about an even origin; sums (n, 6), with how many parts are odd.
+    """
+    out = np.empty(len(run[0]), np.uint64), np.empty(len(run[0]), np.int64), np.empty((len(run[0]), 3), np.int64)
+    count = int(_double(*run, *out))
+    return out[0][:count], out[1][:count], out[2][:count]
+
+
 Occupied = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
+
+
+def find_occupied_codes(
+    points: NDArray[Any], shift: NDArray[Any], edge: float, origin: NDArray[np.int64], odd: bool = False
+) -> Run | None:
+    """Occupied lattice cells of one chunk of points, by Morton codes; None where these do not reach, or the extent is too large.
+
+    Args:
+        points, shift, edge: as of `find_occupied_cells`.
+        origin: (3,) cell that codes are about, multiples of 8.
+        odd: count odd parts, too: sums are (n, 6).
+    """
+    base, size = _find_brick_box(points, shift, edge)
+    first = (base - origin) >> 3
+    fits = float(np.prod(size.astype(np.float64))) <= MAX_TABLE
+    if not fits or (first < 0).any() or (first + size > AXIS_LIMIT >> 3).any():
+        return None
+    _, codes, filled, counts, sums = _count_in_bricks(points, shift, edge, base, size, first, 6 if odd else 3)
+    return (codes[filled >> 9] << np.uint64(9)) | (filled & 511).astype(np.uint64), counts, sums
 
 
 def find_occupied_cells(points: NDArray[Any], shift: NDArray[Any], edge: float) -> Occupied:
@@ -264,30 +316,54 @@ def find_occupied_cells(points: NDArray[Any], shift: NDArray[Any], edge: float) 
         base (3,) int64; cells (n, 3) int64 relative to it, not negative; their counts (n,) int64; (n, 3) int64 sums over their
         points of which of `OFFSET_STEPS` parts of the cell they lie in: whole numbers, so that no order of points matters.
     """
+    base, size = _find_brick_box(points, shift, edge)
+    if float(np.prod(size.astype(np.float64))) > MAX_TABLE:
+        return _split(points, shift, edge)
+    bricks, _, filled, counts, sums = _count_in_bricks(points, shift, edge, base, size, np.zeros(3, np.int64), 3)
+    return base, (bricks[filled >> 9] << 3) + decode(filled & 511), counts, sums
+
+
+def _find_brick_box(points: NDArray[Any], shift: NDArray[Any], edge: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The lowest cell of the bricks that hold all finite points, and how many bricks lie along each axis."""
     low, high, _ = compute_bounds(points)
     if not np.isfinite(low).all():
-        return np.zeros(3, np.int64), np.zeros((0, 3), np.int64), np.zeros(0, np.int64), np.zeros((0, 3), np.int64)
+        return np.zeros(3, np.int64), np.zeros(3, np.int64)
     first = np.floor((low + shift) / edge).astype(np.int64)
     last = np.floor((high + shift) / edge).astype(np.int64)
     base = (first >> 3) << 3
-    size = ((last - base) >> 3) + 1
-    if float(np.prod(size.astype(np.float64))) > MAX_TABLE:
-        return _split(points, shift, edge)
+    return base, ((last - base) >> 3) + 1
+
+
+def _count_in_bricks(
+    points: NDArray[Any],
+    shift: NDArray[Any],
+    edge: float,
+    base: NDArray[np.int64],
+    size: NDArray[np.int64],
+    first: NDArray[np.int64],
+    columns: int,
+) -> tuple[NDArray[np.int64], NDArray[np.uint64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Bricks (b, 3) that hold points, by their Morton codes (b,) about a brick `first` steps before; places (n,) in them of their
+    occupied cells, in Morton order; of these the counts (n,) and sums (n, columns)."""
     table = np.zeros(tuple(size), np.int32)
+    if not table.size:
+        none = np.zeros(0, np.int64)
+        return np.zeros((0, 3), np.int64), none.astype(np.uint64), none, none, np.zeros((0, columns), np.int64)
     run_in_slices(mark, len(points), LEAST_POINTS, points, shift, edge, base, table)
     bricks = np.argwhere(table)
-    bricks = bricks[np.argsort(encode(bricks), kind="stable")]
+    codes = encode(bricks + first)
+    order = np.argsort(codes, kind="stable")
+    bricks, codes = bricks[order], codes[order]
     table[tuple(bricks.T)] = np.arange(len(bricks))
     counts = np.zeros(len(bricks) * 512, np.uint32)
     places = np.empty(len(points), np.int64)
     count(points, shift, edge, base, table, counts, places)
     filled = np.flatnonzero(counts)
-    cells = (bricks[filled >> 9] << 3) + decode(filled & 511)
     numbers = counts[filled].astype(np.int64)
     counts[filled] = np.arange(len(filled))
-    sums = np.zeros((len(filled), 3), np.int64)
+    sums = np.zeros((len(filled), columns), np.int64)
     add_parts(places, counts, sums)
-    return base, cells, numbers, sums
+    return bricks, codes, filled, numbers, sums
 
 
 def _split(points: NDArray[Any], shift: NDArray[Any], edge: float) -> Occupied:
@@ -417,3 +493,49 @@ def find_filled_cells(cells, holding, matrix, local, slack, reach, tall):  # typ
                     out[count, 0], out[count, 1], out[count, 2], rows[count] = u, v, q, i
                     count += 1
     return out[:count], rows[:count]
+
+
+CUBE_LIMIT = 1 << 20  # cubes to each side of the origin that have codes
+HASH_MULTIPLIER, HASH_SHIFT = uint64(0x9E3779B97F4A7C15), uint64(32)  # Knuth's
+MOMENTS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # pairs of axes
+
+
+@compile_ahead("f8[:,::1], f8, i4[::1], i8[::1], f8[:,::1]", error_model="numpy")
+def _sum_in_cubes(points, edge, slots, codes, sums):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    last, count = uint64(len(slots) - 1), 0
+    for i in range(len(points)):
+        cx, cy, cz = np.floor(points[i, 0] / edge), np.floor(points[i, 1] / edge), np.floor(points[i, 2] / edge)
+        if not (abs(cx) < CUBE_LIMIT and abs(cy) < CUBE_LIMIT and abs(cz) < CUBE_LIMIT):
+            continue
+        code = (np.int64(cx) + CUBE_LIMIT) << 42 | (np.int64(cy) + CUBE_LIMIT) << 21 | (np.int64(cz) + CUBE_LIMIT)
+        at = ((uint64(code) * HASH_MULTIPLIER) >> HASH_SHIFT) & last
+        while slots[at] >= 0 and codes[slots[at]] != code:
+            at = (at + uint64(1)) & last
+        row = slots[at]
+        if row < 0:
+            row = slots[at] = count
+            codes[row] = code
+            for k in range(10):
+                sums[row, k] = 0.0
+            count += 1
+        x, y, z = points[i, 0] - (cx + 0.5) * edge, points[i, 1] - (cy + 0.5) * edge, points[i, 2] - (cz + 0.5) * edge
+        sums[row, 0] += 1.0
+        sums[row, 1] += x
+        sums[row, 2] += y
+        sums[row, 3] += z
+        sums[row, 4] += x * x
+        sums[row, 5] += x * y
+        sums[row, 6] += x * z
+        sums[row, 7] += y * y
+        sums[row, 8] += y * z
+        sums[row, 9] += z * z
+    return count
+
+
+def sum_in_cubes(points: NDArray[np.float64], edge: float) -> NDArray[np.float64]:
+    """Return (n, 10) of each cube of space that holds points (N, 3), by place: their number, the sums of their places from its
+    middle, and those of the products of `MOMENTS`. Points farther than a million cubes from the origin are left out."""
+    slots = np.full(1 << max(2 * len(points) - 1, 1).bit_length(), -1, np.int32)
+    codes, sums = np.empty(len(points), np.int64), np.empty((len(points), 10))
+    count = int(_sum_in_cubes(np.ascontiguousarray(points, np.float64), edge, slots, codes, sums))
+    return sums[:count][np.argsort(codes[:count])]

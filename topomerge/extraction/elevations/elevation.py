@@ -80,9 +80,11 @@ def unroll(faces: Array, navigable: VoxelGrid, cells: VoxelGrid, crossed: VoxelG
     frames[:, 6] -= BANDS * UPWARDS / 2 + LOWEST  # one band about the floor
     walk = fill_strips(floor, frames, sizes, (DEPTHS, 1), np.array([ALONG, ACROSS, BANDS * UPWARDS]), TILE)
     flat = ALONG * UPWARDS / cells.edge**2  # cells of a wall that an element holds
-    rays = measure_crossed_places(crossed, faces, sizes)
-    strips = np.concatenate([solid / (FULL * flat), walk / (FULL * ALONG * ACROSS / navigable.edge**2), rays], axis=2)
-    return Elevations(faces, np.concatenate([[0], np.cumsum(sizes)]), np.minimum(strips, 1.0))
+    strips = np.empty((len(solid), DEPTHS, STRIP_CHANNELS), np.float32)
+    np.divide(solid, FULL * flat, out=strips[..., :BANDS])
+    np.divide(walk, FULL * ALONG * ACROSS / navigable.edge**2, out=strips[..., BANDS : BANDS + 1])
+    strips[..., BANDS + 1 :] = measure_crossed_places(crossed, faces, sizes)
+    return Elevations(faces, np.concatenate([[0], np.cumsum(sizes)]), np.minimum(strips, 1.0, out=strips))
 
 
 def measure_crossed_places(crossed: VoxelGrid | None, faces: Array, sizes: Array) -> Array:
