@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -22,13 +23,13 @@ from topomerge.fusion.result import MergeResult, build_placements, serialise_mer
 from topomerge.fusion.transfer import transform_floor
 from topomerge.io.listing import format_json
 from topomerge.io.maps import save_map
-from topomerge.io.rooms_ply import assign_room_colours, save_rooms_ply
+from topomerge.io.rooms_ply import save_rooms_ply
 from topomerge.registration.evidence.places import MOST_ODDS, PARTS, Places
 from topomerge.registration.pipeline import Registration
 from topomerge.types import Array, Placement, Sim3, TopometricMap
 from topomerge.viz.atlas_report import render_atlas_html
 from topomerge.viz.merge_plan import Drawn, lay_out_pair, render_blend_view, render_deformation_table, render_lines
-from topomerge.viz.plan import build_scene_data
+from topomerge.viz.plan import build_scene_data, get_room_colours
 from topomerge.viz.report import (
     render_page,
     render_plan_view,
@@ -154,7 +155,7 @@ def encode_png_uri(image: Array) -> str:
     from PIL import Image
 
     file = io.BytesIO()
-    Image.fromarray(image).save(file, "PNG", optimize=True)
+    Image.fromarray(image).save(file, "PNG")  # `optimize` takes five times as long for 5 % of the bytes
     return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode("ascii")
 
 
@@ -177,15 +178,20 @@ def save_merge(result: MergeResult, folder: str | Path) -> None:
     except OSError as error:
         raise InputError(f"{folder}: can't be made ({error.strerror or error}); give another folder") from error
     writers: list[tuple[str, Callable[[Path], None]]] = [
-        ("merge.json", partial(_write, format_json(serialise_merge(result)))),
-        ("report.html", partial(_write, render_merge_html(result))),
+        ("merge.json", lambda path: _write(format_json(serialise_merge(result)), path)),
+        ("report.html", lambda path: _write(render_merge_html(result), path)),
     ]
     if result.map is not None:
         writers += [("merged.ply", partial(save_rooms_ply, result.map)), ("map.tmap", partial(save_map, result.map))]
     try:
-        with ExitStack() as stack:  # all are whole before the first is renamed
-            for name, write in writers:
-                write(stack.enter_context(replace_on_success(folder / name)))
+        with ExitStack() as stack, ThreadPoolExecutor(1) as pool:  # all are whole before the first is renamed
+            places = [stack.enter_context(replace_on_success(folder / name)) for name, _ in writers]
+            jobs = list(zip(writers, places, strict=True))
+            beside = [pool.submit(write, place) for (_, write), place in jobs[2:]]  # a third of it is compression
+            for (_, write), place in jobs[:2]:
+                write(place)
+            for done in beside:
+                done.result()
             (folder / "merge.json").unlink(missing_ok=True)  # renamed last: a kill leaves no list of another run's files
     except BaseException:
         if is_new and not any(folder.iterdir()):
@@ -210,11 +216,12 @@ def render_merge_html(result: MergeResult) -> str:
     registration = result.registration
     pose = registration.transform if registration else None
     drawn = lay_out_pair(a, b, pose)
-    sections = [_render_verdict(result), render_warnings(result.warnings), _render_maps(result, drawn)]
+    within = None if result.map is None else _find_joined_rooms(result)
+    sections = [_render_verdict(result), render_warnings(result.warnings), _render_maps(result, drawn, within)]
     data: dict[str, Any] = {}
     if pose is not None:
         sections.append(_render_overlay(result, drawn, pose))
-    if result.map is not None:
+    if result.map is not None and within is not None:
         sheet, plans = lay_out(result.map, turn=drawn[0][0].turn)
         view = build_element(
             "div", render_plan_view(result.map, sheet, plans), render_scroller(render_rooms_table(result.map)), class_="beside"
@@ -222,7 +229,7 @@ def render_merge_html(result: MergeResult) -> str:
         parts = join([view, *render_landmarks(result.map)])
         sections.append(render_section("The joined map", parts, "joined"))
         sections.append(_render_space(result))
-        data = {"scene-data": _build_scene(result, sheet.turn), "mates": _collect_partners(result)}
+        data = {"scene-data": _build_scene(result, sheet.turn), "mates": _collect_partners(result, within)}
     if registration is not None:
         sections.append(_render_evidence(result, registration))
         if registration.places is not None and len(registration.places):
@@ -284,9 +291,13 @@ def _render_figures(result: MergeResult) -> Markup:
     return build_element("ul", *items, class_="summary")
 
 
-def _render_maps(result: MergeResult, drawn: tuple[Drawn, Drawn]) -> Markup:
-    """Both plans side by side, rooms that are one in one colour, and the table of them."""
-    colours = _compute_colours(result) if result.map is not None else (None, None)
+def _render_maps(result: MergeResult, drawn: tuple[Drawn, Drawn], within: tuple[Array, Array] | None) -> Markup:
+    """Both plans side by side, rooms that are one in one colour, and the table of them.
+
+    Args:
+        within: of `_find_joined_rooms`; None where nothing is joined.
+    """
+    colours = (None, None) if within is None else _compute_colours(result, within)
     views = []
     for name, m, (sheet, plans), shades in zip("ab", result.maps, drawn, colours, strict=True):
         head = build_element("h3", f"{name}: {m.title} ", build_element("small", f"{len(m.rooms)} rooms"))
@@ -296,25 +307,27 @@ def _render_maps(result: MergeResult, drawn: tuple[Drawn, Drawn]) -> Markup:
         text = "Matched rooms share a colour; grey rooms are in one map only. Point at a room to highlight its match."
         parts.append(build_element("p", text, class_="note"))
     parts.append(build_element("div", *views, class_="pair"))
-    if result.matches:
+    if result.matches and within is not None:
         figure = build_element("div", render_lines(result.maps, drawn, result.matches, colours), class_="sheet")
         parts.append(build_element("div", build_element("h3", "Room matches"), figure, class_="more"))
         parts.append(
-            build_element("div", build_element("h3", "Matched rooms"), render_scroller(_render_matches(result)), class_="more")
+            build_element(
+                "div", build_element("h3", "Matched rooms"), render_scroller(_render_matches(result, within[0])), class_="more"
+            )
         )
     return render_section("The two maps", join(parts), "maps")
 
 
-def _compute_colours(result: MergeResult) -> tuple[Array, Array]:
+def _compute_colours(result: MergeResult, within: tuple[Array, Array]) -> tuple[Array, Array]:
     """(R, 3) uint8 of the rooms of both maps: matched ones have the colour of the joined map's room in which they lie."""
     assert result.map is not None
-    palette = assign_room_colours(result.map)
+    palette = get_room_colours(result.map)
     of_maps = []
-    for k, (m, within) in enumerate(zip(result.maps, _find_joined_rooms(result), strict=True)):
+    for k, (m, room) in enumerate(zip(result.maps, within, strict=True)):
         colour = np.tile(np.array(ALONE, np.uint8), (len(m.rooms), 1))
         matched = sorted({match.rooms[k] for match in result.matches})
-        matched = [i for i in matched if within[i] >= 0]
-        colour[matched] = palette[within[matched]]
+        matched = [i for i in matched if room[i] >= 0]
+        colour[matched] = palette[room[matched]]
         of_maps.append(colour)
     return of_maps[0], of_maps[1]
 
@@ -329,8 +342,8 @@ def _find_joined_rooms(result: MergeResult) -> tuple[Array, Array]:
     )
 
 
-def _collect_partners(result: MergeResult) -> dict[str, list[str]]:
-    """Room as the page calls it -> rooms that are the same one."""
+def _collect_partners(result: MergeResult, within: tuple[Array, Array]) -> dict[str, list[str]]:
+    """Room as the page calls it -> rooms that are the same one; `within`: of `_find_joined_rooms`."""
     mates: dict[str, set[str]] = {}
 
     def tell(one: str, other: str) -> None:
@@ -339,18 +352,18 @@ def _collect_partners(result: MergeResult) -> dict[str, list[str]]:
 
     for match in result.matches:
         tell(f"a{match.rooms[0]}", f"b{match.rooms[1]}")
-    for name, within in zip("ab", _find_joined_rooms(result), strict=True):
-        for i, k in enumerate(within.tolist()):
+    for name, rooms in zip("ab", within, strict=True):
+        for i, k in enumerate(rooms.tolist()):
             if k >= 0:
                 tell(f"{name}{i}", str(k))
     return {room: sorted(others) for room, others in sorted(mates.items())}
 
 
-def _render_matches(result: MergeResult) -> Markup:
+def _render_matches(result: MergeResult, within: Array) -> Markup:
+    """The table of matches; `within`: room of the joined map of each room of a."""
     a, b = result.maps
     columns = [(name, "number") for name in ("room of a", "area m²", "room of b", "area m²")]
     columns += [("probability", "text"), ("room of the joined map", "number")]
-    within = _find_joined_rooms(result)[0]
     rows = []
     for match in result.matches:
         i, j = match.rooms

@@ -11,10 +11,19 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.structure.directions import estimate_wall_directions
 from topomerge.types import LANDMARK_KINDS, Array, TopometricMap, find_room_names
-from topomerge.viz.plan import Frame, Place, StoreyPlan, compute_frame, find_label_places, format_hex_colour, rasterize_storeys
+from topomerge.viz.plan import (
+    DRAWN_AGAIN,
+    Frame,
+    Place,
+    StoreyPlan,
+    compute_frame,
+    find_label_places,
+    format_hex_colour,
+    get_room_colours,
+    rasterize_storeys,
+)
 from topomerge.viz.tables import (
     SHOWN_KINDS,
     Markup,
@@ -121,7 +130,6 @@ ROOM_HOLE = 6.0  # m2: holes in a room up to this are furniture or shadows, larg
 SMOOTH = 0.8  # pixels: standard deviation of the blur before an outline is traced
 TOLERANCE = 0.5  # pixels that an outline may be off for having fewer corners
 WALL_TRACE = (0.6, 0.36)  # blur and level for walls: lines of one pixel stay whole, single pixels go
-DRAWN_AGAIN = 8  # plans whose outlines are kept: a report draws those of two maps several times
 SPECK = 0.3  # m2: smaller patches of what was seen outside rooms are left out
 
 
@@ -233,7 +241,7 @@ def render_plan_svgs(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPla
         `<svg class="plan" data-storey=…>` elements. Rooms, their labels and their nodes in the graph carry `data-room`, and all
         that is not certain `data-sure`.
     """
-    colours = assign_room_colours(map) if colours is None else colours
+    colours = get_room_colours(map) if colours is None else colours
     named = [find_label_places(plan, sheet.frame) for plan in plans]
     names = find_room_names(map.landmarks, len(map.rooms))
     everywhere = {room: place for of_storey in named for room, place in of_storey.items()}
