@@ -365,8 +365,3 @@ def _build_change(
     place = np.append(middle, layers.floor)
     rounded = {name: round(float(value), 3) for name, value in evidence.items()}
     return Change(kind, layers.storeys[0], place, shape, round(extent, 3), round(float(probability), 4), rounded)
-
-
-def select_kinds(changes: Changes, kinds: Sequence[str]) -> Changes:
-    """Select the changes of some kinds."""
-    return replace(changes, changes=tuple(c for c in changes.changes if c.kind in kinds))
