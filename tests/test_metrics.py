@@ -11,7 +11,6 @@ from hypothesis.extra.numpy import arrays
 from tests.grids import COMPILED
 from topomerge.metrics import (
     assign,
-    compute_consistency,
     compute_overlaps,
     count_contingency,
     is_on_storey,
@@ -108,23 +107,6 @@ def test_names_of_rooms_and_order_of_places_do_not_matter(true, found, a, b, ord
     renamed = [np.append(p, -1)[x][list(order)] for p, x in ((a, true), (b, found))]
     after = score_rooms(*renamed, 5, np.ones(5, bool))
     assert after.iou == pytest.approx(before.iou)
-    assert compute_consistency(*renamed) == pytest.approx(compute_consistency(true, found), nan_ok=True)
-
-
-@COMPILED
-@given(LABELS, LABELS)
-def test_consistency_is_symmetric(a, b) -> None:
-    assert compute_consistency(a, b) == pytest.approx(compute_consistency(b, a), nan_ok=True)
-    assert (a < 0).all() or compute_consistency(a, a) == 1
-
-
-def test_consistency_by_hand() -> None:
-    a, b = places((0, 0, 30), (1, 1, 18), (1, 2, 12))
-    assert compute_consistency(a, b) == pytest.approx((1 + 18 / 30) / 3)
-    assert compute_consistency(a, b, every=False) == pytest.approx((1 + 18 / 30) / 2)
-    assert compute_consistency(a, b, least=15) == pytest.approx((1 + 18 / 30) / 2)
-    assert compute_consistency(a, np.full(60, -1)) == 0
-    assert np.isnan(compute_consistency(np.full(3, -1), np.full(3, -1)))
 
 
 def test_doors() -> None:

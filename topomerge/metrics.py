@@ -188,27 +188,6 @@ def is_storeys_right(true: Array, extracted: Array, within: float = LEVEL) -> bo
     return len(true) == len(extracted) and bool((np.abs(np.sort(true) - np.sort(extracted)) <= within).all())
 
 
-def compute_consistency(a: Array, b: Array, least: int = 0, every: bool = True) -> float:
-    """Compute how alike two maps cut one place into rooms: 1 where they agree; symmetric.
-
-    The sum of the IoU of the rooms assigned to each other one to one, divided by the number of rooms of the map that has more, so
-    that a room that is split in one of them costs; or, without `every`, of the map that has fewer: the mean of those assigned.
-    nan where neither has a room.
-
-    Args:
-        a, b: (n,) labels of the same places, those that both have seen.
-        least: rooms with fewer places than this in their own map are not asked for.
-    """
-    counts = [np.bincount(x[x >= 0], minlength=1) for x in (a, b)]
-    iou, _ = compute_overlaps(a, b, len(counts[0]), len(counts[1]))
-    sizes = [c >= max(least, 1) for c in counts]
-    iou = iou[sizes[0]][:, sizes[1]]
-    if not iou.size:
-        return 0.0 if max(iou.shape) else float("nan")
-    i, j = linear_sum_assignment(iou, maximize=True)
-    return float(iou[i, j].sum() / (max(iou.shape) if every else min(iou.shape)))
-
-
 def is_on_storey(vertical: float) -> bool:
     """Return whether a pose with this vertical error, m, puts a slice or a drawing on its own storey.
 

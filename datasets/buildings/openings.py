@@ -249,11 +249,11 @@ def cut_niches(
             for start, end in pairwise(ring):
                 length = float(np.hypot(*(end - start)))
                 if length >= LONG_WALL and rng.random() < share:
-                    made = _cut_niche(start, (end - start) / length, length, space, solid, rng)
-                    if made is not None:
-                        hollows.append(made[0])
-                        rows.append(made[1])
-                        solid = solid.difference(made[0].polygon.buffer(CORNER))
+                    niche = _cut_niche(start, (end - start) / length, length, space, solid, rng)
+                    if niche is not None:
+                        hollows.append(niche[0])
+                        rows.append(niche[1])
+                        solid = solid.difference(niche[0].polygon.buffer(CORNER))
     return hollows, np.array(rows, NICHE_DTYPE)
 
 

@@ -206,10 +206,10 @@ def _iter_hypotheses(target: _StoreyShape, source: _StoreyShape) -> Iterator[tup
     shafts = [(a, b) for a, b in product(target.shafts, source.shafts) if a[0] == b[0]]
     low, high = (np.array(s.floor.bounds).reshape(2, 2) for s in (target, source))
     sizes = (low[1] - low[0]) / (high[1] - high[0])
-    for (_, area, at), (_, other, there) in shafts:
+    for (_, area, at), (_, other, other_place) in shafts:
         for scale in (1.0, float(np.sqrt(area / other)), *sizes.tolist()):
             if STOREY_SCALES[0] <= scale <= STOREY_SCALES[1]:
-                yield scale, *(at - scale * there).tolist()
+                yield scale, *(at - scale * other_place).tolist()
     for (a, b), (c, d) in product(shafts, shafts):
         v, w = c[2] - a[2], d[2] - b[2]
         if a is c or b is d or min(np.hypot(*v), np.hypot(*w)) < 3:

@@ -93,9 +93,9 @@ def load_evaluation_pair(path: Path) -> EvaluationPair:
     about = json.loads(data["about"].tobytes())
     true, one, twin = ((data[f"a.{name}"], data[f"b.{name}"]) for name in ("true_room", "true_one", "twin"))
     glimpsed = (data["a.x"][:, GLIMPSED_COLUMN] > 0.5, data["b.x"][:, GLIMPSED_COLUMN] > 0.5)
-    laid = about["rooms"] == "laid"
-    matches = data["laid" if laid else "matches"]
-    if laid:  # no labels: the rooms that lie over each other stand for true ones
+    by_overlap = about["rooms"] == "laid"
+    matches = data["laid" if by_overlap else "matches"]
+    if by_overlap:  # no labels: the rooms that lie over each other stand for true ones
         true = _number_matched_rooms(matches, tuple(len(t) for t in true))
         one = (true[0] >= 0, true[1] >= 0)
     pose = convert_to_sim3(data["transform"])
@@ -164,10 +164,10 @@ def find_twins(true: Array, other: Array, rooms: Sequence[TrueRoom], others: Seq
     out = np.zeros(len(true), bool)
     if not rooms or not others:
         return out
-    here, there = np.array([_measure_plan(r) for r in rooms]), np.array([_measure_plan(r) for r in others])
+    own_plans, others_plans = np.array([_measure_plan(r) for r in rooms]), np.array([_measure_plan(r) for r in others])
     held = np.unique(other[other >= 0])
     for i in np.flatnonzero(true >= 0):
-        mine, these = here[true[i]], there[held[held != true[i]] if same else held]
+        mine, these = own_plans[true[i]], others_plans[held[held != true[i]] if same else held]
         alike = (abs(these[:, 0] / mine[0] - 1) < TWIN_AREA) & (abs(these[:, 1:] - mine[1:]) < TWIN_SIDE).all(axis=1)
         out[i] = alike.any()
     return out

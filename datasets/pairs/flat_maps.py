@@ -186,8 +186,8 @@ def label_points(cloud: PointCloud, rooms: Sequence[TrueRoom], storey: int) -> P
 
 def measure_floor_overlap(a: Array, b: Array, cell: float = 0.2) -> float:
     """Measure Dice of two floors given as points (n, 2) in one frame: twice the common area by the sum of both areas."""
-    here, there = (np.unique(k) for k in encode_rows(compute_cells(a, cell), compute_cells(b, cell)))
-    return float(2 * np.isin(here, there).sum() / (len(here) + len(there)))
+    cells_a, cells_b = (np.unique(k) for k in encode_rows(compute_cells(a, cell), compute_cells(b, cell)))
+    return float(2 * np.isin(cells_a, cells_b).sum() / (len(cells_a) + len(cells_b)))
 
 
 def build_flat_pair(

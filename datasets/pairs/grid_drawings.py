@@ -107,12 +107,12 @@ def make_drawing(item: DrawingItem, plans: Sequence[Plans], folder: str) -> Buil
     """Make an item's file."""
 
     def make() -> dict[str, Array]:
-        here, there, storey, kind = choose_drawn_place(item, plans, Path(folder))
+        scanned, drawn, storey, kind = choose_drawn_place(item, plans, Path(folder))
         number = 4 * item.pair.number + 2 * "ab".index(item.side) + (not item.own)
         rng = np.random.default_rng([item.pair.set, number, 1])
         frame = draw_frames(2, number % UNSCALED_EVERY == 0, rng)[1]
         path = Path(folder) / f"{item.pair.name}.npz"
-        return _add_common_area(build_drawing_arrays(path, here, there, storey, kind, frame, f"{item.name}.npz"), here)
+        return _add_common_area(build_drawing_arrays(path, scanned, drawn, storey, kind, frame, f"{item.name}.npz"), scanned)
 
     return make_item(item.name, folder, make, LONGEST_GRID_PAIR)
 
@@ -133,8 +133,8 @@ def choose_drawn_place(item: DrawingItem, plans: Sequence[Plans], folder: Path) 
             raise InputError("the same storey was drawn for the other map")
         return here, here, here.storey, "overlap"
     if hard:
-        there = next((p for p in places if p.side != item.side), here)
-        return here, there, there.storey, hard
+        drawn = next((p for p in places if p.side != item.side), here)
+        return here, drawn, drawn.storey, hard
     if len(here.building.storeys) > 1:
         return here, here, 1 - min(here.storey, 1), "other-storey"
     for one, given in zip(item.before, plans[1:], strict=True):

@@ -266,9 +266,13 @@ def draw_lookalike_items(recipe: LookalikeRecipe) -> list[LookalikeItem]:
     out = []
     both = ((recipe.pairs, False), (recipe.again, True))
     rows = [
-        (n, k, again) for of, again in both for n in range(max(of.values(), default=0)) for k in LOOKALIKES if n < of.get(k, 0)
+        (n, k, repeated)
+        for of, repeated in both
+        for n in range(max(of.values(), default=0))
+        for k in LOOKALIKES
+        if n < of.get(k, 0)
     ]
-    for number, kind, again in rows:
+    for number, kind, repeated in rows:
         rng = np.random.default_rng([recipe.seed, LOOKALIKES.index(kind), number])
         sensors = dict(recipe.sensors or SENSORS_OF.get(kind, WEIGHTS["sensors"]))
         names = sorted(sensors)
@@ -276,7 +280,7 @@ def draw_lookalike_items(recipe: LookalikeRecipe) -> list[LookalikeItem]:
         a, b = rng.choice(len(names), 2, p=weights / weights.sum()).tolist()
         furniture = str(rng.choice(FURNISHED, p=FURNITURE_SHARES[kind]))
         seed, scaled = int(rng.integers(first, last + 1)), bool(rng.random() < recipe.scaled)
-        out.append(LookalikeItem(kind, number, seed, furniture, (names[a], names[b]), scaled, again))
+        out.append(LookalikeItem(kind, number, seed, furniture, (names[a], names[b]), scaled, repeated))
     return out
 
 

@@ -184,13 +184,13 @@ def select_consistent(tried: Sequence[TriedPair]) -> list[TriedPair]:
 def _count_triangles(one: TriedPair, accepted: Sequence[TriedPair]) -> int:
     """How many triangles of believed pairs close over a pair, less those that do not."""
     assert one.pose is not None
-    beside = [
+    neighbours = [
         {other.b if other.a == end else other.a: other for other in accepted if end in (other.a, other.b)}
         for end in (one.a, one.b)
     ]
-    third = beside[0].keys() & beside[1].keys()
-    ways = [beside[0][name].get_pose(one.a) @ beside[1][name].get_pose(name) for name in third]
-    return sum(1 if is_same_pose(way, one.pose, one.middle) else -1 for way in ways)
+    third = neighbours[0].keys() & neighbours[1].keys()
+    detours = [neighbours[0][name].get_pose(one.a) @ neighbours[1][name].get_pose(name) for name in third]
+    return sum(1 if is_same_pose(way, one.pose, one.middle) else -1 for way in detours)
 
 
 def _is_unconfirmed(one: TriedPair, kept: Sequence[TriedPair]) -> bool:

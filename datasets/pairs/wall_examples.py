@@ -69,8 +69,8 @@ def compute_true_classes(building: Building, walls: Elevations, frame: Sim3, shi
     place = np.arange(len(truth)) - np.repeat(walls.first[:-1], np.diff(walls.first))
     face = walls.faces[np.repeat(np.arange(len(walls.faces)), np.diff(walls.first))]
     at = face["start"] + (place + 0.5)[:, None] * ALONG * face["along"]
-    beside = (at, at + 0.01 * face["along"], at + 0.01 * face["out"])
-    ends = [frame.inverse().apply(np.column_stack([p, face["floor"]])) for p in beside]
+    corners = (at, at + 0.01 * face["along"], at + 0.01 * face["out"])
+    ends = [frame.inverse().apply(np.column_stack([p, face["floor"]])) for p in corners]
     if shift is not None:
         undone = shift[1][cKDTree(shift[0]).query(ends[0])[1]]
         ends = [p + undone for p in ends]

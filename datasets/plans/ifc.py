@@ -96,10 +96,10 @@ class ElementSolids:
     def triangulate(self, element: Any) -> Array | None:
         """Return (t, 3, 3) corners of an element's triangles, None where it has no shape."""
         try:
-            made: Any = self.geom.create_shape(self.settings, element)
+            shape: Any = self.geom.create_shape(self.settings, element)
         except Exception:  # an element without a solid; its errors have no common class
             return None
-        mesh = made.geometry
+        mesh = shape.geometry
         vertices = np.array(mesh.verts, float).reshape(-1, 3)
         triangles = vertices[np.array(mesh.faces, int).reshape(-1, 3)]
         return triangles if len(triangles) else None

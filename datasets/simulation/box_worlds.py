@@ -169,8 +169,8 @@ def furnish_row(world: World, width: float, kind: str, rng: np.random.Generator)
         return furnish_all(world, rng)
     things = [world.things[0]]
     for side in (1, 1 + ROW_ROOMS):
-        made = furnish_room(world, side, 4, rng)
-        things += [made + np.array([k, 0, k, 0, 0]) * width for k in range(ROW_ROOMS)]
+        furniture = furnish_room(world, side, 4, rng)
+        things += [furniture + np.array([k, 0, k, 0, 0]) * width for k in range(ROW_ROOMS)]
     row = World(world.rooms, world.doors, things)
     return move_things(row, 0.5, rng) if kind == "hotel" else row
 

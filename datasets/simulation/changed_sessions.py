@@ -24,7 +24,6 @@ from topomerge.datasets.simulation.session import simulate_session
 from topomerge.errors import InputError
 from topomerge.types import Array, PointCloud, Sim3
 
-NO_CHANGE = Difficulty(moved=0.0, gone=0.0, doors_moved=0.0, people=0.0)
 THICKNESS, DOORWAY, LINTEL = 0.12, 0.9, 2.05  # m, of the walls that are put up
 ROOM_AREA, FROM_DOOR = 14.0, 0.8  # m2 of a room that is divided, m between its doors and the new wall
 PLACES_TRIED = 30

@@ -15,7 +15,7 @@ from topomerge.datasets.core.building import Building
 from topomerge.datasets.simulation.floor_truth import rasterize_floors
 
 from topomerge.errors import InputError
-from topomerge.types import Array, Landmarks, Sim3, TopometricMap, build_landmarks, join_landmarks, move_landmarks
+from topomerge.types import Array, Landmarks, build_landmarks
 
 RADIO_CELL = 0.1  # m, of plans
 AT_ONE_METRE = -40.0  # dBm
@@ -39,7 +39,6 @@ class RadioSettings:
         sensitivity: dBm, of the weakest readings.
         missed: share of the readings that a phone misses, of strong ones; of weak ones more.
         moved: share of the access points that stand elsewhere at another session.
-        step: m between two scans.
     """
 
     density: float = 0.0
@@ -52,14 +51,13 @@ class RadioSettings:
     sensitivity: float = -92.0
     missed: float = 0.1
     moved: float = 0.05
-    step: float = 2.0
 
     def __post_init__(self) -> None:
         limits = {"density": 20.0, "exponent": 6.0, "missed": 1.0, "moved": 1.0, "sensitivity": 0.0}
         for name in (f.name for f in fields(self)):
             value, limit = getattr(self, name), limits.get(name, 100.0)
             least = -120.0 if name == "sensitivity" else 0.0
-            if not least <= value <= limit or (name == "step" and value == 0):
+            if not least <= value <= limit:
                 raise InputError(f"radio {name} must be {least:g} to {limit:g}, not {value}")
 
 
@@ -186,30 +184,3 @@ def _move_points(
         plan = next(p for p in plans if p.level == points.level[k])
         position[k, :2] = plan.free[rng.integers(len(plan.free))]
     return replace(points, position=position)
-
-
-def add_radio(
-    map: TopometricMap, building: Building, poses: Array, settings: RadioSettings, session: int = 0, frame: Sim3 | None = None
-) -> TopometricMap:
-    """Return a map with what a phone hears along its poses.
-
-    Args:
-        poses: (K, 4, 4) true poses of the sensor in the building.
-        settings: a density of 0 leaves the map as it is.
-        session: 0: access points as they were placed.
-        frame: building -> map; None: the building's own.
-    """
-    if settings.density == 0 or not len(poses):
-        return map
-    plans = build_radio_plans(building)
-    points = place_access_points(plans, settings, abs(building.seed))
-    at = poses[:, :3, 3]
-    walked = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1)))
-    at = at[np.unique(np.searchsorted(walked, np.arange(0.0, walked[-1] + 1e-9, settings.step)).clip(0, len(at) - 1))]
-    levels = np.clip(np.searchsorted(building.storeys["floor"], at[:, 2], side="right") - 1, 0, None)
-    parts = [map.landmarks]
-    for level in np.unique(levels).tolist():
-        readings = simulate_readings(plans, points, at[levels == level, :2], level, settings, session)
-        readings.table["group"] += 100_000 * level
-        parts.append(move_landmarks(readings, frame) if frame else readings)
-    return replace(map, landmarks=join_landmarks(parts))

@@ -72,8 +72,8 @@ def plan_walk(building: Building, rooms: Sequence[int], rng: np.random.Generator
     sight = float(rng.uniform(*SIGHT))
     stops = []
     for r in requested:
-        made = _choose_stops(floors, clear, building.rooms[r].storey, r, sight)
-        stops += _sample_unfinished_stops(made, floors, rng) if rng.random() < unfinished else made
+        chosen = _choose_stops(floors, clear, building.rooms[r].storey, r, sight)
+        stops += _sample_unfinished_stops(chosen, floors, rng) if rng.random() < unfinished else chosen
     if not stops:
         raise InputError(f"{building.name}: none of the rooms has a free floor to stand on")
     start = stops[int(rng.integers(len(stops)))]

@@ -110,8 +110,11 @@ NETWORKS = {
 }
 
 
+SELDOM = ("bare", "bare means", "points", "local")  # with the slow tests: slow to export, or less of what another one has
+
+
 @pytest.mark.longer
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in ("points", "local"))) for n in NETWORKS])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SELDOM)) for n in NETWORKS])
 def test_every_encoder_is_as_with_torch(torch, name, tmp_path):
     from topomerge.models.weights import read_embedder
 

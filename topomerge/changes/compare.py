@@ -52,13 +52,13 @@ def find_room_changes(layers: StoreyLayers, walls: Sequence[WallChange]) -> list
     joined = _find_splits(layers, new, old, [w for w in walls if w.kind == "wall gone"])
     found = [RoomChange("room split", o, area, p, e, (whole,), parts) for whole, parts, o, area, p, e in split]
     found += [RoomChange("room joined", o, area, p, e, parts, (whole,)) for whole, parts, o, area, p, e in joined]
-    told = {r for c in found for r in c.old}, {r for c in found for r in c.new}
-    own = _find_enclosed(layers, new, old, [w for w in walls if w.kind == "wall new"], told[1])
+    reported = {r for c in found for r in c.old}, {r for c in found for r in c.new}
+    own = _find_enclosed(layers, new, old, [w for w in walls if w.kind == "wall new"], reported[1])
     found += [RoomChange("room new", outline, area, p, e, (), (room,)) for room, outline, area, p, e in own]
-    own = _find_enclosed(layers, old, new, [w for w in walls if w.kind == "wall gone"], told[0])
+    own = _find_enclosed(layers, old, new, [w for w in walls if w.kind == "wall gone"], reported[0])
     found += [RoomChange("room gone", outline, area, p, e, (room,), ()) for room, outline, area, p, e in own]
-    told = {r for c in found for r in c.old}, {r for c in found for r in c.new}
-    return found + _find_grown(layers, walls, told)
+    reported = {r for c in found for r in c.old}, {r for c in found for r in c.new}
+    return found + _find_grown(layers, walls, reported)
 
 
 def find_room_corrections(layers: StoreyLayers) -> list[RoomChange]:
@@ -129,11 +129,11 @@ def _find_enclosed(
         if area < PART_AREA or share < SEEN_SHARE or shares.max() >= ITS_OWN:
             continue
         border = mask & ~ndimage.binary_erosion(mask)
-        made = np.max([np.where(border & near, probability, 0.0) for probability, near in close], axis=0)
-        enclosed = float((made > 0).sum() / border.sum())
+        enclosing = np.max([np.where(border & near, probability, 0.0) for probability, near in close], axis=0)
+        enclosed = float((enclosing > 0).sum() / border.sum())
         if enclosed < ENCLOSED:
             continue
-        probability = float(made[made > 0].mean())
+        probability = float(enclosing[enclosing > 0].mean())
         evidence = {"wall": probability, "m2": area, "seen": share, "enclosed": enclosed}
         found.append((room, _trace_box(layers, mask), area, probability * share, evidence))
     return found
@@ -365,8 +365,3 @@ def _build_change(
     place = np.append(middle, layers.floor)
     rounded = {name: round(float(value), 3) for name, value in evidence.items()}
     return Change(kind, layers.storeys[0], place, shape, round(extent, 3), round(float(probability), 4), rounded)
-
-
-def select_kinds(changes: Changes, kinds: Sequence[str]) -> Changes:
-    """Select the changes of some kinds."""
-    return replace(changes, changes=tuple(c for c in changes.changes if c.kind in kinds))

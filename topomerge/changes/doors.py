@@ -130,13 +130,13 @@ def find_door_corrections(layers: StoreyLayers, reader: DoorReader) -> list[Door
     rows = [reader.select(k, layers) for k in (0, 1)]
     a, b = (reader.edges[k][rows[k]] for k in (0, 1))
     partner = _pair_doors(a["centre"], b["centre"])
-    told = [("door gone", a[i], int(rows[0][i]), -1) for i in range(len(a)) if i not in partner]
-    told += [("door new", b[j], -1, int(rows[1][j])) for j in range(len(b)) if j not in set(partner.values())]
+    corrections = [("door gone", a[i], int(rows[0][i]), -1) for i in range(len(a)) if i not in partner]
+    corrections += [("door new", b[j], -1, int(rows[1][j])) for j in range(len(b)) if j not in set(partner.values())]
     turned = ((a[i], b[j], int(rows[0][i]), int(rows[1][j])) for i, j in partner.items() if a[i]["open"] != b[j]["open"])
-    told += [("door opened" if after["open"] else "door shut", before, i, j) for before, after, i, j in turned]
+    corrections += [("door opened" if after["open"] else "door shut", before, i, j) for before, after, i, j in turned]
     return [
         DoorChange(kind, d["centre"][:2].copy(), float(d["width"]), float(d["direction"]), 1.0, {"corrected": 1.0}, i, j)
-        for kind, d, i, j in told
+        for kind, d, i, j in corrections
     ]
 
 
@@ -209,9 +209,9 @@ def read_state(layers: StoreyLayers, map: MapLayer, door: Array, own: Array | No
     passed = np.asarray(~blocked & (open_ground.mean(axis=1) > 0.6))
     inner, jambs = np.asarray(np.abs(u) < width / 2 - 0.12), np.asarray(np.abs(u) > width / 2 + 0.05)
     way, shut = float(passed[inner].mean()), float(blocked[inner].mean())
-    told = 0.0 if own is None else (OWN_OPEN if own["open"] else -OWN_SHUT) * float(own["confidence"])
+    prior = 0.0 if own is None else (OWN_OPEN if own["open"] else -OWN_SHUT) * float(own["confidence"])
     share = way / max(way + shut, 1e-6)
-    through = float(1 / (1 + np.exp(-(WAY_ODDS * (share - 0.5) + told))))
+    through = float(1 / (1 + np.exp(-(WAY_ODDS * (share - 0.5) + prior))))
     bare = float(1 / (1 + np.exp(-WAY_ODDS * (passed[jambs].mean() - 0.7))))
     if own is not None and own["kind"] == "door":
         bare *= 0.2

@@ -425,17 +425,19 @@ class _ModelDoors:
         near = [s for s in self.layers if abs(s.floor - float(door["centre"][2])) <= 2 * FLOOR_REACH]
         own = self.found[k] if k >= 0 and abs(shift) < SAME_DOOR else None
         states = [read_state(storey, storey.new, door, own, self.reader.points[1]) for storey in near]
-        told = next((state for state in states if state["seen"] >= 0.5), None)
-        if k >= 0 and (told is not None or abs(shift) > SAME_DOOR):
+        observed = next((state for state in states if state["seen"] >= 0.5), None)
+        if k >= 0 and (observed is not None or abs(shift) > SAME_DOOR):
             state, probability = _decide_elsewhere(shift, DOOR_SIGMA)
-            if state == "elsewhere" or told is None:
+            if state == "elsewhere" or observed is None:
                 along = np.array([-normal[1], normal[0], 0.0])
                 return ElementRow(element, state, shift, DOOR_SIGMA, along, 1.0, probability * float(self.found["confidence"][k]))
-        if told is None:
+        if observed is None:
             return ElementRow(element, "unseen", np.nan, np.nan, normal, 0.0, 1.0)
-        there = told["open"] + told["leaf"]
-        state = "seen" if there >= 0.5 else "missing"
-        return ElementRow(element, state, np.nan, np.nan, normal, told["seen"], told["seen"] * max(there, 1 - there))
+        evidence = observed["open"] + observed["leaf"]
+        state = "seen" if evidence >= 0.5 else "missing"
+        return ElementRow(
+            element, state, np.nan, np.nan, normal, observed["seen"], observed["seen"] * max(evidence, 1 - evidence)
+        )
 
 
 def _build_door(element: ModelElement) -> Array:

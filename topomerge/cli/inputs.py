@@ -354,8 +354,8 @@ class _Processes:
         reports: dict[str, Report | None] = {}
         try:
             connection.send(path)
-            while isinstance(told := connection.recv(), tuple):
-                title, done, text = told
+            while isinstance(message := connection.recv(), tuple):
+                title, done, text = message
                 if title not in reports:
                     reports[title] = self.name_bars(path)(title)
                 if (report := reports[title]) is not None:
@@ -365,9 +365,9 @@ class _Processes:
             status = process.exitcode or 0
             code = f"signal {-status}" if status < 0 else f"status {status}"
             raise InputError(f"{path}: the process that extracted it ended ({code}); if memory is short, give --jobs 1") from None
-        if isinstance(told, str):
-            raise InputError(told)
-        return told  # type: ignore[no-any-return]
+        if isinstance(message, str):
+            raise InputError(message)
+        return message  # type: ignore[no-any-return]
 
     def _get_process(self) -> tuple[BaseProcess, Connection[Any, Any]]:
         """The process of this thread."""
@@ -435,14 +435,14 @@ def _work(
         while True:
             path = connection.recv()
             try:
-                told: LoadedMap | str = _load_map(path, options, start_task)
+                outcome: LoadedMap | str = _load_map(path, options, start_task)
             except BrokenPipeError:
                 raise
             except Exception as error:
                 if debug:
                     traceback.print_exc()
-                told = format_failure(error, [path])
-            connection.send(told)
+                outcome = format_failure(error, [path])
+            connection.send(outcome)
 
 
 def _share_cores(processes: int) -> None:

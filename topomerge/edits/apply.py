@@ -174,13 +174,13 @@ def _add_door(
     draft: Draft, at: Array, width: float | None = None, open: bool | None = None, between: Array | None = None
 ) -> None:
     pair, direction, floor = _find_sides(draft, at, between)
-    there = [
+    existing = [
         k
         for k in np.flatnonzero((np.sort(draft.edges["rooms"], axis=1) == pair).all(axis=1)).tolist()
         if np.hypot(*(draft.edges["centre"][k] - at)[:2]) <= SAME_DOOR_DISTANCE
     ]
-    if there:
-        row = there[0]
+    if existing:
+        row = existing[0]
     else:
         row = len(draft.edges)
         draft.edges = np.append(draft.edges, np.zeros(1, EDGE_DTYPE))

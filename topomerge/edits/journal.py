@@ -174,9 +174,9 @@ class Edit:
             raise InputError(f"{self.op} lacks {missing[0]!r}: give {fields[missing[0]][1]}")
         common = {name: getattr(self, name) for name in ("id", "time") if getattr(self, name)} | {"by": self.by}
         for name, value in {**common, **self.values}.items():
-            check, words = fields[name] if name in self.values else COMMON[name]
+            check, requirement = fields[name] if name in self.values else COMMON[name]
             if not check(value):
-                raise InputError(f"{self.op}: {name} must be {words}, not {json.dumps(value, default=str)[:60]}")
+                raise InputError(f"{self.op}: {name} must be {requirement}, not {json.dumps(value, default=str)[:60]}")
 
     def to_json(self) -> dict[str, Any]:
         """As plain values, in the order of a line."""

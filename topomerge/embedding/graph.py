@@ -209,14 +209,14 @@ def hash_landmarks(rooms: int, texts: Iterable[tuple[int, str, float]], objects:
 
 def compute_landmark_features(map: TopometricMap) -> Array:
     """Compute what the landmarks of each room say, the surest `MOST_SIGNS` of each kind: as `hash_landmarks`."""
-    table, told = map.landmarks.table, []
+    table, columns = map.landmarks.table, []
     for kinds in (("text", "tag", "name"), ("object",)):
         rows = np.flatnonzero(map.landmarks.is_kind(*kinds) & (table["room"] >= 0))
         rows = rows[np.lexsort((rows, -table["confidence"][rows], table["room"][rows]))]
         rows = rows[np.arange(len(rows)) - np.searchsorted(table["room"][rows], table["room"][rows]) < MOST_SIGNS]
         room, value, sure = (table[name][rows].tolist() for name in ("room", "value", "confidence"))
-        told.append([(r, map.landmarks.values[v], c) for r, v, c in zip(room, value, sure, strict=True)])
-    return hash_landmarks(len(map.rooms), *told)
+        columns.append([(r, map.landmarks.values[v], c) for r, v, c in zip(room, value, sure, strict=True)])
+    return hash_landmarks(len(map.rooms), *columns)
 
 
 def rescale_graph(arrays: Mapping[str, Array], scale: float) -> dict[str, Array]:

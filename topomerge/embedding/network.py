@@ -106,8 +106,13 @@ def list_pair_tensors(node: Node) -> tuple[str, ...]:
 
 def list_tensors(network: Network) -> tuple[str, ...]:
     """Return names of the tensors that a network reads."""
-    ways = ("edge_way",) if network.node.ways and network.node.kind != "none" else ()
-    return (*dict.fromkeys(find_tensor(part) for part in network.geometry.parts), *GRAPH, *list_pair_tensors(network.node), *ways)
+    directions = ("edge_way",) if network.node.ways and network.node.kind != "none" else ()
+    return (
+        *dict.fromkeys(find_tensor(part) for part in network.geometry.parts),
+        *GRAPH,
+        *list_pair_tensors(network.node),
+        *directions,
+    )
 
 
 def build_embedder_signature(network: Network) -> Signature:

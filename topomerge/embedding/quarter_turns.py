@@ -149,10 +149,10 @@ def compute_shares(log_evidence: Array) -> Array:
 
 def _score_turn(turn: Turn) -> tuple[float, complex]:
     """Logarithm of the evidence of a turn, and the shift that explains most of it."""
-    cosine, ways = turn.cosine, turn.ways
+    cosine, shifts = turn.cosine, turn.ways
     most = min(PARTNERS * sum(cosine.shape), MOST_PAIRS, cosine.size)
     rooms = np.unravel_index(np.argpartition(-cosine, most - 1, axis=None)[:most], cosine.shape)
-    way, odds = ways[rooms], np.exp(LIKENESS * (cosine[rooms] - EVEN))
+    way, odds = shifts[rooms], np.exp(LIKENESS * (cosine[rooms] - EVEN))
     near = np.exp(-(np.abs(way[:, None] - way[None]) ** 2) / (2 * WAYS_ALIKE**2)) * odds
     log_likelihood = np.zeros(most)  # of the shift that each pair of rooms says
     for side, count in zip(rooms, cosine.shape, strict=True):

@@ -185,8 +185,8 @@ def score_model(case: Case) -> Row:
     moved = [shift_element(e, asked[e.guid].normal * planted[k]) if k in planted else e for k, e in enumerate(elements)]
     began = process_time()
     rows = {r.element.guid: r for r in compare_with_model(moved, model, scan, placement).elements}
-    told = [(by, rows[elements[k].guid]) for k, by in planted.items()]
-    found = [(by, -r.shift, r.state) for by, r in told]  # it is the model's wall that is shifted: the scan's is behind it
+    planted_rows = [(by, rows[elements[k].guid]) for k, by in planted.items()]
+    found = [(by, -r.shift, r.state) for by, r in planted_rows]  # it is the model's wall that is shifted: the scan's is behind it
     others = [rows[elements[k].guid].state for k in shown if k not in planted]
     row |= {"compare_s": process_time() - began, "found": found, "others": others}
     return row | {"states": [r.state for r in asked.values()], "sigma": float(np.nanmedian([r.sigma for r in rows.values()]))}
@@ -211,8 +211,8 @@ def _tabulate_groups(rows: Sequence[Row]) -> str:
     lines = []
     for name in GROUPS:
         counts = np.array([r["groups"][name] for r in used]).reshape(-1, 4)
-        right, told, found, true = counts.sum(axis=0).tolist()
-        lines.append([name, true, write_ratio(counts[:, 0], counts[:, 1], used), f"{right} of {told}",
+        right, reported, found, true = counts.sum(axis=0).tolist()
+        lines.append([name, true, write_ratio(counts[:, 0], counts[:, 1], used), f"{right} of {reported}",
                       write_ratio(counts[:, 2], counts[:, 3], used), f"{found} of {true}"])  # fmt: skip
     head = f"{len(rows)} pairs of sessions with changes, {len(used)} of them aligned. 95 % intervals over buildings."
     return f"{head}\n\n{write_table(('what', 'true', 'precision', '', 'recall', ''), lines)}"

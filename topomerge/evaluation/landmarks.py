@@ -87,8 +87,8 @@ class Settings(TaskSettings):
 def make_recipe(settings: Settings) -> LookalikeRecipe:
     """Return the recipe of the pairs."""
     split, name = ("train", "signs_train") if settings.data.set == "train" else ("test", "signs_test")
-    pairs, again = (dict.fromkeys(LOOKALIKES, count) for count in (settings.pairs, settings.again))
-    return LookalikeRecipe(name=name, split=split, pairs=pairs, again=again, scaled=0.0)
+    pairs, repeated = (dict.fromkeys(LOOKALIKES, count) for count in (settings.pairs, settings.again))
+    return LookalikeRecipe(name=name, split=split, pairs=pairs, again=repeated, scaled=0.0)
 
 
 def list_inputs(settings: Settings) -> list[str]:
@@ -256,10 +256,20 @@ def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
 
 def _format_line(name: str, rows: Sequence[Row]) -> list[object]:
     """A line under `HEADS`."""
-    apart, again = [r for r in rows if not r["again"]], [r for r in rows if r["again"]]
-    wrong, told = sum(map(is_false, apart)), [r for r in apart if min(r["landmarks"])]
+    apart, repeated = [r for r in rows if not r["again"]], [r for r in rows if r["again"]]
+    wrong, with_landmarks = sum(map(is_false, apart)), [r for r in apart if min(r["landmarks"])]
     low, high = compute_exact_interval(wrong, len(apart)) if apart else (0.0, 1.0)
-    good = sum(r["believed"] and r["right"] for r in again)
-    share: Any = f"{100 * good / len(again):.0f}" if again else "–"
+    good = sum(r["believed"] and r["right"] for r in repeated)
+    share: Any = f"{100 * good / len(repeated):.0f}" if repeated else "–"
     interval = f"{100 * low:.1f} to {100 * high:.1f} %"
-    return [name, len(apart), wrong, interval, len(told), sum(map(is_false, told)), len(again), good, share]
+    return [
+        name,
+        len(apart),
+        wrong,
+        interval,
+        len(with_landmarks),
+        sum(map(is_false, with_landmarks)),
+        len(repeated),
+        good,
+        share,
+    ]

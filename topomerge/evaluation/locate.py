@@ -182,7 +182,7 @@ def iter_windows(b: PointCloud, true: Sim3, a: PointCloud, rng: np.random.Genera
     """Yield square windows of a capture, about places that the other one shows, too."""
     from scipy.spatial import cKDTree
 
-    tree, made = cKDTree(a.points[::5, :2]), 0
+    tree, count = cKDTree(a.points[::5, :2]), 0
     for row in rng.permutation(len(b.points))[:200].tolist():
         middle = b.points[row, :2]
         inside = (np.abs(b.points[:, :2] - middle) < WINDOW / 2).all(axis=1)
@@ -193,8 +193,8 @@ def iter_windows(b: PointCloud, true: Sim3, a: PointCloud, rng: np.random.Genera
                 at = free.compute_centroids()[:, :2]
                 free = free.select_cells((np.abs(at - middle) < WINDOW / 2).all(axis=1))
             yield PointCloud(b.points[inside], free=free, upright=True)
-            made += 1
-        if made == WINDOWS:
+            count += 1
+        if count == WINDOWS:
             return
 
 

@@ -113,10 +113,10 @@ def select_last_variant(merges: Sequence[Row]) -> list[Row]:
 
 def tabulate_descriptor_effect(merges: Sequence[Row]) -> Table:
     """Tabulate how alike two variants of merging come out on the same pairs."""
-    ways = {name: {r["pair"]: r for r in rows} for name, rows in group_by_variant(merges).items()}
+    variants = {name: {r["pair"]: r for r in rows} for name, rows in group_by_variant(merges).items()}
     rows = []
-    for first, second in combinations(ways, 2):
-        both = [(row, ways[second][pair]) for pair, row in ways[first].items() if pair in ways[second]]
+    for first, second in combinations(variants, 2):
+        both = [(row, variants[second][pair]) for pair, row in variants[first].items() if pair in variants[second]]
         verdicts = sum(a["believed"] == b["believed"] for a, b in both)
         apart = np.array([_measure_pose_difference(a["place"], b["place"]) for a, b in both]).reshape(-1, 2)
         poses = int((apart < SAME_POSE).all(axis=1).sum())

@@ -156,13 +156,13 @@ def measure_building(data: Path, building: str, part: int) -> Row:
     """Score storeys of a real building: each against itself at another session, and against the others."""
     folder = data / DEVELOPMENT_FOLDERS["storeys"]
     plans = {s: build_flat_radio_plan(read_flat(folder / f"{building}-{s}.yaml"), LEVELS[s]) for s in STOREYS[building]}
-    heard = {s: simulate_sessions(plan, list(plans.values()), part) for s, plan in plans.items()}
-    maps = {s: tuple(build_walk_map(part) for part in parts) for s, parts in heard.items()}
+    sessions = {s: simulate_sessions(plan, list(plans.values()), part) for s, plan in plans.items()}
+    maps = {s: tuple(build_walk_map(part) for part in parts) for s, parts in sessions.items()}
     true = {s: score_radio(first, second, Sim3()) for s, (first, second) in maps.items()}
     false = {f"{s} {t}": score_radio(maps[s][0], maps[t][1], Sim3()) for s, t in combinations(maps, 2)}
     return {
         "building": building,
-        "readings": sum(len(x) for p in heard.values() for x in p),
+        "readings": sum(len(x) for p in sessions.values() for x in p),
         "true": true,
         "false": false,
     }
@@ -200,10 +200,10 @@ def tabulate_poses(rows: Sequence[Row]) -> str:
         for name, group in [*((row["storey"], [row]) for row in some), ("all", some)]:
             trials = np.array([t for row in group for t in row["trials"]], float)
             error, sure = trials[:, 0], trials[:, 3] > 0
-            told = [f"{np.median(error[sure]):.2f}", f"{error[sure].max():.2f}"] if sure.any() else ["–", "–"]
+            errors = [f"{np.median(error[sure]):.2f}", f"{error[sure].max():.2f}"] if sure.any() else ["–", "–"]
             z = f"{np.sqrt(np.mean(error[sure] ** 2 / trials[sure, 2] ** 2)):.2f}" if sure.any() else "–"
             wrong = int((sure & (error > FAR)).sum())
-            cells = [len(error), f"{np.median(error):.2f}", f"{error.max():.1f}", f"{1 - sure.mean():.2f}", *told, wrong, z]
+            cells = [len(error), f"{np.median(error):.2f}", f"{error.max():.1f}", f"{1 - sure.mean():.2f}", *errors, wrong, z]
             lines.append([walks or "half of all", name, *cells])
     head = ["walks a map", "storey", "trials", "median m", "worst m", "told unsure", "sure: median m", "sure: worst m"]
     return write_table([*head, "sure and beyond 5 m", "error over sigma"], lines)

@@ -77,8 +77,8 @@ class Case:
     @property
     def place(self) -> str:
         """The physical building that it is a map of: what intervals are drawn over."""
-        made = f"{self.building}-{self.seed}" if self.source == "procedural" else self.building
-        return find_physical_building(self.source, made)
+        title = f"{self.building}-{self.seed}" if self.source == "procedural" else self.building
+        return find_physical_building(self.source, title)
 
     @property
     def name(self) -> str:

@@ -225,9 +225,9 @@ def count_ranks_after(pair: EvaluationPair, cost: Array, agreed: Array | None) -
     names = ("first", "first_single", "five")
     if agreed is None:
         return {f"{name}_after": np.nan for name in names}
-    again = cost.astype(np.float64)
-    again[agreed[:, 0], agreed[:, 1]] = -1.0  # costs are 0 or more
-    counts = count_ranks(pair, again)
+    reranked = cost.astype(np.float64)
+    reranked[agreed[:, 0], agreed[:, 1]] = -1.0  # costs are 0 or more
+    counts = count_ranks(pair, reranked)
     return {f"{name}_after": counts[name] for name in names}
 
 
@@ -319,11 +319,11 @@ def find_doubled_columns(first: Array, second: Array, seen: Array, edge: float) 
     distance *= edge
     near = first & (distance >= WITHIN[0] + 0.99 * edge) & (distance <= WITHIN[1] + 0.01 * edge)
     here = np.argwhere(near)
-    there = nearest[:, near].T
-    alone = ~ndimage.binary_dilation(first, np.ones((3, 3)))[tuple(there.T)]
+    partners = nearest[:, near].T
+    alone = ~ndimage.binary_dilation(first, np.ones((3, 3)))[tuple(partners.T)]
     normals = [_estimate_normals(walls) for walls in (first, second)]
-    apart = there - here
-    n, m = normals[0][tuple(here.T)], normals[1][tuple(there.T)]
+    apart = partners - here
+    n, m = normals[0][tuple(here.T)], normals[1][tuple(partners.T)]
     parallel = np.abs(np.angle(np.exp(2j * (n - m)))) <= 2 * PARALLEL
     across = np.abs(np.angle(np.exp(2j * (n - np.arctan2(apart[:, 1], apart[:, 0]))))) <= 2 * (np.pi / 2 - ACROSS)
     between = np.zeros(len(here), bool)

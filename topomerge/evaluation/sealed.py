@@ -93,8 +93,8 @@ def format_block(rows: Sequence[Row], version: str, command: str, seconds: float
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     source = commit()
     title = f"## {now}: version {version}" + (f", commit {source}" if source else "")
-    again = f" This version had been measured {before} times before: the set was not sealed for it any more." if before else ""
-    took = f"`{command}`, {seconds / 60:.0f} minutes.{again}"
+    repeated = f" This version had been measured {before} times before: the set was not sealed for it any more." if before else ""
+    took = f"`{command}`, {seconds / 60:.0f} minutes.{repeated}"
     return "\n".join(["", title, "", took, "", *format_tables(rows), ""])
 
 
@@ -157,8 +157,8 @@ def measure_and_append(words: Sequence[str]) -> None:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Run; the exit status."""
-    said = list(sys.argv[1:] if words is None else words)
-    return run_script("sealed", lambda: measure_and_append(said), "nothing was written")
+    arguments = list(sys.argv[1:] if words is None else words)
+    return run_script("sealed", lambda: measure_and_append(arguments), "nothing was written")
 
 
 if __name__ == "__main__":

@@ -140,7 +140,7 @@ def tabulate(rows: Sequence[Row], settings: TaskSettings) -> dict[str, str]:
     lines = []
     for sensor in (*dict.fromkeys(row["sensor"] for row in rows), "all"):
         some = [row for row in rows if sensor in (row["sensor"], "all")]
-        right, there = (np.sum([row[name] for row in some], axis=0).tolist() for name in ("right", "there"))
+        right, present = (np.sum([row[name] for row in some], axis=0).tolist() for name in ("right", "there"))
         medians = write_medians(np.concatenate([row[name] for row in some]) for name in ERRORS)
-        lines.append([sensor, len(some), there[1], write_share(right), write_share(there), *medians])
+        lines.append([sensor, len(some), present[1], write_share(right), write_share(present), *medians])
     return {"windows": f"{len(rows)} maps.\n\n{write_table(WINDOW_COLUMNS, lines)}"}

@@ -77,17 +77,17 @@ def _read_first_message(bag: Bag, topic: Topic) -> Any:
 
 def _read_camera(bag: Bag, topic: Topic) -> Camera:
     """The camera of a topic of images, as its CameraInfo states it after rectification (P), else before (K)."""
-    beside = bag.find_topic(
+    companion = bag.find_topic(
         topic.name.removesuffix(TRANSPORT).removesuffix(PACKED).rstrip("/").rpartition("/")[0] + "/camera_info"
     )
-    if beside is None or beside.type != CAMERA_INFO or not beside.count:
+    if companion is None or companion.type != CAMERA_INFO or not companion.count:
         frame = _read_first_message(bag, topic).header.frame_id
         fitting = [t for t in bag.find_topics(CAMERA_INFO) if _read_first_message(bag, t).header.frame_id == frame]
         if len(fitting) != 1:
             have = f"no CameraInfo beside {topic.name}, and {len(fitting)} of its frame {frame!r}"
             raise InputError(f"{bag.path}: has {have}; record camera_info, too: the bag holds {bag.format_topics()}")
-        beside = fitting[0]
-    return _decode_camera(bag, beside)
+        companion = fitting[0]
+    return _decode_camera(bag, companion)
 
 
 def _decode_camera(bag: Bag, beside: Topic) -> Camera:

@@ -289,18 +289,18 @@ class _Collector:
         if len(self.content.texts) >= MOST_ENTITIES // 10:
             return
         is_block = entity.dxftype() == "MTEXT"
-        words = entity.plain_text() if is_block else entity.dxf.get("text", "")
+        text = entity.plain_text() if is_block else entity.dxf.get("text", "")
         height = float(entity.dxf.get("char_height" if is_block else "height", 1.0))
         place = Vec3(entity.dxf.get("insert", (0, 0, 0)))
         if not is_block:
             along = math.radians(entity.dxf.get("rotation", 0.0))
             aligned = entity.dxf.get("halign", 0) or entity.dxf.get("valign", 0)
-            half = 0.0 if aligned else 0.35 * height * len(words)
+            half = 0.0 if aligned else 0.35 * height * len(text)
             place = Vec3(entity.dxf.get("align_point", place)) if aligned else place
             place += Vec3(half * math.cos(along), half * math.sin(along), 0)
         place = place if matrix is None else matrix.transform(place)
-        if words.strip() and all(abs(v) < BEYOND for v in (place.x, place.y, height)):
-            self.content.texts.append(PictureText(" ".join(words.split()), (place.x, place.y), height, 1.0))
+        if text.strip() and all(abs(v) < BEYOND for v in (place.x, place.y, height)):
+            self.content.texts.append(PictureText(" ".join(text.split()), (place.x, place.y), height, 1.0))
 
 
 def _keep_opening(kind: str) -> str:

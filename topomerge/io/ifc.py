@@ -77,11 +77,11 @@ def parse_references(text: bytes) -> tuple[Array, Array, int]:
     text = NOT_SAID.sub(b"", text)
     statements = [(match[1], match[2]) for match in STATEMENT.finditer(text)]
     row = {name: i for i, (name, _) in enumerate(statements)}
-    paired = {name for name, said in statements if PAIRED.match(said)}
+    paired = {name for name, statement in statements if PAIRED.match(statement)}
     owners, targets = array("q"), array("q")
-    for name, said in statements:
+    for name, statement in statements:
         left_out = paired if name in paired else ()
-        existing = [row[other] for other in ENTITY_REFERENCE.findall(said) if other in row and other not in left_out]
+        existing = [row[other] for other in ENTITY_REFERENCE.findall(statement) if other in row and other not in left_out]
         owners.extend([row[name]] * len(existing))
         targets.extend(existing)
     return np.array(owners, np.int64), np.array(targets, np.int64), len(statements)

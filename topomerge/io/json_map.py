@@ -57,7 +57,7 @@ STOREY_GAP = 1.5  # m between the heights of places, from which on they are of t
 
 def _iter_place_pieces(path: Path, graph: Mapping[str, Any], options: ReadOptions) -> Iterator[Piece]:
     """Walls and floor of each storey by its places, which say how far from them the nearest obstacle is."""
-    places, ways = _parse_places(graph)
+    places, edges = _parse_places(graph)
     if len(places) < FEWEST_PLACES or not (places[:, 3] > 0).any():
         raise InputError(
             f"{path}: is a scene graph without a mesh, and without places that tell where its walls are; give "
@@ -67,7 +67,7 @@ def _iter_place_pieces(path: Path, graph: Mapping[str, Any], options: ReadOption
     yield Piece(np.empty((0, 3)), warnings=(f"{path}: {text}",), landmarks=find_graph_landmarks(path, graph), done=0.1)
     order = np.argsort(places[:, 2], kind="stable")
     for rows in np.split(order, np.flatnonzero(np.diff(places[order, 2]) > STOREY_GAP) + 1):
-        own = ways[np.isin(ways, rows).all(axis=1)]
+        own = edges[np.isin(edges, rows).all(axis=1)]
         free, low = _draw_places(path, places, rows, own)
         outline = ndimage.binary_dilation(free, np.ones((3, 3))) & ~free
         plan = grid.Plan(path, PLACE_CELL, (low[0], low[1], 0.0))

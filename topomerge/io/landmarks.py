@@ -196,7 +196,7 @@ def serialise_landmarks(landmarks: Landmarks) -> list[dict[str, Any]]:
 
 
 def _list_known(values: Array, known: Array) -> list[Any]:
-    return [value if there else None for value, there in zip(values.tolist(), known.tolist(), strict=True)]
+    return [value if is_known else None for value, is_known in zip(values.tolist(), known.tolist(), strict=True)]
 
 
 def parse_landmarks(rows: Iterable[Mapping[str, Any]], source: str) -> Landmarks:

@@ -45,8 +45,8 @@ DIGITS = 6  # micrometres: the digits behind are noise
 
 def describe_room(room: Any) -> list[str]:
     """Describe a row of ROOM_DTYPE: `outside`, `glimpsed` (only looked into), `doubtful` (probably no room)."""
-    words = (("outside", room["outside"] > 0.5), ("glimpsed", room["glimpsed"]), ("doubtful", room["confidence"] < 0.5))
-    return [word for word, so in words if so]
+    notes = (("outside", room["outside"] > 0.5), ("glimpsed", room["glimpsed"]), ("doubtful", room["confidence"] < 0.5))
+    return [word for word, so in notes if so]
 
 
 def _convert_to_strict_json(value: Any) -> Any:
@@ -146,13 +146,13 @@ def _format_count(count: int, word: str) -> str:
 
 def _list_neighbours(map: TopometricMap) -> list[list[str]]:
     """For each room the rooms that it leads to; a second door to the same one is not told again."""
-    beside: list[dict[int, str]] = [{} for _ in map.rooms]
+    neighbours: list[dict[int, str]] = [{} for _ in map.rooms]
     for edge in map.edges:
         a, b = edge["rooms"].tolist()
         mark = f" ({edge['kind']})" if edge["kind"] in ("stairs", "ramp") else ""
-        beside[a].setdefault(b, mark)
-        beside[b].setdefault(a, mark)
-    return [[f"{room}{rooms[room]}" for room in sorted(rooms)] for rooms in beside]
+        neighbours[a].setdefault(b, mark)
+        neighbours[b].setdefault(a, mark)
+    return [[f"{room}{rooms[room]}" for room in sorted(rooms)] for rooms in neighbours]
 
 
 def _iter_room_rows(map: TopometricMap, names: Sequence[str]) -> Iterable[Sequence[str]]:

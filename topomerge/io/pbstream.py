@@ -291,7 +291,7 @@ def parse_spatial_submap(data: bytes, pose: Array) -> Array:
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Read the submaps of the trajectories that are joined: walls and floor of grids in a plane, points of those in space."""
-    graph, kept, told = PoseGraph(), set[int](), []
+    graph, kept, warnings = PoseGraph(), set[int](), []
     flat: list[FlatSubmap] = []
     spatial, missing = False, set[Key]()
     try:
@@ -301,7 +301,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
                     graph = parse_pose_graph(value)
                     components = graph.find_components()
                     kept = components[0] if components else set()
-                    told += [_describe_apart(path, part) for part in components[1:]]
+                    warnings += [_describe_apart(path, part) for part in components[1:]]
                     missing = {key for key in graph.submaps if key[0] in kept}
                 elif number == SUBMAP and isinstance(value, bytes):
                     fields = parse_message(value)
@@ -325,8 +325,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     if not flat and not spatial:
         raise InputError(f"{path}: holds no submaps with poses; finish the trajectory before it is saved")
     if missing:
-        told.append(f"{path}: {len(missing):,} of its submaps have no grid; it may be cut short")
-    yield Piece(np.empty((0, 3)), warnings=tuple(told), landmarks=_build_landmarks(graph, path), done=0.9)
+        warnings.append(f"{path}: {len(missing):,} of its submaps have no grid; it may be cut short")
+    yield Piece(np.empty((0, 3)), warnings=tuple(warnings), landmarks=_build_landmarks(graph, path), done=0.9)
     if flat:
         walls, free, plan = _draw_submaps(path, flat)
         yield from grid.extrude(path, np.flipud(walls), np.flipud(free), plan, options)

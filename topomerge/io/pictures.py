@@ -99,8 +99,8 @@ class PictureReader:
         """How far the camera moved since the nearest of the last pictures, in distances and angles between two."""
         moved = np.linalg.norm(self._views[:, :3, 3] - pose[:3, 3], axis=1) / KEY_DISTANCE
         cosine = (np.einsum("kij,ij->k", self._views[:, :3, :3], pose[:3, :3]) - 1) / 2
-        ways = np.maximum(moved, np.degrees(np.arccos(np.clip(cosine, -1, 1))) / KEY_ANGLE)
-        return float(ways.min(initial=BLURRED_WAY))
+        lengths = np.maximum(moved, np.degrees(np.arccos(np.clip(cosine, -1, 1))) / KEY_ANGLE)
+        return float(lengths.min(initial=BLURRED_WAY))
 
     def read_frame(self, frame: Frame, depth: Array, image: Array | None) -> None:
         """Read the colours of a frame of depth, if it is due."""

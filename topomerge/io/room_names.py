@@ -73,7 +73,7 @@ def _iter_features(path: Path, about: Mapping[str, Any]) -> Iterator[dict[str, A
     shapes = [(feature.get("properties") or {}, feature.get("geometry")) for feature in about["features"]]
     own = [properties for properties, _ in shapes if properties.get("kind") == "landmark"]
     yield from ({**row, "kind": row["of"]} for row in own)
-    said = {(row.get("room"), row.get("value")) for row in own}
+    given = {(row.get("room"), row.get("value")) for row in own}
     named = []
     for properties, geometry in shapes:
         name = next((str(properties[key]) for key in NAME_KEYS if properties.get(key)), "")
@@ -81,7 +81,7 @@ def _iter_features(path: Path, about: Mapping[str, Any]) -> Iterator[dict[str, A
             geometry
             and name
             and geometry.get("type") in ("Polygon", "MultiPolygon")
-            and (properties.get("room"), name) not in said
+            and (properties.get("room"), name) not in given
         ):
             named.append((name, properties, shapely.geometry.shape(geometry)))
     if named:
@@ -124,18 +124,18 @@ def _iter_cells(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _read_cell(cell: Any, points: Mapping[str, Any]) -> dict[str, Any] | None:
-    name, facts, at = "", "", None
+    name, properties, at = "", "", None
     for part in cell:
         if _get_name(part) == "name":
             name = (part.text or "").strip()
         elif _get_name(part) == "description":
-            facts = part.text or ""
+            properties = part.text or ""
         elif _get_name(part) == "duality":
             at = points.get(next(iter(part.attrib.values()), "").removeprefix("#"))
     if UNNAMED.fullmatch(name):
         return None
     at = _find_middle(cell) if at is None else at
-    storey = re.search(r'storey="(\d{1,3})"', facts)
+    storey = re.search(r'storey="(\d{1,3})"', properties)
     position = None if at is None else (float(at[0]), float(at[1]), float(at[2]) + GIVEN_ABOVE_FLOOR)
     return {"kind": "name", "value": name, "position": position, "storey": int(storey[1]) if storey else None}
 

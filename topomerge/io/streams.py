@@ -131,10 +131,10 @@ def read_rosbridge(
                 yield None
                 continue
             try:
-                told = json.loads(text)
-                if told.get("op") != "publish" or told.get("topic") not in topics:
+                decoded = json.loads(text)
+                if decoded.get("op") != "publish" or decoded.get("topic") not in topics:
                     continue
-                message = build_message(told["topic"], told["msg"], counts.read + 1)
+                message = build_message(decoded["topic"], decoded["msg"], counts.read + 1)
             except MESSAGE_ERRORS:
                 counts.broken += 1
                 continue
@@ -156,8 +156,8 @@ def read_foxglove(address: str, topics: Collection[str], counts: StreamCounts) -
                 continue
             try:
                 if isinstance(received, str):
-                    told = json.loads(received)
-                    offered = told.get("channels", []) if told.get("op") == "advertise" else []
+                    decoded = json.loads(received)
+                    offered = decoded.get("channels", []) if decoded.get("op") == "advertise" else []
                     new = [
                         c for c in offered if c["topic"] in topics and c.get("encoding") == "cdr" and len(requested) < len(topics)
                     ]

@@ -220,9 +220,9 @@ def find_category(prim: Any) -> str:
     """Find what a prim is, by its own category or that of a group around it, else by RoomPlan's numbered names; "": not told."""
     at = prim
     while at and not at.IsPseudoRoot():
-        told = at.GetCustomDataByKey("Category")
-        if isinstance(told, str) and told.strip():
-            return clean_text(told).lower()
+        category = at.GetCustomDataByKey("Category")
+        if isinstance(category, str) and category.strip():
+            return clean_text(category).lower()
         at = at.GetParent()
     names = prim.GetPath().pathString.split("/")
     if not any(name.endswith("_grp") for name in names):

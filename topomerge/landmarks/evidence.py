@@ -197,7 +197,7 @@ class LandmarkEvidence:
 
 def describe_witnesses(kind: str, witnesses: Sequence[Witness], shown: int = 3) -> str:
     """Describe the landmarks of a kind: "signs 2.113 and 2.114 agree; nothing contradicts"; nothing where none testifies."""
-    words = KINDS[kind].words if kind in KINDS else kind
+    label = KINDS[kind].words if kind in KINDS else kind
     agree, against, away = ([w for w in witnesses if w.verdict == v] for v in ("agrees", "contradicts", "elsewhere"))
     if not (agree or against or away):
         return ""
@@ -210,15 +210,15 @@ def describe_witnesses(kind: str, witnesses: Sequence[Witness], shown: int = 3) 
 
     parts = []
     if agree:
-        parts.append(f"{words}{'s' * (len(agree) > 1)} {name(agree)} agree{'s' * (len(agree) == 1)}")
+        parts.append(f"{label}{'s' * (len(agree) > 1)} {name(agree)} agree{'s' * (len(agree) == 1)}")
     if against:
         pairs = ", ".join(f"{quote_text(w.values[0])} against {quote_text(w.values[1])}" for w in against[:shown])
         more = f" and {len(against) - shown} more" if len(against) > shown else ""
-        parts.append(f"{words}s contradict: {pairs}{more}")
+        parts.append(f"{label}s contradict: {pairs}{more}")
     elif agree:
         parts.append("nothing contradicts")
     if away:
-        parts.append(f"{words}{'s' * (len(away) > 1)} {name(away)} stand{'s' * (len(away) == 1)} elsewhere in the other map")
+        parts.append(f"{label}{'s' * (len(away) > 1)} {name(away)} stand{'s' * (len(away) == 1)} elsewhere in the other map")
     return "; ".join(parts)
 
 

@@ -173,8 +173,8 @@ class _Fusion:
         t["value"][old] = np.where(t["confidence"][new] > t["confidence"][old], t["value"][new], t["value"][old])
         t["confidence"][old] = 1 - (1 - t["confidence"][old]) * (1 - t["confidence"][new])
         for name in ("number", "time"):
-            said = t[name][surer]
-            t[name][old] = np.where(np.isnan(said), np.where(surer == old, t[name][new], t[name][old]), said)
+            chosen = t[name][surer]
+            t[name][old] = np.where(np.isnan(chosen), np.where(surer == old, t[name][new], t[name][old]), chosen)
         for name in ("room", "storey"):
             t[name][old] = np.where(t[name][old] >= 0, t[name][old], t[name][new])
         self.into[new] = old

@@ -188,10 +188,10 @@ def compute_factors(a: Sightings, b: Sightings, met: Associated, rules: Kind, ki
     keys = [(a.keys[p], b.keys[q]) for p, q in met.pairs.tolist()]
     share = compute_shares(a, b, met.pairs)
     sure = 1 - DOUBTED * (1 - a.confidence[i] * b.confidence[j])
-    beside = SIDE_BY_SIDE[0] + (SIDE_BY_SIDE[1] - SIDE_BY_SIDE[0]) * met.apart**2
+    proximity = SIDE_BY_SIDE[0] + (SIDE_BY_SIDE[1] - SIDE_BY_SIDE[0]) * met.apart**2
     numbers = a.numbered[i] & b.numbered[j]
     changed = np.where(numbers | (kind != "text"), rules.changed, max(rules.changed, WORDS_CHANGED))
-    stays = (1 - changed) * (1 - beside) * sure
+    stays = (1 - changed) * (1 - proximity) * sure
 
     def read(reading: Sequence[float]) -> float:
         times = np.where(met.turned, TURNED, np.minimum(np.array(reading) / (share * met.crowd), rules.most))
@@ -211,8 +211,8 @@ def compute_factors(a: Sightings, b: Sightings, met: Associated, rules: Kind, ki
         for name in ALTERNATIVES[1:]:
             repeats, shifted = rules.repeats[name], SHIFTED[name] if shifts else 0.0
             terms = [np.log(1 - repeats - shifted * (1 - repeats)) + probability[name], np.log(repeats) + same]
-            ways = [(LEADING if is_leading(s) else COUNTED if s[0] == "count" else {}).get(name, OTHERWISE) for s in shifts]
-            terms += [np.log(shifted * (1 - repeats) * way) + m for way, m in zip(ways, moved, strict=True)]
+            tables = [(LEADING if is_leading(s) else COUNTED if s[0] == "count" else {}).get(name, OTHERWISE) for s in shifts]
+            terms += [np.log(shifted * (1 - repeats) * way) + m for way, m in zip(tables, moved, strict=True)]
             parts[name].append(np.log(weight) + float(np.logaddexp.reduce(terms)))
     return {name: float(np.logaddexp.reduce(values)) for name, values in parts.items()}
 

@@ -115,8 +115,8 @@ def build_sightings(map: TopometricMap, kinds: Sequence[str]) -> Sightings:
     numbered = [text and is_number(v) for v, text in zip(values, texts, strict=True)]
     confidence = np.clip(np.nan_to_num(table["confidence"][rows], nan=0.5), 0.0, 1.0)
     named = table["kind"][rows] == LANDMARK_KINDS.index("name")
-    headings, told = table["number"][rows], (np.array(shares, float), np.array(numbered, bool), named)
-    whole = Sightings(rows, tuple(values), tuple(keys), position, sigma, confidence, headings, *told)
+    headings, qualities = table["number"][rows], (np.array(shares, float), np.array(numbered, bool), named)
+    whole = Sightings(rows, tuple(values), tuple(keys), position, sigma, confidence, headings, *qualities)
     whole = whole.select(_pick_single_readings(whole))
     if len(whole) > MOST_SIGHTINGS:
         whole = whole.select(np.sort(np.argsort(whole.share, kind="stable")[:MOST_SIGHTINGS]))

@@ -176,9 +176,9 @@ def score_shifted(one: str, other: str, shift: Shift, error: float) -> float:
     """Return the probability that readers give `one` and `other` of two numbers of which the second is the first one's shift."""
     how, amount, change = shift
     back = (how, amount, ">".join(change.split(">")[::-1])) if how == "change" else (how, -amount, "")
-    there, here = apply_shift(one, shift), apply_shift(other, back)
-    ahead = 0.0 if there is None else score_reading(there, other, error)
-    return max(ahead, 0.0 if here is None else score_reading(one, here, error))
+    moved, moved_back = apply_shift(one, shift), apply_shift(other, back)
+    ahead = 0.0 if moved is None else score_reading(moved, other, error)
+    return max(ahead, 0.0 if moved_back is None else score_reading(one, moved_back, error))
 
 
 def quote_text(text: str, longest: int = 24) -> str:

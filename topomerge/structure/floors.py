@@ -48,14 +48,14 @@ def _build_floors(map: TopometricMap) -> list[shapely.MultiPolygon]:
     cells = [None if plan is None else _straighten_walls(_trace_polygon(plan.cells, plan.low)) for plan in plans]
     growth = _estimate_growth(map, plans, cells)
     floors: list[shapely.MultiPolygon] = []
-    beside: dict[int, list[shapely.MultiPolygon]] = {}
+    adjoining: dict[int, list[shapely.MultiPolygon]] = {}
     for r, shape in enumerate(cells):
         if shape is None:
             floor = shapely.box(*map.rooms["lo"][r, :2], *map.rooms["hi"][r, :2])
         else:
             grown = shape.buffer(growth / edge, join_style="mitre", mitre_limit=1.5)
             floor = shapely.affinity.affine_transform(grown, [edge, 0, 0, edge, *origin])
-        others = beside.setdefault(int(map.rooms["storey"][r]), [])
+        others = adjoining.setdefault(int(map.rooms["storey"][r]), [])
         taken = [others[k] for k in np.flatnonzero(shapely.intersects(others, floor))] if others else []
         floors.append(_collect_polygons(floor.difference(shapely.union_all(taken)) if taken else floor, SPECK))
         others.append(floors[-1])

@@ -289,8 +289,8 @@ def _pair_faces(faces: list[_Face]) -> list[tuple[int, int, float, float]]:
             for start, end in _intersect_intervals(free, low, high):
                 pairs.append((i, j, start, end))
             free = _subtract_interval(free, low, high)
-    there = {(i, j) for i, j, _, _ in pairs}
-    return [pair for pair in pairs if pair[0] < pair[1] or (pair[1], pair[0]) not in there]
+    paired = {(i, j) for i, j, _, _ in pairs}
+    return [pair for pair in pairs if pair[0] < pair[1] or (pair[1], pair[0]) not in paired]
 
 
 def _project_onto_face(face: _Face, point: Array) -> Array:
@@ -335,8 +335,8 @@ def _build_single_walls(faces: list[_Face], pairs: list[tuple[int, int, float, f
     for i, j, start, end in pairs:
         f, g = faces[i], faces[j]
         taken.setdefault(i, []).append((start, end))
-        there = sorted(float((f.a + f.along * t - g.a) @ g.along) for t in (start, end))
-        taken.setdefault(j, []).append((there[0], there[1]))
+        span = sorted(float((f.a + f.along * t - g.a) @ g.along) for t in (start, end))
+        taken.setdefault(j, []).append((span[0], span[1]))
     for i, face in enumerate(faces):
         free = [(0.0, face.length)]
         for low, high in taken.get(i, []):

@@ -326,21 +326,21 @@ def build_map_pair(
     links[pair.matches[:, 0], pair.matches[:, 1]] = True
     links = links[rows[0]][:, rows[1]]
     counts = torch.tensor([len(present) for present in rows])
-    again = int(counts[1]) * (len(graphs) - len(rows))
-    sides = [torch.repeat_interleave(torch.arange(2), counts), torch.ones(again, dtype=torch.long)]
+    negatives = int(counts[1]) * (len(graphs) - len(rows))
+    sides = [torch.repeat_interleave(torch.arange(2), counts), torch.ones(negatives, dtype=torch.long)]
     true_rooms = [numbers[present] for numbers, present in zip(pair.true, rows, strict=True)]
     clear = find_well_seen_rooms(links, pair.a["x"][rows[0]], pair.b["x"][rows[1]])
     side = torch.cat(sides)
     return MapPair(
-        **_join_graphs(graphs, [*counts.tolist(), again], names),
+        **_join_graphs(graphs, [*counts.tolist(), negatives], names),
         side=side,
-        map=torch.repeat_interleave(torch.arange(3), torch.tensor([*counts.tolist(), again])),
+        map=torch.repeat_interleave(torch.arange(3), torch.tensor([*counts.tolist(), negatives])),
         building=torch.tensor(pair.building_numbers)[side],
-        true=torch.cat([*true_rooms, torch.full((again,), -1)]),
-        clear=torch.cat([*clear, torch.zeros(again, dtype=torch.bool)]),
+        true=torch.cat([*true_rooms, torch.full((negatives,), -1)]),
+        clear=torch.cat([*clear, torch.zeros(negatives, dtype=torch.bool)]),
         match_index=torch.nonzero(links).T + torch.tensor([[0], [int(counts[0])]]),
         room_counts=counts,
-        num_nodes=int(counts.sum()) + again,
+        num_nodes=int(counts.sum()) + negatives,
     )
 
 

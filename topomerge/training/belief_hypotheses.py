@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -201,9 +201,6 @@ def classify_pair(row: dict[str, Any]) -> str:
     return next(name for limit, name in ((40, "<40"), (80, "40-80"), (200, "80-200"), (np.inf, ">200")) if row["common"] < limit)
 
 
-CAPTURE_GROUPS = 5  # of captures; those of two groups are left out at a time
-
-
 def build_floor_rows(settings: MergeBelief, log_line: Any) -> list[Row]:
     """The pairs of the floor with their judged hypotheses, cached; each weighs `settings.floor`, and none are taken where that
     is 0 or no real data is there."""
@@ -216,18 +213,6 @@ def build_floor_rows(settings: MergeBelief, log_line: Any) -> list[Row]:
         for path in derive_hypothesis_files("development_floor", [[p] for p in paths], settings, log_line)
     ]
     return [{**row, "weight": settings.floor, "real": True} for row in rows if row["hyps"]]
-
-
-def iter_capture_folds(rows: Sequence[Row]) -> Iterator[tuple[list[Row], list[Row]]]:
-    """Rows of the floor to fit to and to judge, so that each row is judged once, by fits that saw neither of its captures."""
-    names = sorted({name for row in rows for name in row["captures"].split("-")})
-    group = {name: k % CAPTURE_GROUPS for k, name in enumerate(names)}
-    of = [{group[name] for name in row["captures"].split("-")} for row in rows]
-    for first in range(CAPTURE_GROUPS):
-        for second in range(first, CAPTURE_GROUPS):
-            judged = [row for row, groups in zip(rows, of, strict=True) if groups == {first, second}]
-            if judged:
-                yield [row for row, groups in zip(rows, of, strict=True) if not groups & {first, second}], judged
 
 
 def build_lookalike_rows(recipe: LookalikeRecipe, settings: MergeBelief, log_line: Any) -> list[Row]:

@@ -178,8 +178,8 @@ class EmbeddingJob:
         """The pairs of an epoch: all of one's own, and those that are drawn for replay, with replacement, among them."""
         order = torch.randperm(self.own, generator=generator)
         if self.drawn:
-            again = torch.randint(self.own, len(self.train), (self.drawn,), generator=generator)
-            order = torch.cat([order, again])[torch.randperm(self.own + self.drawn, generator=generator)]
+            replayed = torch.randint(self.own, len(self.train), (self.drawn,), generator=generator)
+            order = torch.cat([order, replayed])[torch.randperm(self.own + self.drawn, generator=generator)]
         return [int(number) for number in order]
 
     def iter_batches(self, state: State) -> Generator[MapPair, None, None]:
@@ -327,16 +327,16 @@ def adopt_network(settings: Training) -> Training:
     if not settings.init_from:
         return settings
     try:
-        there, asked = asdict(read_embedder(settings.init_from)[0].network), asdict(settings.network)
+        loaded, asked = asdict(read_embedder(settings.init_from)[0].network), asdict(settings.network)
     except InputError as error:
         raise InputError(f"init_from={settings.init_from}: {error}") from error
     given = compare_settings(asdict(Network()), asked)
-    differing = {key: values for key, values in compare_settings(there, asked).items() if key in given and key != "dropout"}
+    differing = {key: values for key, values in compare_settings(loaded, asked).items() if key in given and key != "dropout"}
     if differing:
         text = ", ".join(f"{key} ({was!r} there, {now!r} asked for)" for key, (was, now) in differing.items())
         raise InputError(f"init_from={settings.init_from}: is another network: {text}; leave out what differs")
-    dropout = settings.network.dropout if "dropout" in given else there["dropout"]
-    return replace(settings, network=build_network({**there, "dropout": dropout}))
+    dropout = settings.network.dropout if "dropout" in given else loaded["dropout"]
+    return replace(settings, network=build_network({**loaded, "dropout": dropout}))
 
 
 def _load_data(settings: Training, log_line: LogFn, fabric: Any) -> tuple[list[GraphPair], list[GraphPair], list[GraphPair]]:

@@ -301,11 +301,11 @@ def fit_models(rows: list[dict[str, Any]], flat: bool, settings: MergeBelief) ->
     t = build_hypothesis_table(rows)
     ranking, scores = fit_ranking(t, flat, settings)
     w = collect_best_hypotheses(t, scores, ranking["bent"], settings)
-    verdict, believed = fit_verdict(w, flat, t.ordinary, settings)
+    verdict, accepted = fit_verdict(w, flat, t.ordinary, settings)
     mine = w.first & np.array([is_flat(row) == flat for row in w.rows], bool)
     scored = [row for row, so in zip(w.rows, mine, strict=True) if so]
     pairs = int(sum(t.trains[i] for i in np.unique(t.owner[t.is_inspected])))
-    return {"pairs": pairs, **ranking, **verdict}, (scored, np.minimum(believed, w.share)[mine], w.y[mine])
+    return {"pairs": pairs, **ranking, **verdict}, (scored, np.minimum(accepted, w.share)[mine], w.y[mine])
 
 
 def fit_ranking(t: Table, flat: bool, settings: MergeBelief) -> tuple[dict[str, Any], Array]:
@@ -386,13 +386,13 @@ def fit_verdict(w: BestHypotheses, flat: bool, ordinary: int, settings: MergeBel
             return dict(load_model()["flat" if flat else "solid"]["plan"])
         return fit_logistic(w.plan[rows], w.y[rows] > 0, PLAN_VECTOR, settings.plan_strength, balance[rows])
 
-    believed = np.zeros(len(w.y))
+    accepted = np.zeros(len(w.y))
     for train, test in iter_folds(w.building, settings.folds, ordinary):
         against = np.exp(-compute_logits(fit_place(train), w.x[test])) + compute_plan_odds(fit_plan(train), w.plan[test])
-        believed[test] = 1 / (1 + against)
+        accepted[test] = 1 / (1 + against)
     every, wrong = np.arange(len(w.y)), other & (w.y == 0)
     kinds = shipped.get("kinds") or fit_multinomial(w.x[wrong], truth[wrong], weight[wrong], settings.kinds_strength)
-    return {"winner": fit_place(every), "kinds": kinds, "plan": fit_plan(every)}, believed
+    return {"winner": fit_place(every), "kinds": kinds, "plan": fit_plan(every)}, accepted
 
 
 def score_beliefs(rows: Sequence[dict[str, Any]], accepted: Array, true: Array, threshold: float) -> dict[str, float]:

@@ -100,12 +100,12 @@ def _add_furniture(inside: Array, wall: Array, room: Array, rng: np.random.Gener
         middle = places[rng.integers(len(places))]
         size = rng.integers(1, 9, 2) if rng.random() < 0.6 else rng.integers(1, 3, 2)
         box = tuple(slice(max(int(m - s // 2), 0), int(m + s - s // 2)) for m, s in zip(middle, size, strict=True))
-        there, rim = room[box], np.ones(room[box].shape, bool)
+        floor, rim = room[box], np.ones(room[box].shape, bool)
         kind = int(rng.integers(3))
         rim[1:-1, 1:-1] = kind == 0
-        inside[box] &= ~there
+        inside[box] &= ~floor
         if kind < 2:
-            wall[box] |= there & rim
+            wall[box] |= floor & rim
     return inside, wall
 
 

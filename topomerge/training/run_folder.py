@@ -32,7 +32,6 @@ MAY_CHANGE |= {"name", "runs", "logger", "export", "resume", "overwrite", "top",
 # Keys that follow from the `path` of one's own captures; `record_start` compares what the sets hold.
 OWN_SETS = {"data", "data.name", "heldout.name", "validation"}
 UNTOLD = {"name", "runs", "resume", "overwrite"}  # of them
-MISSING = object()
 
 
 def compare_settings(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, list[Any]]:

@@ -139,9 +139,9 @@ def sample_stretch(scan: WallExample, middle: int, options: WallSegmentation, rn
     x = np.zeros((options.length, DEPTHS, STRIP_CHANNELS), np.float32)
     truth, weight = np.zeros(options.length, np.uint8), np.zeros(options.length // PLACES, np.float32)
     x[: stop - start], truth[: stop - start] = scan.strips[start:stop] / np.float32(255), scan.truth[start:stop]
-    right, there = downsample_truth(truth, x)
+    right, present = downsample_truth(truth, x)
     weight[: (stop - start) // PLACES] = 1.0
-    weight *= np.array(options.classes, np.float32)[right] * np.where(there, 1.0, options.unseen)
+    weight *= np.array(options.classes, np.float32)[right] * np.where(present, 1.0, options.unseen)
     if rng.random() < 0.5:
         x, right, weight = x[::-1], right[::-1], weight[::-1]
     return _corrupt_strip(x, options.augment, rng), np.ascontiguousarray(right), np.ascontiguousarray(weight, np.float32)
@@ -170,10 +170,10 @@ def score_walls(examples: Sequence[WallExample], network: Run) -> dict[str, floa
     for scan in examples:
         for low, high in zip(scan.first[:-1], scan.first[1:], strict=True):
             strip = scan.strips[low:high] / np.float32(255)
-            right, there = downsample_truth(scan.truth[low:high], strip)
-            probability = compute_place_probabilities(strip, network)[there]
-            np.add.at(table, (right[there], probability.argmax(axis=1)), 1)
-            loss += compute_log_loss(probability, right[there])
+            right, present = downsample_truth(scan.truth[low:high], strip)
+            probability = compute_place_probabilities(strip, network)[present]
+            np.add.at(table, (right[present], probability.argmax(axis=1)), 1)
+            loss += compute_log_loss(probability, right[present])
     coarse = np.zeros((len(COARSE_CLASSES), len(COARSE_CLASSES)), np.int64)
     np.add.at(coarse, np.ix_(COARSE_CLASS, COARSE_CLASS), table)
     scores = {**compute_f1_scores(table, WALL_CLASSES), **score_colour_classes(coarse)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -154,10 +154,6 @@ class Deformation:
     def least_growth(self) -> float:
         """The least factor by which a small area is changed; not above 0 where space is folded."""
         return min((f.growth[0] for f in self.fields if f is not None), default=1.0)
-
-    def weakened(self, share: float) -> Deformation:
-        """Return the same with only a share of each move."""
-        return replace(self, moves=share * self.moves)
 
     def to_json(self) -> dict[str, Any]:
         """As plain values, none rounded."""

@@ -59,7 +59,7 @@ def told(assembly: Assembly) -> tuple:
 
 
 @pytest.mark.longer
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_assembled_by_sets_it_is_what_it_is_at_once(seed: int) -> None:
     claims, says, count = drawn(seed)

@@ -223,9 +223,9 @@ class _BuildingModel(Model):
             quantities.append(self.create("IfcQuantityLength", Name="Height", LengthValue=float(room["height"])))
             quantities.append(self.create("IfcQuantityVolume", Name="GrossVolume", VolumeValue=float(room["volume"])))
         self._define(space, self._set("IfcElementQuantity", "Qto_SpaceBaseQuantities", r, Quantities=quantities))
-        facts = {"Completeness": ("IfcReal", float(room["completeness"])), "Glimpsed": ("IfcBoolean", bool(room["glimpsed"]))}
-        facts |= {name.title(): ("IfcReal", float(room[name])) for name in ROOM_ODDS}
-        properties = [self._create_property(name, kind, value) for name, (kind, value) in facts.items()]
+        values = {"Completeness": ("IfcReal", float(room["completeness"])), "Glimpsed": ("IfcBoolean", bool(room["glimpsed"]))}
+        values |= {name.title(): ("IfcReal", float(room[name])) for name in ROOM_ODDS}
+        properties = [self._create_property(name, kind, value) for name, (kind, value) in values.items()]
         self._define(space, self._set("IfcPropertySet", "Topomerge_Room", r, HasProperties=properties))
         return space
 

@@ -304,7 +304,7 @@ def _add_tree(
             used[at] = used.get(at, 0) + 1
             if used[at] > 1:
                 break
-    for start in [*(pixel for pixel, ways in used.items() if ways > 1), *far]:
+    for start in [*(pixel for pixel, count in used.items() if count > 1), *far]:
         chain = [start]
         while chain[-1] != root and (len(chain) == 1 or (used.get(chain[-1], 0) < 2 and chain[-1] not in nodes)):
             chain.append(parent[chain[-1]])
