@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 # Advice of the readers that only `extract` can take: --scale and --poses of `merge` are others.
 EXTRACT_ADVICE = ("--resolution", "--poses", "--topic", "--scale", "--spacing")
-LEAST_SIZE = {"fork": 500_000, "spawn": 5_000_000}  # bytes of a cloud, from which a process is worth it (docs/benchmarks.md)
+LEAST_SIZE = {"fork": 2_000_000, "spawn": 5_000_000}  # bytes of a cloud, from which a process is worth it (docs/benchmarks.md)
 COMPRESSION = {".laz": 6, ".e57": 2}  # of the bytes of a point, against PLY and LAS
 MEMORY_START, MEMORY_GROWTH = 600_000_000, 8  # bytes that extraction takes at most: to start with, and for each byte of the cloud
 WORKER_OPTIONS = ("voxel_size", "up", "unit", "one_frame", "sensor", "text", "tag_size", "verbose")
