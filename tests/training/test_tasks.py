@@ -183,8 +183,11 @@ def read(task: str) -> Any:
     }[task]()
 
 
+TASK_NAMES = [*NETWORKS, *FITS]  # that of grids is the job of that of plans, with other weights
+
+
 @pytest.mark.longer
-@pytest.mark.parametrize("task", [*NETWORKS, *FITS])
+@pytest.mark.parametrize("task", [pytest.param(t, marks=[pytest.mark.slow] * (t == "grid_segmentation")) for t in TASK_NAMES])
 def test_a_task_is_trained_exported_read_and_judged(task, words, tmp_path, monkeypatch) -> None:
     shipped = read(task)
     scores = train(compose_settings(words(task, f"export={tmp_path / 'exported'}")), quiet)
