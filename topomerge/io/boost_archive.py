@@ -1,8 +1,8 @@
 """Binary archives of Boost.Serialization, read and written by a description of their classes.
 
 The members of an object stand in their order, without names. Where a class comes first, it is told whether its objects are
-counted, and in which version. An object behind a pointer has the number of its class, and is written where it is first met. So all
-that comes before a thing has to be known to read it. Source: `basic_oarchive.cpp` of Boost.Serialization (tried: 1.74).
+counted, and in which version. An object behind a pointer has the number of its class, and is written where it is first met. So
+all that comes before a thing has to be known to read it. Source: `basic_oarchive.cpp` of Boost.Serialization (tried: 1.74).
 """
 
 from __future__ import annotations
