@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from topomerge.errors import InputError
-from topomerge.io.karto import SCAN, WHOLE, build_planar_pose, get_pose, parse_karto_graph, read_karto_graph, write_archive
+from topomerge.io.boost_archive import write_archive
+from topomerge.io.karto import SCAN, WHOLE, build_planar_pose, get_pose, parse_karto_graph, read_karto_graph
 from topomerge.io.native import NATIVE, Doubt, Motion, Source, find_format, plan_outputs, save_joined
 from topomerge.io.points import read_points
 from topomerge.types import transform_points

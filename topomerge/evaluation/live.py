@@ -126,7 +126,8 @@ def judge_event(event: Row, robots: Sequence[tuple[str, int, Sim3, Any]]) -> Row
     told = Sim3(float(np.arctan2(matrix[1, 0], matrix[0, 0])), tuple(matrix[:3, 3].tolist()))
     middle = np.mean([pose[:3, 3] for _, pose, _ in scans_b], axis=0)[None]
     away = float(np.linalg.norm(told.apply(middle) - true.apply(middle)))
-    return {**row, "away": away, "right": one == two and away < RIGHT[0] and abs(wrap_yaw(told.yaw - true.yaw)) < RIGHT[1]}
+    right = one == two and away < RIGHT[0] and abs(wrap_yaw(told.yaw - true.yaw)) < RIGHT[1]
+    return {**row, "away": away, "right": bool(right)}
 
 
 def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:

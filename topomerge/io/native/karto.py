@@ -15,18 +15,16 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
+from topomerge.io.boost_archive import BinaryArchive, Members, write_archive
 from topomerge.io.karto import (
     LAYOUTS,
     SCAN,
     WHOLE,
-    BinaryArchive,
     KartoGraph,
-    Members,
     build_planar_pose,
     get_pose,
     parse_karto_graph,
     read_karto_graph,
-    write_archive,
 )
 from topomerge.io.native import NATIVE, Doubt, Motion, Source, Tally, find_nearest_links
 from topomerge.types import Array
@@ -58,7 +56,7 @@ def find_group(path: Path) -> str:
 
 
 def _find_layout(graph: KartoGraph) -> int:
-    return [layout["Graph"] for layout in LAYOUTS].index(graph.archives[0].layout["Graph"])
+    return [layout.classes["Graph"] for layout in LAYOUTS].index(graph.archives[0].layout.classes["Graph"])
 
 
 def _parse_whole(path: Path, files: Sequence[bytes]) -> KartoGraph:
