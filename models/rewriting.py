@@ -58,7 +58,7 @@ class GraphRewriter:
     def replace_nodes(self, step: Callable[[Any], bool]) -> None:
         """Offer each node to a step."""
         nodes = list(self.graph.node)
-        self.producer = {name: node for node in nodes for name in node.output}
+        self.producer: dict[str, Any] = {name: node for node in nodes for name in node.output}
         self.users: dict[str, list[Any]] = defaultdict(list)
         for node in nodes:
             for name in node.input:
@@ -107,7 +107,9 @@ class GraphRewriter:
     def split_enlarged(self, node: Any) -> bool:
         """The convolution of 3 x 3 of what was enlarged beside something else, and what only each element decides after it."""
         joined = self._find_source(node.input[0], "Concat") if node.op_type == "Conv" else None
-        enlarged = self._find_source(joined.input[0], "Resize") if joined is not None and len(joined.input) == 2 else None
+        if joined is None or len(joined.input) != 2:
+            return False
+        enlarged = self._find_source(joined.input[0], "Resize")
         if (
             enlarged is None
             or list(self.constants[enlarged.input[2]].floats) != [1, 1, 2, 2]

@@ -15,6 +15,7 @@ from topomerge.extraction.cleaning import add_means, coarsen_until_dense, comput
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.slices import raise_slice
 from topomerge.extraction.voxels import LatticeCells, voxelise
+from topomerge.kernels import stencil
 from topomerge.kernels import voxels as kernel
 from topomerge.types import PointCloud, VoxelGrid
 
@@ -152,13 +153,13 @@ def test_sums_in_cubes_are_those_of_numpy():
     points = np.random.default_rng(7).normal(0, 2, (3000, 3))
     points[:3] *= 1e7
     cubes = np.floor(points / 0.7)
-    near = (np.abs(cubes) < kernel.CUBE_LIMIT).all(axis=1)
+    near = (np.abs(cubes) < stencil.CUBE_LIMIT).all(axis=1)
     _, of, number = np.unique(cubes[near], axis=0, return_inverse=True, return_counts=True)
     at = points[near] - (cubes[near] + 0.5) * 0.7
     columns = [np.bincount(of.ravel(), at[:, i]) for i in range(3)]
-    columns += [np.bincount(of.ravel(), at[:, i] * at[:, j]) for i, j in kernel.MOMENTS]
-    assert near.sum() == 2997 and np.array_equal(kernel.sum_in_cubes(points, 0.7), np.column_stack([number, *columns]))
-    assert kernel.sum_in_cubes(np.zeros((0, 3)), 0.4).shape == (0, 10)
+    columns += [np.bincount(of.ravel(), at[:, i] * at[:, j]) for i, j in stencil.MOMENTS]
+    assert near.sum() == 2997 and np.array_equal(stencil.sum_in_cubes(points, 0.7), np.column_stack([number, *columns]))
+    assert stencil.sum_in_cubes(np.zeros((0, 3)), 0.4).shape == (0, 10)
 
 
 def test_shift_moves_the_origin_exactly():

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from topomerge.kernels.voxels import MOMENTS, sum_in_cubes
+from topomerge.kernels.stencil import MOMENTS, sum_in_cubes
 from topomerge.types import Array, PointCloud, VoxelGrid, transform_landmarks, transform_points
 
 # Which way is up in a cloud: the normals of its floors and ceilings say so, and its walls are the witnesses (beyond the thesis).

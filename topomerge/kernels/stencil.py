@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
+from numba import njit, uint64
 from numpy.typing import NDArray
 
 from topomerge.kernels import compile_ahead, run_in_slices
@@ -144,3 +144,49 @@ def vote(bricks: Arrays2, cells: NDArray[Any], stencil: Arrays2, labels: NDArray
     out = np.empty(len(cells), np.int64)
     run_in_slices(_vote, len(cells), LEAST_CELLS, *bricks, cells, *stencil, labels, out)
     return out
+
+
+CUBE_LIMIT = 1 << 20  # cubes to each side of the origin that have codes
+HASH_MULTIPLIER, HASH_SHIFT = uint64(0x9E3779B97F4A7C15), uint64(32)  # Knuth's
+MOMENTS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # pairs of axes
+
+
+@compile_ahead("f8[:,::1], f8, i4[::1], i8[::1], f8[:,::1]", error_model="numpy")
+def _sum_in_cubes(points, edge, slots, codes, sums):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    last, count = uint64(len(slots) - 1), 0
+    for i in range(len(points)):
+        cx, cy, cz = np.floor(points[i, 0] / edge), np.floor(points[i, 1] / edge), np.floor(points[i, 2] / edge)
+        if not (abs(cx) < CUBE_LIMIT and abs(cy) < CUBE_LIMIT and abs(cz) < CUBE_LIMIT):
+            continue
+        code = (np.int64(cx) + CUBE_LIMIT) << 42 | (np.int64(cy) + CUBE_LIMIT) << 21 | (np.int64(cz) + CUBE_LIMIT)
+        at = ((uint64(code) * HASH_MULTIPLIER) >> HASH_SHIFT) & last
+        while slots[at] >= 0 and codes[slots[at]] != code:
+            at = (at + uint64(1)) & last
+        row = slots[at]
+        if row < 0:
+            row = slots[at] = count
+            codes[row] = code
+            for k in range(10):
+                sums[row, k] = 0.0
+            count += 1
+        x, y, z = points[i, 0] - (cx + 0.5) * edge, points[i, 1] - (cy + 0.5) * edge, points[i, 2] - (cz + 0.5) * edge
+        sums[row, 0] += 1.0
+        sums[row, 1] += x
+        sums[row, 2] += y
+        sums[row, 3] += z
+        sums[row, 4] += x * x
+        sums[row, 5] += x * y
+        sums[row, 6] += x * z
+        sums[row, 7] += y * y
+        sums[row, 8] += y * z
+        sums[row, 9] += z * z
+    return count
+
+
+def sum_in_cubes(points: NDArray[np.float64], edge: float) -> NDArray[np.float64]:
+    """Return (n, 10) of each cube of space that holds points (N, 3), by place: their number, the sums of their places from its
+    middle, and those of the products of `MOMENTS`. Points farther than a million cubes from the origin are left out."""
+    slots = np.full(1 << max(2 * len(points) - 1, 1).bit_length(), -1, np.int32)
+    codes, sums = np.empty(len(points), np.int64), np.empty((len(points), 10))
+    count = int(_sum_in_cubes(np.ascontiguousarray(points, np.float64), edge, slots, codes, sums))
+    return sums[:count][np.argsort(codes[:count])]
