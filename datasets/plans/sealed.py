@@ -1,9 +1,10 @@
 """The sealed set: what no script of training, fitting, choosing or looking may read, and the one gate to it.
 
 `splits/sealed.txt` lists seeds of procedural buildings, files of real data that nothing here was made or judged by, and buildings
-of published sets that nobody here has. A line seals a building and all that lies below its name; a line that begins with "-" takes
-out what was looked at below a sealed name, whatever a file of it ends in. Whatever reads plans, grids, published sets or makes procedural buildings asks `refuse_building` or `refuse_file` first; both let pass what is asked
-within `open_sealed_set` only, which `topomerge/evaluation/sealed.py` alone enters (a test reads the sources), once a release.
+of published sets that nobody here has. A line seals a building and all that lies below its name; one that begins with "-" takes
+out a file that was looked at, whatever it ends in. Whatever reads plans, grids, published sets or makes procedural buildings asks
+`refuse_building` or `refuse_file` first; both let pass what is asked within `open_sealed_set` only, which
+`topomerge/evaluation/sealed.py` alone enters (a test reads the sources), once a release.
 
 What is outside cannot be held: a person who opens a sealed file with a program of their own (``topomerge extract`` among them)
 has looked at it.
@@ -64,7 +65,7 @@ def is_sealed(source: str, name: str) -> bool:
     if source == "procedural":
         return name.isdecimal() and first <= int(name) <= last
     parts = name.split("/")
-    if any(f"-{source}/{seen}" in names for seen in (name, name.rpartition(".")[0], name.rpartition(".")[0].removesuffix("_pgm"))):
+    if any(f"-{source}/{file.removesuffix('_pgm')}" in names for file in (name, name.rpartition(".")[0])):
         return False
     return source in whole or any(f"{source}/{'/'.join(parts[:k])}" in names for k in range(1, len(parts) + 1))
 
@@ -75,7 +76,7 @@ def is_sealed_file(path: str | Path) -> bool:
     for source, folders in SEALED_FOLDERS.items():
         for k in (k for k, part in enumerate(parts) if part in folders):
             below = "/".join(parts[k + 1 :])
-            if is_sealed(source, below):
+            if is_sealed(source, below) or is_sealed(source, below.rpartition(".")[0]):
                 return True
     return False
 

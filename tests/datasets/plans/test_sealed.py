@@ -132,6 +132,16 @@ def test_grids_are_refused(tmp_path: Path) -> None:
         look.make_scan(case, tmp_path)
 
 
+def test_what_was_looked_at_is_no_longer_sealed() -> None:
+    for name in ("home_f", "home_f.yaml", "EX1.png", "EX1_pgm.png", "movecare_map1.yaml"):
+        assert not sealed.is_sealed("strands", f"Giraff/{name}")
+        assert not sealed.is_sealed_file(f"/data/grids_rose2_homes_strands/Giraff/{name}")
+    for name in ("home_g", "home_g.png", "EX2_pgm.png", "EX1_other.png"):
+        assert sealed.is_sealed("strands", f"Giraff/{name}")
+        assert sealed.is_sealed_file(f"/data/grids_rose2_homes_strands/Giraff/{name}")
+    assert sealed.is_sealed_file("/data/utexas_amrl_vectormaps/AHG1.json")  # the stem of a file, too
+
+
 def test_published_sets_are_refused(tmp_path: Path) -> None:
     for area in ("Area_5", "Area_6"):
         (tmp_path / area).mkdir()
