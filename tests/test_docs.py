@@ -22,7 +22,7 @@ from topomerge.cli.main import COMMANDS, EXIT_STATUSES
 from topomerge.cli.main import main as cli
 
 QUICK = ("cli.md",)  # pages whose examples need no scans; those of all others are slow
-LONGER = ("extend.md",)  # run by every change all the same
+LONGER = ("extend.md", "training.md")  # run by every change all the same
 NEW = r"\*\*One (?:file|YAML)\*\*, `([^`]+)`"  # what a reader of extend.md adds
 
 
