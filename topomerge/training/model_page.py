@@ -63,8 +63,8 @@ def write_model_page(runs: str | Path, page: str | Path) -> Path:
             f"{runs}: holds no run called experiment=NAME,seed=N; train with python train.py -m experiment=... seed=0,1"
         )
     if len(sets) > 1:
-        first, second = list(sets.values())[:2]
-        raise InputError(f"{runs}: {first.name} and {second.name} learned from, or watched, other pairs; train them on the same")
+        one, other = list(sets.values())[:2]
+        raise InputError(f"{runs}: {one.name} and {other.name} learned from, or watched, other pairs; train them on the same")
     (example,) = sets.values()
     data = read_run(example).get("data", {})
     names = {key: data.get(key, {}).get("name", "?") for key in ("data", "validation")}
