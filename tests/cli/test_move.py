@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from tests.cli import test_merge_points
 from tests.cli.test_merge_points import BENDS, Run, run
+from tests.io import test_karto
 from tests.io.test_native import PLANE, quaternions, random_poses, write_lines
 from tests.io.test_native_rtabmap import poses_of, write_session
 from tests.samples import box_points, write_ply
@@ -18,6 +20,7 @@ from topomerge.cli.main import main as cli
 from topomerge.fusion.frames import LEAST_DOUBT, read_file_frames
 from topomerge.io.maps import save_map
 from topomerge.io.native.pose_graph import read_pose_graph
+from topomerge.io.points import read_points
 from topomerge.io.trajectory import read_trajectory
 from topomerge.types import Array, Deformation, Placement, Sim3
 
@@ -49,6 +52,20 @@ def test_a_merge_writes_one_database(run: Run, tmp_path: Path) -> None:
     count = max(first)
     np.testing.assert_allclose(joined[1], first[1], atol=1e-7)
     np.testing.assert_allclose(joined[1 + count], NEAR.matrix @ first[1], rtol=0, atol=1e-6)
+
+
+def test_a_merge_writes_one_pose_graph_of_slam_toolbox(run: Run, tmp_path: Path) -> None:
+    with zipfile.ZipFile(Path(test_karto.__file__).parent / "karto_archives.zip") as archive:
+        for name in "ab":
+            for suffix in ("posegraph", "data"):
+                (tmp_path / f"{name}.{suffix}").write_bytes(archive.read(f"room.{suffix}"))
+    status, out, _ = run("a.posegraph", "b.posegraph", "-o", "merged", "--native", "--rigid")
+    assert status == 0 and "a.posegraph + b.posegraph" in out and (tmp_path / "merged/joined.data").is_file()
+    one, both = (read_points(tmp_path / name) for name in ("a.posegraph", "merged/joined.posegraph"))
+    assert one.poses is not None and both.poses is not None and len(both.poses) == 2 * len(one.poses)
+    moved = NEAR.apply(one.poses[:, :3, 3])
+    np.testing.assert_allclose(both.poses[: len(one.poses)], one.poses, atol=1e-9)
+    np.testing.assert_allclose(both.poses[len(one.poses) :, :2, 3], moved[:, :2], atol=1e-9)
 
 
 def test_mixed_formats_each_in_its_own(run: Run, tmp_path: Path) -> None:
