@@ -69,7 +69,7 @@ def test_the_probabilities_are_in_the_file(open_plan: TopometricMap, tmp_path: P
 
 def test_zones_are_numbered_room_by_room(open_plan: TopometricMap) -> None:
     areas, narrows = np.zeros(5, AREA_DTYPE), np.zeros(3, EDGE_DTYPE)
-    narrows["rooms"], narrows["confidence"] = [(0, 2), (1, 2), (1, 3)], [0.6, 0.2, 0.1]
+    narrows["rooms"], narrows["confidence"] = [(0, 2), (1, 2), (1, 3)], [0.6, 0.3, 0.1]
     drawn = replace(open_plan, areas=areas, narrows=narrows, navigable_area=None)
     assert find_zones(drawn).tolist() == [0, 1, 2, 1, 3]
     assert find_zones(drawn, 0.2).tolist() == [0, 1, 1, 1, 2] and find_zones(drawn, 0.6).tolist() == [0, 0, 0, 0, 1]

@@ -38,7 +38,7 @@ class DefaultParameters(SharedParameters):
 
     door: float = 0.5  # narrowings of the floor that are doors with this probability part rooms
     slice_door: float = 0.65  # … in slices of a 2D laser: there neither lintels nor tops of furniture are seen
-    narrow: float = 0.1  # and with this one areas of a room: its zones (docs/adr/0047)
+    narrow: float = 0.2  # and with this one areas of a room: its zones (docs/adr/0047)
     walls: bool = True  # doors are looked for on walls, too: shut ones, and where open ones end (docs/adr/0018)
 
 

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from topomerge.extraction.plans.storey_plan import Merge
 from topomerge.types import Array, TopometricMap, select_lowest_of_column
 
-ZONE_LEVEL = 0.1  # up to this probability of a door between them two areas are one zone
+ZONE_LEVEL = 0.2  # up to this probability of a door between them two areas are one zone
 
 
 def compute_merge_levels(merges: Sequence[Merge], pairs: Array) -> Array:
