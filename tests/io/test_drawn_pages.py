@@ -19,7 +19,7 @@ from topomerge.io.drawing import (
     find_treads,
     parse_drawing,
 )
-from topomerge.io.drawn_page import DrawnPage, find_homography, find_page, move_places
+from topomerge.io.drawn_page import DrawnPage, compute_levels, find_homography, find_page, move_places
 from topomerge.io.drawn_storeys import find_storeys, parse_storey
 from topomerge.io.grid import build_drawn_pieces, read_picture
 from topomerge.io.piece import ReadOptions
@@ -362,3 +362,9 @@ def test_the_truth_of_a_page_is_measured_where_it_is_read():
     dark = cut.picture.mean(axis=2) < 60
     walls = ndimage.binary_dilation(np.isin(cut.classes, (2, 3)), iterations=2)
     assert walls[dark].mean() > 0.5 and cut.rooms.max() == drawing.rooms.max()
+
+
+def test_levels_are_means_to_the_bit() -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (40, 50, 3)).astype(np.uint8)
+    assert (compute_levels(picture) == picture.mean(axis=2).round()).all()
+    assert (compute_levels(np.full((1, 1, 3), 255, np.uint8)) == 255).all()

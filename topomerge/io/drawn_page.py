@@ -17,6 +17,7 @@ GREY_OF_UNKNOWN, GREY_WIDTH, GREY_SHARE = 205, 6, 0.03  # levels of 255: a robot
 LEAST_LIGHTER = 0.005  # of the pixels of a grid are floor; where none is lighter, the grey is that of paper
 UNKNOWN_BORDER = 0.1  # of the pixels along the border of a grid, at least, are unknown
 COLOURLESS = 8  # levels of 255 between red, green and blue
+COLOURED = 256  # in place of a level: none
 FEW_LEVELS, NEARLY_ALL = 3, 0.995  # a robot's grid has so many greys for so many of its pixels
 
 CLEAN_SHARE = 0.3  # of the pixels of a picture that a program drew are of one level
@@ -89,9 +90,10 @@ def find_page(picture: Array) -> DrawnPage | None:
 
 def is_robot_grid(picture: Array) -> bool:
     """Return whether a picture (h, w, 3) holds the grey of unknown of a robot's grid: along its border, or few others."""
-    levels = picture.mean(axis=2, dtype=np.float32).round().astype(np.int32)
-    levels[np.ptp(picture, axis=2) > COLOURLESS] = -1
-    histogram = np.bincount(levels.ravel() + 1, minlength=257)[1:] / levels.size
+    levels, (red, green, blue) = compute_levels(picture), np.moveaxis(picture, 2, 0)
+    spread = np.maximum(np.maximum(red, green), blue) - np.minimum(np.minimum(red, green), blue)
+    levels[spread > COLOURLESS] = COLOURED
+    histogram = np.bincount(levels.ravel(), minlength=257)[:256] / levels.size
     window = slice(GREY_OF_UNKNOWN - GREY_WIDTH, GREY_OF_UNKNOWN + GREY_WIDTH + 1)
     unknown = histogram[window]
     if unknown.sum() <= GREY_SHARE or unknown.max() <= 0.6 * unknown.sum() or histogram[window.stop :].sum() < LEAST_LIGHTER:
@@ -101,9 +103,19 @@ def is_robot_grid(picture: Array) -> bool:
     return bool(around > UNKNOWN_BORDER or has_few_levels(picture))
 
 
+def compute_levels(picture: Array) -> Array:
+    """(h, w) uint16, the mean of red, green and blue of a picture (h, w, 3) uint8, rounded: thirds are never halves."""
+    total = picture[..., 0].astype(np.uint16)
+    total += picture[..., 1]
+    total += picture[..., 2]
+    total += 1
+    total //= 3
+    return total
+
+
 def has_few_levels(picture: Array) -> bool:
     """Return whether a few colours are nearly all of a picture, as in a robot's grid."""
-    counts = np.sort(np.bincount(picture.reshape(-1, 3).mean(axis=1).round().astype(np.int64), minlength=256))[::-1]
+    counts = np.sort(np.bincount(compute_levels(picture).ravel(), minlength=256))[::-1]
     return bool(counts[:FEW_LEVELS].sum() >= NEARLY_ALL * counts.sum())
 
 
