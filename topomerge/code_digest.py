@@ -92,7 +92,7 @@ def find_data_files(path: Path, package: Path = HERE) -> list[Path]:
             inner = [p for p in entry.rglob("*") if p.is_file()]
             if not any(p.suffix in SKIPPED for p in inner):
                 files += [p for p in inner if entry.name in texts or p.name in texts]
-        elif entry.suffix not in SKIPPED and entry.name in texts:
+        elif entry.suffix not in SKIPPED and {entry.name, entry.name.replace(CARD, ".json")} & texts:  # with its card
             files.append(entry)
     for name in (text for text in texts if text.endswith(NETWORK)):
         network = package / NETWORKS / name
