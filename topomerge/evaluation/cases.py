@@ -220,8 +220,8 @@ def look() -> list[Case]:
     return [Case("by eye", "file", name) for name in LOOK]
 
 
-def marked() -> list[Case]:
-    """Grids on which places were told apart by eye: for development."""
+def list_marked() -> list[Case]:
+    """List grids on which places were told apart by eye: for development."""
     return [Case("marked by eye", "file", name) for name in MARKS]
 
 
@@ -234,7 +234,7 @@ def peers() -> list[Case]:
 
 GROUPS: dict[str, Callable[[], list[Case]]] = {f.__name__: f for f in (dev, simulate_scan, hard, plans, grids, ifc, pairs, look)}
 # "all" leaves these out: it holds their cases already, or they are for development.
-SELECTIONS: dict[str, Callable[[], list[Case]]] = {"peers": peers, "homes": homes, "marked": marked}
+SELECTIONS: dict[str, Callable[[], list[Case]]] = {"peers": peers, "homes": homes, "marked": list_marked}
 
 
 def select_cases(names: Iterable[str], limit: int | None = None) -> list[Case]:

@@ -127,12 +127,12 @@ def compute_gain(rows: Sequence[Row], others: Sequence[Row], metric: str, rounds
     both = [sum_counts(compared_rows, list_needed_counts(metric), buildings) for compared_rows in (rows, others)]
     counts = {(side, name): c for side, of in enumerate(both) for name, c in of.items()}
 
-    def better(c: Mapping[tuple[int, str], Array]) -> Array:
+    def subtract_sides(c: Mapping[tuple[int, str], Array]) -> Array:
         first, second = (measure(metric, {name: v for (s, name), v in c.items() if s == side}) for side in (0, 1))
         return first - second
 
-    held, low, high = _estimate_interval(counts, rounds, better)
-    ratio = float(better({key: c.sum() for key, c in counts.items()}))
+    held, low, high = _estimate_interval(counts, rounds, subtract_sides)
+    ratio = float(subtract_sides({key: c.sum() for key, c in counts.items()}))
     return Value(ratio, low, high, len({r["pair"] for r in rows}), len(buildings), held)
 
 

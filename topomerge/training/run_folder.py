@@ -56,7 +56,7 @@ def check_folder(folder: Path, settings: Mapping[str, Any]) -> None:
         InputError: such a folder, or one that can't be written.
     """
     if settings["resume"]:
-        differing = {k: v for k, v in _changes(folder, settings).items() if k.split(".")[0] not in MAY_CHANGE}
+        differing = {k: v for k, v in _find_changes(folder, settings).items() if k.split(".")[0] not in MAY_CHANGE}
         if differing:
             keys = ", ".join(f"{key} (was {was!r}, now {now!r})" for key, (was, now) in differing.items())
             raise InputError(f"{folder}: resume=true goes on with the settings of the run, but others are given: {keys}")
@@ -71,7 +71,7 @@ def check_folder(folder: Path, settings: Mapping[str, Any]) -> None:
         raise InputError(f"{folder}: can't be written ({error.strerror or error})") from error
 
 
-def _changes(folder: Path, settings: Mapping[str, Any]) -> dict[str, list[Any]]:
+def _find_changes(folder: Path, settings: Mapping[str, Any]) -> dict[str, list[Any]]:
     """What differs from the settings in the folder of a run."""
     try:
         before = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))
@@ -98,12 +98,12 @@ def record_start(folder: Path, settings: Mapping[str, Any], data: Mapping[str, A
         now = data.get(name, of)
         if of["sha256"] and now["sha256"] and of["sha256"] != now["sha256"]:
             raise InputError(f"{folder}: {name}={now['name']} holds other pairs than when the run began; start anew")
-    changes = _changes(folder, settings) if settings["resume"] else {}
+    changes = _find_changes(folder, settings) if settings["resume"] else {}
     start = {
         "began": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "command": read_command(),
         **dict(zip(("commit", "changed_sources"), read_commit(), strict=True)),
-        "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
+        "versions": {"python": platform.python_version(), **{name: _get_version(name) for name in PACKAGES}},
         "seed": settings["seed"],
         "threads": threads,
         "device": device,
@@ -115,7 +115,7 @@ def record_start(folder: Path, settings: Mapping[str, Any], data: Mapping[str, A
         temporary.write_text(json.dumps(convert_to_plain(record), indent=1) + "\n", encoding="utf-8")
 
 
-def _version(package: str) -> str:
+def _get_version(package: str) -> str:
     try:
         return version(package)
     except PackageNotFoundError:

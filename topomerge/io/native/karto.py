@@ -100,7 +100,7 @@ def _join_graphs(graphs: Sequence[KartoGraph], doubt: Doubt) -> int:
             _put_in(graph, first)
     links = 0
     for a, i, b, j in find_nearest_links(places):
-        _link(first, vertices[a][i], vertices[b][j], doubt)
+        _add_link(first, vertices[a][i], vertices[b][j], doubt)
         links += 1
     return links
 
@@ -154,7 +154,7 @@ def _extend(of: list[Any], entries: Sequence[Any], get_number: Any) -> None:
         of[get_number(entry)] = entry
 
 
-def _link(graph: KartoGraph, a: Members, b: Members, doubt: Doubt) -> None:
+def _add_link(graph: KartoGraph, a: Members, b: Members, doubt: Doubt) -> None:
     """Add a link between two scans, as Karto's LinkInfo: the covariance is that of the second one in the first one's frame."""
     ends = [get_pose(vertex["scan"]["pose"]) for vertex in (a, b)]
     relative = np.linalg.inv(build_planar_pose(*ends[0])) @ build_planar_pose(*ends[1])
