@@ -83,6 +83,7 @@ def find_reached_modules(*modules: str, package: Path = HERE) -> dict[str, Path]
     return dict(sorted(files.items()))
 
 
+@cache
 def find_data_files(path: Path, package: Path = HERE) -> list[Path]:
     """Data files that a module names, beside it, in a folder beside it, or among the networks; sorted."""
     texts = _read_source(path).texts
@@ -116,6 +117,7 @@ def _compute_hash(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:LENGTH]
 
 
+@cache
 def _find_module_file(module: str, package: Path) -> Path | None:
     """File of a module of the house; None of anything else, such as a function's name behind its module's."""
     top, *parts = module.split(".")

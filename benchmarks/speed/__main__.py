@@ -30,6 +30,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "networks": {"sides": (64,), "strip": 40, "squares": 2},
     "build_pairs": {"pairs": 2, "rooms": 4},
     "training": {"batches": (2,), "steps": 1},
+    "researcher": {"most": 1},
     "studio": {"rooms": [10]},
     "bags": {"gigabytes": [0.02], "spacing": 0.1},
 }
