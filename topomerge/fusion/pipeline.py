@@ -7,7 +7,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -403,16 +403,23 @@ def _propose_surface_poses(a: TopometricMap, b: TopometricMap, matching: Matchin
 
 
 class _TimedDescriptor:
-    """A descriptor whose seconds are those of embedding.
+    """A descriptor whose seconds are those of embedding. The one that ships is loaded when it is first asked.
 
     Args:
         scales: offer rows at other scales; where walls are searched, they find the scale in a tenth of the time.
     """
 
     def __init__(self, embedder: str | Descriptor, watch: Stopwatch, scales: bool) -> None:
-        self.describe, self.watch = make_embedder(embedder), watch
+        self.embedder, self.watch = embedder, watch
+        if embedder != DEFAULT or scales:
+            _ = self.describe  # says at once what is wrong with it
         if scales and hasattr(self.describe, "at_scales"):
             self.at_scales = self._at_scales
+
+    @cached_property
+    def describe(self) -> Descriptor:
+        """The descriptor itself."""
+        return make_embedder(self.embedder)
 
     def __call__(self, map: TopometricMap) -> Rows:
         with self.watch.measure("embed"):

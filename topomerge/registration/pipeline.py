@@ -133,7 +133,9 @@ def build_candidates(
     if scorer is not None:
         closely += [k for k in select_testified(ranked, scorer) if k not in closely]
     near = [ranked[k] for k in closely]
-    bent |= {id(h): build_candidate(a, b, h, scaled, scorer) for h in near if id(h) not in bent}
+    new = [h for h in near if id(h) not in bent]
+    built = run_side_by_side(lambda h: build_candidate(a, b, h, scaled, scorer), new)
+    bent |= {id(h): candidate for h, candidate in zip(new, built, strict=True)}
     examined = sorted((bent[id(h)] for h in near), key=lambda c: -c.odds)
     examined[0].features["repeats"] = float(count_repeats(ranked))  # asked of the best one only
     moved = [replace(c.hypothesis, transform=c.bend.transform) for c in examined]
