@@ -128,9 +128,7 @@ class InputMaps:
         prepares: let each process draw what registration needs of the map that it extracted (`LoadedMap.parts`).
     """
 
-    def __init__(
-        self, paths: Sequence[str], args: argparse.Namespace, ahead: Sequence[str] = (), prepares: bool = False
-    ) -> None:
+    def __init__(self, paths: Sequence[str], args: argparse.Namespace, ahead: Sequence[str] = (), prepares: bool = False) -> None:
         self._paths, self._ahead = list(paths), list(ahead)
         self._args = argparse.Namespace(**{**vars(args), "prepares": prepares})
         sizes = {path: measure_input(path) for path in paths if not is_map(path)}

@@ -165,7 +165,9 @@ def _merge(args: argparse.Namespace, inputs: InputMaps, folder: Path, files: Map
     choices = collect_given(args, "force", "rigid")
     poses = _read_decisions(maps, folder, args) or args.poses
     with ProgressBars(enabled=not args.quiet) as bars, report_steps(bars.start_task("merge")):
-        result = topomerge.merge(_take_prepared(loaded, maps), scale=args.scale_of_b, embedder=args.descriptor, poses=poses, **choices, **belief)
+        result = topomerge.merge(
+            _take_prepared(loaded, maps), scale=args.scale_of_b, embedder=args.descriptor, poses=poses, **choices, **belief
+        )
         tell_step(1.0, "write the files")
     seconds = {"read": sum(one.read_seconds for one in loaded), "extract": sum(one.extract_seconds for one in loaded)}
     result = replace(result, seconds={**result.seconds, **seconds})

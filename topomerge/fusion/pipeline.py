@@ -243,9 +243,7 @@ class MergeConfig(AtlasSettings):
     decided: Mapping[tuple[int, int], Sim3 | None] = field(default_factory=dict)
 
 
-def place_pair(
-    maps: Sequence[TopometricMap], config: MergeConfig, prepared: Sequence[Prepared | None] = ()
-) -> MergeResult:
+def place_pair(maps: Sequence[TopometricMap], config: MergeConfig, prepared: Sequence[Prepared | None] = ()) -> MergeResult:
     """Register two maps; where nothing is believed, matched rooms propose poses, too. Of those that are `prepared`, nothing is
     drawn again."""
     a, b = maps
