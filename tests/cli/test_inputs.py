@@ -103,6 +103,13 @@ def test_processes_start_before_the_maps_are_asked_for(clouds: list[str], began:
     assert not list_children()
 
 
+def test_what_registration_needs_is_drawn_where_a_map_is_extracted(clouds: list[str], began: list[str], method: str) -> None:
+    with inputs.InputMaps(clouds[:2], choose(2), prepares=True) as maps:
+        loaded = list(maps)
+    assert len(began) == 1 and all(one.parts is not None and one.parts["surface"] is not None for one in loaded)
+    assert all(one.parts is None for one in iter_input_maps(clouds[:2], choose(2)))
+
+
 def test_forked_processes_do_not_outlive_the_first(clouds: list[str]) -> None:
     """Each closes the ends of the others' pipes that it inherits: else it would wait for ever."""
     code = f"""

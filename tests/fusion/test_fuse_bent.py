@@ -12,7 +12,7 @@ import topomerge as tm
 from tests.fusion.atlas.atlas_scenes import office_map, truth
 from tests.types.test_deformation import deformation
 from topomerge.fusion.fuse import find_joined_rooms, fuse, match_common_rooms
-from topomerge.fusion.resampling import resample_cells
+from topomerge.fusion.resampling import _linearise, _linearise_places, resample_cells
 from topomerge.types import Array, Deformation, Placement, Sim3, TopometricMap, VoxelGrid
 
 POSE = Sim3(0.4, (1.23, 4.56, 0.03))
@@ -52,6 +52,17 @@ def test_a_bent_floor_has_no_holes(seed):
     laid = Placement(POSE, bent_by(seed)).transform_points(floor.compute_centroids())
     away = np.linalg.norm((np.array([-9.0, -9.0, 0.0]) + (cells + 0.5) * 0.1 - laid[rows])[:, :2], axis=1)
     assert away.max() < 0.1
+
+
+@pytest.mark.parametrize("spread", [40, 4000])
+def test_columns_of_one_storey_are_bent_once(spread):
+    """To the bit as cell by cell; cells that are far apart are no raster."""
+    at = np.random.default_rng(0).integers(0, (spread, spread, 25), (900, 3))
+    grid = VoxelGrid.from_cells(at, np.array([-5.0, 3.0, 0.1]), 0.1)
+    places = grid.compute_centroids(grid.cells)
+    once, each = _linearise(bent_by(1), grid.cells, places, grid), _linearise_places(bent_by(1), places, grid)
+    for one, other in zip(once, each, strict=True):
+        assert np.array_equal(one, other)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -17,7 +17,7 @@ import threading
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -40,8 +40,9 @@ EXTRACT_ADVICE = ("--resolution", "--poses", "--topic", "--scale", "--spacing")
 LEAST_SIZE = {"fork": 2_000_000, "spawn": 5_000_000}  # bytes of a cloud, from which a process is worth it (docs/benchmarks.md)
 COMPRESSION = {".laz": 6, ".e57": 2}  # of the bytes of a point, against PLY and LAS
 MEMORY_START, MEMORY_GROWTH = 600_000_000, 8  # bytes that extraction takes at most: to start with, and for each byte of the cloud
-WORKER_OPTIONS = ("voxel_size", "up", "unit", "one_frame", "sensor", "text", "tag_size", "verbose")
+WORKER_OPTIONS = ("voxel_size", "up", "unit", "one_frame", "sensor", "text", "tag_size", "verbose", "prepares")
 EXTRACTION_MODULES = ("topomerge.extraction.extract", "topomerge.io.points")
+PREPARATION_MODULE = "topomerge.registration.prepared"
 EXTRACTION_LOOPS = ("images", "rasters", "rays", "stencil", "voxels")  # of `topomerge.kernels`
 GRACE = 2.0  # s that a process has to end by itself
 Starter = Callable[[str], Report | None]  # title of a task -> what moves its bar
@@ -49,11 +50,13 @@ Starter = Callable[[str], Report | None]  # title of a task -> what moves its ba
 
 @dataclass(frozen=True)
 class LoadedMap:
-    """A map, and the seconds that reading (or loading) and extracting it took."""
+    """A map, the seconds that reading (or loading) and extracting it took, and what registration needs of it, where that was
+    drawn at once (`Prepared.pack`)."""
 
     map: TopometricMap
     read_seconds: float
     extract_seconds: float = 0.0
+    parts: Mapping[str, Any] | None = None
 
 
 def check_cloud_options(paths: Sequence[str], args: argparse.Namespace) -> None:
@@ -122,10 +125,12 @@ class InputMaps:
         paths: of the inputs.
         args: of the command.
         ahead: modules that the command needs afterwards; they are imported while another process works.
+        prepares: let each process draw what registration needs of the map that it extracted (`LoadedMap.parts`).
     """
 
-    def __init__(self, paths: Sequence[str], args: argparse.Namespace, ahead: Sequence[str] = ()) -> None:
-        self._paths, self._args, self._ahead = list(paths), args, list(ahead)
+    def __init__(self, paths: Sequence[str], args: argparse.Namespace, ahead: Sequence[str] = (), prepares: bool = False) -> None:
+        self._paths, self._ahead = list(paths), list(ahead)
+        self._args = argparse.Namespace(**{**vars(args), "prepares": prepares})
         sizes = {path: measure_input(path) for path in paths if not is_map(path)}
         self._large = {path for path, size in sizes.items() if size >= LEAST_SIZE[choose_start()]}
         large = [sizes[path] for path in self._large]
@@ -214,15 +219,24 @@ def _load_map(path: str, args: argparse.Namespace, start_task: Starter) -> Loade
             chunks = read_chunks(path, **collect_reading_options(path, args), progress=start_task("read"))
             topomap = extract(chunks, **collect_given(args, "voxel_size"), name=path, progress=start_task("extract"))
         topomap = replace(topomap, parameters={**topomap.parameters, **collect_given(args, "sensor")})
+        seconds = time.perf_counter() - began
+        parts = _prepare_map(topomap) if getattr(args, "prepares", False) and not is_map(path) else None
     except InputError as error:
         text = str(error) if path in str(error) else f"{path}: {error}"
         if advised := [name for name in EXTRACT_ADVICE if name in text]:
             text += f" ({', '.join(advised)}: of `topomerge extract`, whose .tmap can be given here)"
         raise InputError(text) from error
-    seconds, extracting = time.perf_counter() - began, 0.0
+    extracting, preparing = 0.0, time.perf_counter() - began - seconds
     if not is_map(path):
         extracting = min(sum(s for step, s in topomap.seconds.items() if not step.startswith("read")), seconds)
-    return LoadedMap(topomap, seconds - extracting, extracting)
+    return LoadedMap(topomap, seconds - extracting, extracting + preparing, parts)
+
+
+def _prepare_map(topomap: TopometricMap) -> Mapping[str, Any] | None:
+    """What registration needs of a map; None of one that has nothing to register, which registration says."""
+    from topomerge.registration.prepared import prepare
+
+    return prepare(topomap).pack() if len(topomap.grid) else None
 
 
 def measure_input(path: str) -> int:
@@ -299,7 +313,7 @@ class _Processes:
     def __enter__(self) -> _Processes:
         method = choose_start()
         if method == "fork":
-            _load_extraction()
+            _load_extraction(getattr(self._options, "prepares", False))
         with _hold_interrupts(method), warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # of forks beside threads: those of BLAS, which ends them before
             for _ in range(self._count):
@@ -394,11 +408,11 @@ def _hold_interrupts(method: str) -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _load_extraction() -> None:
-    """Import what extraction needs, and load its loops, which takes half as long again."""
+def _load_extraction(prepares: bool = False) -> None:
+    """Import what extraction needs (and drawing what registration needs), and load its loops, which takes half as long again."""
     from numba.core.sigutils import normalize_signature
 
-    for name in EXTRACTION_MODULES:
+    for name in (*EXTRACTION_MODULES, *([PREPARATION_MODULE] if prepares else [])):
         import_module(name)
     from topomerge.kernels.ahead import load_loops
 

@@ -49,7 +49,9 @@ from topomerge.progress import report_steps, tell_step
 if TYPE_CHECKING:
     import numpy as np
 
+    from topomerge.cli.inputs import LoadedMap
     from topomerge.fusion.result import MergeResult
+    from topomerge.registration.prepared import Prepared
     from topomerge.types import Sim3, TopometricMap
 
 
@@ -146,7 +148,7 @@ def run_merge(args: argparse.Namespace) -> int:
         instead = "a folder is one map; name the files in it" if Path(args.inputs[0]).is_dir() else "give another one"
         raise InputError(f"{args.inputs[0]}: merge takes two maps or more, 1 given; {instead}")
     check_inputs(args.inputs)
-    with InputMaps(args.inputs, args, MERGE_MODULES) as inputs, open_output_folder(args.output) as folder:
+    with InputMaps(args.inputs, args, MERGE_MODULES, len(args.inputs) == 2) as inputs, open_output_folder(args.output) as folder:
         files = choose_point_files(args.inputs, folder) if args.points else {}
         check_outputs([*(folder / name for name in MERGE_OUTPUTS), *files.values()], args.inputs)
         try:
@@ -163,7 +165,9 @@ def _merge(args: argparse.Namespace, inputs: InputMaps, folder: Path, files: Map
     choices = collect_given(args, "force", "rigid")
     poses = _read_decisions(maps, folder, args) or args.poses
     with ProgressBars(enabled=not args.quiet) as bars, report_steps(bars.start_task("merge")):
-        result = topomerge.merge(maps, scale=args.scale_of_b, embedder=args.descriptor, poses=poses, **choices, **belief)
+        result = topomerge.merge(
+            _take_prepared(loaded, maps), scale=args.scale_of_b, embedder=args.descriptor, poses=poses, **choices, **belief
+        )
         tell_step(1.0, "write the files")
     seconds = {"read": sum(one.read_seconds for one in loaded), "extract": sum(one.extract_seconds for one in loaded)}
     result = replace(result, seconds={**result.seconds, **seconds})
@@ -181,6 +185,13 @@ def _merge(args: argparse.Namespace, inputs: InputMaps, folder: Path, files: Map
     elif not result.merged:
         print_line(f"topomerge: {result.reason}", sys.stderr)
     return 0 if result.merged else 2
+
+
+def _take_prepared(loaded: Sequence[LoadedMap], maps: Sequence[TopometricMap]) -> list[TopometricMap | Prepared]:
+    """The maps, those of which everything is drawn with that."""
+    from topomerge.registration.prepared import unpack_prepared
+
+    return [map if one.parts is None else unpack_prepared(one.parts, map) for one, map in zip(loaded, maps, strict=True)]
 
 
 def _read_decisions(

@@ -65,10 +65,11 @@ def check_descriptor(args: argparse.Namespace) -> None:
     Raises:
         InputError: no.
     """
-    from topomerge.embedding.learned import build_embedder
+    from topomerge.embedding.learned import DEFAULT, build_embedder
 
     with name_option_in_errors("--descriptor"):
-        build_embedder(args.descriptor)
+        if args.descriptor != DEFAULT:  # which ships, and of two maps is asked for only where walls are not believed
+            build_embedder(args.descriptor)
     with name_option_in_errors("--k"):
         steps = getattr(args, "k", 0)
         if steps and args.descriptor == "learned":

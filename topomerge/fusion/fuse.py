@@ -42,6 +42,7 @@ from topomerge.fusion.transfer import (
     transform_windows,
     vote_rooms,
 )
+from topomerge.kernels import run_side_by_side
 from topomerge.kernels.voxels import OFFSET_STEPS
 from topomerge.matching.consistency import find_matches
 from topomerge.matching.room_plans import build_room_plans
@@ -90,8 +91,9 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
     for n in order:
         map = maps[poses[n][0]]
         first_room = sum(len(part.table) for part in laid)
-        cells.add_map(map, placements[n], int(first_bits[n]), first_room, parts[n].assumed and n != order[0])
-        floors.append((map, cells.place_floor(map, placements[n])))
+        placed = cells.place_cells(map, placements[n])
+        cells.add_map(map, placements[n], placed, int(first_bits[n]), first_room, parts[n].assumed and n != order[0])
+        floors.append((map, placed[2]))
         windows.append(transform_windows(map, placements[n]))
         laid.append(transform_part(map, placements[n]))
         if len(map.landmarks):
@@ -150,10 +152,30 @@ class _JoinedCells:
         self.means: Array = np.zeros((0, 3))
         self.points: Array = np.zeros(0)
 
-    def add_map(self, map: TopometricMap, placement: Placement, first_bit: int, first_room: int, assumed: bool) -> None:
-        """Add a map; of one whose heights were assumed only what no other saw."""
+    def place_cells(self, map: TopometricMap, placement: Placement) -> list[PlacedCells]:
+        """Return for the occupied, the free and the navigable cells of a map which cells (k, 3) of the lattice they fill, and the
+        row (k,) of one that does. The lattice of free cells is twice as wide."""
+        grids = (map.grid, self.edge), (map.free, 2 * self.edge), (map.navigable, self.edge)
+        none = np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
+
+        def place(asked: tuple[VoxelGrid | None, float]) -> PlacedCells:
+            grid, edge = asked
+            return none if grid is None else resample_cells(grid, placement, self.origin, edge)
+
+        return run_side_by_side(place, grids)
+
+    def add_map(
+        self,
+        map: TopometricMap,
+        placement: Placement,
+        placed: Sequence[PlacedCells],
+        first_bit: int,
+        first_room: int,
+        assumed: bool,
+    ) -> None:
+        """Add a map whose cells are placed; of one whose heights were assumed only what no other saw."""
         provenance = np.ones(len(map.grid), np.uint32) if map.provenance is None else map.provenance.astype(np.uint32)
-        cells, rows = resample_cells(map.grid, placement, self.origin, self.edge)
+        cells, rows = placed[0]
         provenance = provenance[rows] << np.uint32(first_bit)
         room = map.room[rows].astype(np.int64)
         room = np.where(room >= 0, room + first_room, -1)
@@ -161,7 +183,7 @@ class _JoinedCells:
         if assumed and len(cells):
             added = self._is_occupied(cells) | ~(self._is_surveyed(cells) | self._is_seen_through(cells))
             cells, provenance, room, means, points = cells[added], provenance[added], room[added], means[added], points[added]
-        free_cells = None if map.free is None else resample_cells(map.free, placement, self.origin, 2 * self.edge)[0]
+        free_cells = None if map.free is None else placed[1][0]
         if free_cells is not None and len(self.free_codes) and len(cells):
             occupied = decode_cells(self.codes)
             copy_of = find_wall_copies((occupied, decode_cells(self.free_codes)), (cells, free_cells), self.edge)
@@ -170,10 +192,6 @@ class _JoinedCells:
         self._add(cells, provenance, room, means, points)
         if free_cells is not None:
             self.free_codes = unite_codes(self.free_codes, encode_cells(free_cells))
-
-    def place_floor(self, map: TopometricMap, placement: Placement) -> PlacedCells:
-        """Return the cells (k, 3) of the lattice that the navigable cells of a map fill, and the row (k,) of one that does."""
-        return resample_cells(map.navigable, placement, self.origin, self.edge)
 
     def _add(self, cells: Array, provenance: Array, room: Array, means: Array, points: Array) -> None:
         before, new = len(self.codes), encode_cells(cells)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -41,7 +41,7 @@ from topomerge.progress import tell_step
 from topomerge.registration.bend.bend import NEITHER_BENDS
 from topomerge.registration.pipeline import FallbackProposals, Registration, register
 from topomerge.registration.posterior import POSTERIOR, WORDS, check_same, compute_evidence_limit, describe_posterior
-from topomerge.registration.prepared import compute_registration_order
+from topomerge.registration.prepared import Prepared, compute_registration_order
 from topomerge.registration.surfaces import check_open3d, estimate_room_poses
 from topomerge.types import Deformation, Sim3, TopometricMap
 
@@ -183,7 +183,7 @@ def _format_percent(share: float) -> str:
 
 @limit_blas_threads
 def merge(
-    maps: Sequence[TopometricMap | str | Path],
+    maps: Sequence[TopometricMap | str | Path | Prepared],
     *,
     scale: str = "fixed",
     force: bool = False,
@@ -196,7 +196,7 @@ def merge(
     """Bring maps together, or say why not. `merge([b, a])` gives the inverse transform.
 
     Args:
-        maps: topometric maps or `.tmap` files, two or more; `atlas` brings more than two together, as many as belong to the first
+        maps: topometric maps or `.tmap` files, two or more, or what `registration.prepared.prepare` made of them; `atlas` brings more than two together, as many as belong to the first
             one.
         scale: "fixed", or "free" where the scale of the second map is unknown.
         force: give the best transform and its joined map, too, where it is not believed; the status stays "abstained".
@@ -226,9 +226,10 @@ def merge(
     check_scale(scale)
     check_same(same)
     config = MergeConfig(scale, threshold, embedder, rigid, same, force, poses, decided)
-    loaded_maps = [load_input(map) for map in maps]
+    prepared = [map if isinstance(map, Prepared) else None for map in maps]
+    loaded_maps = [load_input(map.load() if isinstance(map, Prepared) else map) for map in maps]
     began = time.perf_counter()
-    placed = (place_pair if len(loaded_maps) == 2 else _place_set)(loaded_maps, config)
+    placed = place_pair(loaded_maps, config, prepared) if len(loaded_maps) == 2 else _place_set(loaded_maps, config)
     result = replace(_join(replace(placed, decided=decided)), descriptor=get_descriptor_name(embedder))
     return replace(result, seconds=_split_seconds(placed.seconds, time.perf_counter() - began))
 
@@ -242,8 +243,9 @@ class MergeConfig(AtlasSettings):
     decided: Mapping[tuple[int, int], Sim3 | None] = field(default_factory=dict)
 
 
-def place_pair(maps: Sequence[TopometricMap], config: MergeConfig) -> MergeResult:
-    """Register two maps; where nothing is believed, matched rooms propose poses, too."""
+def place_pair(maps: Sequence[TopometricMap], config: MergeConfig, prepared: Sequence[Prepared | None] = ()) -> MergeResult:
+    """Register two maps; where nothing is believed, matched rooms propose poses, too. Of those that are `prepared`, nothing is
+    drawn again."""
     a, b = maps
     check_pair(a, b, config.scale)
     threshold = resolve_threshold(config.threshold)
@@ -254,7 +256,8 @@ def place_pair(maps: Sequence[TopometricMap], config: MergeConfig) -> MergeResul
     proposals = FallbackProposals(partial(_propose_room_poses, a, b, config, describe), threshold if searched else np.inf)
     choices: dict[str, Any] = {"rigid": config.rigid or fixed is not None, "same": config.same}
     tried = proposals if fixed is None else [fixed]
-    registration = register(a, b, scale=config.scale, proposed=tried, searched=searched, **choices)
+    first, second = (known or map for map, known in zip(maps, prepared or (None, None), strict=True))
+    registration = register(first, second, scale=config.scale, proposed=tried, searched=searched, **choices)
     accepted = registration.transform is not None and registration.probability >= threshold
     if (0, 1) in config.decided:
         accepted = fixed is not None
@@ -398,16 +401,23 @@ def _propose_surface_poses(a: TopometricMap, b: TopometricMap, matching: Matchin
 
 
 class _TimedDescriptor:
-    """A descriptor whose seconds are those of embedding.
+    """A descriptor whose seconds are those of embedding. The one that ships is loaded when it is first asked.
 
     Args:
         scales: offer rows at other scales; where walls are searched, they find the scale in a tenth of the time.
     """
 
     def __init__(self, embedder: str | Descriptor, watch: Stopwatch, scales: bool) -> None:
-        self.describe, self.watch = make_embedder(embedder), watch
+        self.embedder, self.watch = embedder, watch
+        if embedder != DEFAULT or scales:
+            _ = self.describe  # says at once what is wrong with it
         if scales and hasattr(self.describe, "at_scales"):
             self.at_scales = self._at_scales
+
+    @cached_property
+    def describe(self) -> Descriptor:
+        """The descriptor itself."""
+        return make_embedder(self.embedder)
 
     def __call__(self, map: TopometricMap) -> Rows:
         with self.watch.measure("embed"):

@@ -25,6 +25,7 @@ CODE_OFFSET = 1 << 20  # cells are counted from there, as Morton codes hold no n
 COPY_REACH = 0.25  # m between a wall and its copy, at most
 AROUND = 8  # cells about the walls, of which free ones are asked for
 LEAST_CELLS = 4096  # that a thread looks at
+THINLY_SPREAD = 8  # columns of the cells' rectangle for each cell
 Seen = tuple[Array, Array]
 
 
@@ -57,7 +58,7 @@ def _find_filled_cells(grid: VoxelGrid, chosen: slice, placement: Placement, ori
     pose, ratio = placement.pose, placement.pose.scale * grid.edge / edge
     wide = ratio * _find_stretch(placement.bend) * np.sqrt(0.5) + pose.scale * _find_slant(placement.bend, grid.edge) / edge
     places = grid.compute_centroids(grid.cells[chosen])
-    bent, local = _linearise(placement.bend, places, grid)
+    bent, local = _linearise(placement.bend, grid.cells[chosen], places, grid)
     holding = np.floor((pose.apply(bent) - origin) / edge).astype(np.int64)  # the cells that the middles lie in
     back = pose.inverse().matrix
     matrix = np.column_stack([back[:3, :3] * edge, back[:3, :3] @ origin + back[:3, 3] - grid.origin]) / grid.edge
@@ -73,11 +74,22 @@ def _find_filled_cells(grid: VoxelGrid, chosen: slice, placement: Placement, ori
     return np.concatenate([cells, holding]), np.concatenate([rows, np.arange(len(holding))]) + chosen.start
 
 
-def _linearise(bend: Deformation | None, places: Array, grid: VoxelGrid) -> tuple[Array, Array]:
-    """Where bending moves the middles (n, 3) of cells of a grid, and the bending about them as `kernels.resample` wants it:
-    (n, 8), or (0, 8) where nothing is bent."""
+def _linearise(bend: Deformation | None, cells: Array, places: Array, grid: VoxelGrid) -> tuple[Array, Array]:
+    """Where bending moves the middles (n, 3) of cells (n, 3) of a grid, and the bending about them as `kernels.resample` wants
+    it: (n, 8), or (0, 8) where nothing is bent. Of one storey it is the same for all cells of a column, and computed once."""
     if bend is None:
         return places, np.zeros((0, 8))
+    if len(bend.fields) > 1:
+        return _linearise_places(bend, places, grid)
+    first, column = _find_columns(cells)
+    moved, local = _linearise_places(bend, places[first], grid)
+    bent = places.copy()
+    bent[:, :2] = moved[column, :2]
+    return bent, local[column]
+
+
+def _linearise_places(bend: Deformation, places: Array, grid: VoxelGrid) -> tuple[Array, Array]:
+    """`_linearise`, place by place."""
     bent = bend.apply(places)
     steps = np.eye(3) * JACOBIAN_STEP
     x, y, z = ((bend.apply(places + step) - bent)[:, :2] / JACOBIAN_STEP for step in steps)
@@ -85,6 +97,24 @@ def _linearise(bend: Deformation | None, places: Array, grid: VoxelGrid) -> tupl
     back = np.column_stack([y[:, 1], -y[:, 0], -x[:, 1], x[:, 0]]) / area[:, None]
     lean = np.column_stack([(back[:, 2 * k : 2 * k + 2] * z).sum(axis=1) for k in (0, 1)])
     return bent, np.column_stack([(bent - grid.origin)[:, :2] / grid.edge, back, lean])
+
+
+def _find_columns(cells: Array) -> tuple[Array, Array]:
+    """(c,) row of a cell (n, 3) of each column, and (n,) the column of each cell; each cell by itself where they are too thinly
+    spread for a raster."""
+    at = cells[:, :2].astype(np.int64)
+    at -= at.min(axis=0)
+    size = int(at[:, 0].max() + 1), int(at[:, 1].max() + 1)
+    rows = np.arange(len(cells))
+    if size[0] * size[1] > THINLY_SPREAD * len(cells):
+        return rows, rows
+    flat = at[:, 0] * size[1] + at[:, 1]
+    first = np.full(size[0] * size[1], -1)
+    first[flat] = rows
+    columns = np.flatnonzero(first >= 0)
+    number = np.zeros_like(first)
+    number[columns] = np.arange(len(columns))
+    return first[columns], number[flat]
 
 
 def _find_stretch(bend: Deformation | None) -> float:

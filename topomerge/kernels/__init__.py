@@ -14,7 +14,7 @@ import errno
 import os
 import stat
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,6 +25,7 @@ from topomerge.kernels.ahead import compile_ahead as compile_ahead
 from topomerge.kernels.ahead import compile_missing
 
 T = TypeVar("T")
+R = TypeVar("R")
 SLICES_A_THREAD = 4  # so that threads end at about the same time
 _threads = {"count": int(config.NUMBA_NUM_THREADS)}  # type: ignore[attr-defined]
 
@@ -52,6 +53,19 @@ def run_in_slices(function: Callable[..., T], count: int, least: int, *args: Any
     borders = [count * k // slices for k in range(slices + 1)]
     with ThreadPoolExecutor(min(slices, count_threads())) as pool:
         return list(pool.map(lambda first, last: function(first, last, *args), borders[:-1], borders[1:]))
+
+
+def run_side_by_side(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
+    """Return what the function gives for each item, on as many threads as loops have.
+
+    Args:
+        function: lets go of the interpreter for most of its time, as loops, large arrays and networks do. A batch of networks
+            takes longer than its plans one by one (docs/adr/0031).
+    """
+    if len(items) < 2 or count_threads() == 1:
+        return [function(item) for item in items]
+    with ThreadPoolExecutor(min(len(items), count_threads())) as pool:
+        return list(pool.map(function, items))
 
 
 def _probe() -> None: ...

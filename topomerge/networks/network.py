@@ -9,22 +9,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 import numpy as np
 
 from topomerge.archive import convert_to_plain, find_weights_file, replace_on_success
 from topomerge.errors import InputError, is_memory_short
-from topomerge.kernels import count_threads
 from topomerge.types import Array
 
-T = TypeVar("T")
-R = TypeVar("R")
 Dimension = int | str  # a number, or the name of what is counted
 
 
@@ -113,15 +109,6 @@ class Network:
         except Exception as error:  # ONNX Runtime has a dozen kinds
             raise _failure(self.path, "can't be run", error) from error
         return computed
-
-
-def run_side_by_side(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
-    """Return what the function gives for each item, on as many threads as loops have: each run of a network takes one and
-    lets go of the interpreter. A batch takes longer than its plans one by one (docs/adr/0031)."""
-    if len(items) < 2 or count_threads() == 1:
-        return [function(item) for item in items]
-    with ThreadPoolExecutor(min(len(items), count_threads())) as pool:
-        return list(pool.map(function, items))
 
 
 @lru_cache(maxsize=16)

@@ -15,6 +15,7 @@ import numpy as np
 from topomerge.blas import limit_blas_threads
 from topomerge.errors import InputError
 from topomerge.extraction.stopwatch import Stopwatch
+from topomerge.kernels import count_threads, run_side_by_side
 from topomerge.landmarks.evidence import LandmarkEvidence, LandmarkScorer
 from topomerge.landmarks.proposals import propose_poses
 from topomerge.matching.poses import PoseHypothesis, refine, select_distinct_hypotheses, wrap_yaw
@@ -132,7 +133,9 @@ def build_candidates(
     if scorer is not None:
         closely += [k for k in select_testified(ranked, scorer) if k not in closely]
     near = [ranked[k] for k in closely]
-    bent |= {id(h): build_candidate(a, b, h, scaled, scorer) for h in near if id(h) not in bent}
+    new = [h for h in near if id(h) not in bent]
+    built = run_side_by_side(lambda h: build_candidate(a, b, h, scaled, scorer), new)
+    bent |= {id(h): candidate for h, candidate in zip(new, built, strict=True)}
     examined = sorted((bent[id(h)] for h in near), key=lambda c: -c.odds)
     examined[0].features["repeats"] = float(count_repeats(ranked))  # asked of the best one only
     moved = [replace(c.hypothesis, transform=c.bend.transform) for c in examined]
@@ -219,7 +222,7 @@ def register(
         raise InputError(f"scale must be fixed or free, not {scale!r}")
     clock = Stopwatch()
     tell_step(0.0, "draw plans")
-    a, b = (m if isinstance(m, Prepared) else prepare(m, f) for m, f in zip((a, b), free, strict=True))
+    a, b = run_side_by_side(lambda k: _prepare_completely((a, b)[k], free[k]), (0, 1))
     clock.lap("plans")
     if b.order < a.order:  # so that nothing depends on which comes first
         poses = proposed.inverse() if isinstance(proposed, FallbackProposals) else _invert_poses(proposed)
@@ -240,6 +243,14 @@ def register(
         reason = "the maps show no walls that could be compared" if searched else "no two matched rooms could be aligned"
         return Registration(None, 0.0, False, reason=reason, seconds=clock.seconds)
     return replace(pair.build_registration(pair.verdict, rigid), seconds=clock.seconds)
+
+
+def _prepare_completely(map: Map | Prepared, free: VoxelGrid | None) -> Prepared:
+    """What registration needs of a map; where several threads share loops, drawn at once, beside the other map."""
+    if isinstance(map, Prepared):
+        return map
+    prepared = prepare(map, free)
+    return prepared.complete() if count_threads() > 1 else prepared
 
 
 class _Pair:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,10 @@ from topomerge.registration.storeys import build_plans
 from topomerge.types import Array, TopometricMap, VoxelGrid
 
 Map = TopometricMap | VoxelGrid
+SENT_COLUMNS = 8_000_000  # of the plans of a map: more are drawn where they are needed, and not sent from process to process
+BENDING_PARTS = ("pieces", "samples", "lines", "targets")
+RASTERS = ("kind", "to_wall", "field", "to_any", "core", "face", "walls", "directions", "tall", "hung", "profile")
+UNBENT = ("drawing", "raised")  # sensors whose maps mostly stay as they are
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +73,38 @@ class Prepared:
     def targets(self) -> tuple[Target, ...]:
         """The storeys, for pieces of other maps to be registered on."""
         return tuple(Target(s) for s in self.storeys)
+
+    def complete(self) -> Prepared:
+        """Draw what nearly every registration needs, and return the same object: in another process or thread, that is done for
+        both maps at once."""
+        for fields in self.storeys:
+            for name in RASTERS if len(fields.walls) else ():
+                getattr(fields, name)
+        if self.sensor not in UNBENT and len(self.pieces):
+            for name in BENDING_PARTS:
+                getattr(self, name)
+        if not any(fields.plan.sliced for fields in self.storeys):  # a slice has no planes
+            self.make_surface()
+        return self
+
+    def pack(self) -> dict[str, Any] | None:
+        """Return all that was drawn by `complete` without the map, as it is sent to another process; None of plans that are too
+        large for that."""
+        if sum(fields.plan.wall.size for fields in self.storeys) > SENT_COLUMNS:
+            return None
+        known = {name: value for name, value in vars(self.complete()).items() if name not in ("load", "make_surface")}
+        sliced = any(fields.plan.sliced for fields in self.storeys)
+        return {**known, "surface": None if sliced else self.make_surface()}
+
+
+def unpack_prepared(parts: Mapping[str, Any], map: Map) -> Prepared:
+    """Return what `Prepared.pack` sent, with the map it was drawn from."""
+    surface, grid = parts["surface"], get_grid(map)
+    make_surface = cache(lambda: build_surface(grid) if surface is None else surface)
+    names = ("storeys", "order", "middle", "sensor", "has_landmarks")
+    prepared = Prepared(load=lambda: map, make_surface=make_surface, **{name: parts[name] for name in names})
+    vars(prepared).update((name, parts[name]) for name in BENDING_PARTS if name in parts)
+    return prepared
 
 
 def prepare(map: Map, free: VoxelGrid | None = None) -> Prepared:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.special import betaln
 
 from topomerge.archive import read_weights_json
+from topomerge.kernels import run_side_by_side
 from topomerge.landmarks.evidence import LandmarkEvidence
 from topomerge.matching.poses import PoseHypothesis, PoseTolerance, select_distinct_hypotheses
 from topomerge.registration.judge import Judge
@@ -281,10 +282,10 @@ def rank(hypotheses: Sequence[PoseHypothesis], judge: Judge, ranked: Sequence[Po
     """
     lifted = [replace(h, transform=judge.lift_pose(h.transform)) for h in hypotheses]
     if len(lifted) > JUDGED_FULLY:
-        lifted.sort(key=lambda h: -score_plausibility(judge(h.transform, GLANCE_STEP)))
-    judged = list(ranked)
-    for hypothesis in lifted[:JUDGED_FULLY]:
-        features = judge(hypothesis.transform)
-        judged.append(replace(hypothesis, features=features, score=score_plausibility(features)))
+        glances = run_side_by_side(lambda h: score_plausibility(judge(h.transform, GLANCE_STEP)), lifted)
+        lifted = [lifted[k] for k in sorted(range(len(lifted)), key=lambda k: -glances[k])]
+    closely = lifted[:JUDGED_FULLY]
+    features = run_side_by_side(lambda h: judge(h.transform), closely)
+    judged = [*ranked, *(replace(h, features=f, score=score_plausibility(f)) for h, f in zip(closely, features, strict=True))]
     judged.sort(key=lambda h: -h.score)
     return select_distinct_hypotheses(judged, np.append(judge.b[0].middle, 0.0), BASIN)

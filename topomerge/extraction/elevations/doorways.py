@@ -22,7 +22,8 @@ from topomerge.extraction.elevations.elevation import (
     compute_place_probabilities,
     weights,
 )
-from topomerge.networks.network import Run, run_side_by_side
+from topomerge.kernels import run_side_by_side
+from topomerge.networks.network import Run
 from topomerge.types import Array
 
 DOOR_CHANCE, LIKELY_DOOR = 0.35, 0.5  # probability of a door of every place of a doorway, and of one of them

@@ -14,7 +14,8 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES, INSIDE_CLASS, StoreyPlan
-from topomerge.networks.network import Network, Run, Signature, Tensor, load_network, load_shipped_network, run_side_by_side
+from topomerge.kernels import run_side_by_side
+from topomerge.networks.network import Network, Run, Signature, Tensor, load_network, load_shipped_network
 from topomerge.types import Array
 
 PLAN_NETWORK_FILE = "plan_network.onnx"

@@ -79,7 +79,8 @@ def _build_storey_pieces(fields: PlanFields, number: int, rooms: Array | None) -
         whole = WHOLE_SIZE if r >= 0 else PIECE_SIZE
         count = np.where(span <= whole, 1, np.ceil(span / PIECE_SIZE))
         block[rows] = np.minimum((turned[rows] - low) / np.maximum(span, 1e-6) * count, count - 1).astype(np.int64)
-    _, owner = np.unique(np.column_stack([room, block]), axis=0, return_inverse=True)
+    blocks = block.max(axis=0) + 1
+    _, owner = np.unique(((room.astype(np.int64) + 1) * blocks[0] + block[:, 0]) * blocks[1] + block[:, 1], return_inverse=True)
     owner = _merge_small_pieces(walls, owner)
     many = int(owner.max()) + 1
     count = np.bincount(owner, minlength=many)
@@ -104,9 +105,10 @@ def _merge_small_pieces(walls: Array, owner: Array) -> Array:
 def _find_joints(walls: Array, owner: Array, anchors: Array) -> tuple[Array, Array]:
     """Pieces whose walls come near each other, and how far their middles lie apart, m."""
     near = cKDTree(walls).query_pairs(1.0, output_type="ndarray")
-    ends = np.sort(owner[near], axis=1)
-    ends, many = np.unique(ends[ends[:, 0] != ends[:, 1]], axis=0, return_counts=True)
-    joints = ends[many >= 3].reshape(-1, 2)
+    ends = owner[near]
+    ends = ends[ends[:, 0] != ends[:, 1]]
+    pairs, many = np.unique(ends.min(axis=1) * len(anchors) + ends.max(axis=1), return_counts=True)
+    joints = np.column_stack(np.divmod(pairs[many >= 3], len(anchors)))
     joints = np.concatenate([joints, _find_bridges(joints, anchors)])
     return joints, np.linalg.norm(anchors[joints[:, 0]] - anchors[joints[:, 1]], axis=1)
 
