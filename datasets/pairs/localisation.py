@@ -31,9 +31,14 @@ from topomerge.io.maps import save_map
 from topomerge.types import Array, PointCloud, Sim3
 
 SCANS = ("station", "sweep", "slice", "frame", "walk")
+MORE_SCANS = ("turn", "drive")  # what helps where a frame or a slice tells nothing; the odds are not fitted to them
 SENSOR_OF = {"station": "tls", "sweep": "lidar", "slice": "laser2d", "frame": "depth", "walk": "depth"}
+SENSOR_OF |= {"turn": "depth", "drive": "laser2d"}
 RAYS_OF = {"station": 60_000, "sweep": 32_000, "slice": 1080, "frame": 30_000, "walk": 12_000}  # a pose
-WALK_LENGTH = 5.0  # m
+RAYS_OF |= {"turn": 12_000, "drive": 1080}
+TURNS = 8  # frames of a turn
+WALK_LENGTH = 5.0  # m, of a walk and of a drive
+WALKED = ("walk", "drive")
 SHORTEST = 0.8  # of it, that a walk must have
 
 
@@ -57,7 +62,7 @@ class SingleScan:
 def simulate_single_scan(
     building: Building, kind: str, rooms: Sequence[int], rng: np.random.Generator, frame: Sim3
 ) -> SingleScan:
-    """Simulate a scan of a kind of `SCANS` that begins in one of some rooms.
+    """Simulate a scan of a kind of `SCANS` or `MORE_SCANS` that begins in one of some rooms.
 
     Args:
         building: as it stands at the time of the scan (`simulate_session`).
@@ -67,10 +72,10 @@ def simulate_single_scan(
     Raises:
         InputError: an unknown kind, or rooms in which nobody can stand.
     """
-    if kind not in SCANS:
-        raise InputError(f"kind of scan {kind!r}: {', '.join(SCANS)} are possible")
+    if kind not in SENSOR_OF:
+        raise InputError(f"kind of scan {kind!r}: {', '.join(SENSOR_OF)} are possible")
     sensor, start = get_sensor(SENSOR_OF[kind]), int(rng.choice(list(rooms)))
-    walk = plan_walk(building, list(rooms) if kind == "walk" else [start], rng, 0.0)
+    walk = plan_walk(building, list(rooms) if kind in WALKED else [start], rng, 0.0)
     poses = _choose_walk_poses(walk, kind, start, rng)
     points, pose_of = scan_from_poses(building, sensor, poses, RAYS_OF[kind], rng)
     if not len(points):
@@ -83,15 +88,15 @@ def simulate_single_scan(
 
 
 def _choose_walk_poses(walk: Walk, kind: str, room: int, rng: np.random.Generator) -> Array:
-    """(K, 4, 4) of the sensor: one in the room, looking anywhere; or those along `WALK_LENGTH` from there."""
+    """(K, 4, 4) of the sensor: one in the room, looking anywhere, or all around; or those along `WALK_LENGTH` from there."""
     sensor = get_sensor(SENSOR_OF[kind])
     inside = np.flatnonzero(walk.free & (walk.room == room))
     if not len(inside):
         raise InputError(f"nobody can stand in room {room}")
     at = int(rng.choice(inside))
-    if kind != "walk":
+    if kind not in WALKED:
         still = Walk(walk.points[at : at + 1], walk.room[at : at + 1], np.zeros(1, np.int64), np.ones(1, bool))
-        return simulate_sensor_poses(still, replace(sensor, step=0.0, turns=1), [room], rng)[0]
+        return simulate_sensor_poses(still, replace(sensor, step=0.0, turns=TURNS if kind == "turn" else 1), [room], rng)[0]
     long_enough = inside[walk.along[-1] - walk.along[inside] >= SHORTEST * WALK_LENGTH]
     at = int(rng.choice(long_enough)) if len(long_enough) else 0
     end = int(np.searchsorted(walk.along, walk.along[at] + WALK_LENGTH)) + 1
@@ -139,7 +144,7 @@ def make_located_scan(split: str, number: int, kind: str, stranger: bool) -> Sin
     """Make a scan of the building of a map, or of one without a map."""
     building, rooms, _ = draw_building(split, number, stranger)
     for attempt in range(10):
-        rng = np.random.default_rng([number, SCANS.index(kind), int(stranger), attempt, 541])
+        rng = np.random.default_rng([number, (*SCANS, *MORE_SCANS).index(kind), int(stranger), attempt, 541])
         try:
             return simulate_single_scan(
                 simulate_session(building, None, rng), kind, rooms.tolist(), rng, *draw_frames(1, False, rng)

@@ -3,10 +3,10 @@
 ``python evaluate.py task=landmarks data=test pairs=12 again=6 write=docs/results/landmarks.md``. So many pairs of each kind of
 places made to be alike (`datasets.pairs.lookalikes`), and so many of the first place visited twice, which belong together. Each
 pair is registered without landmarks, with half of the door signs read with a fifth of their characters wrong, with signs read
-well, and with tags (`READINGS`).
-Signs are drawn beside the maps: these are those of the other tables. Right: within 0.5 m and 5 degrees. ``data=signs``: the
+well, with tags, and with what phones hear of access points (`READINGS`).
+Landmarks are drawn beside the maps: these are those of the other tables. Right: within 0.5 m and 5 degrees. ``data=signs``: the
 likelihood of signs alone, without walls, in a minute; ``data=signs_train``: of training buildings, to choose by; ``data=reader``:
-a real reader on pictures of signs.
+a real reader on pictures of signs; ``data=wifi``: what WiFi alone makes of places that walls believe.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from topomerge.code_digest import compute_code_digest
 from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.core.builder import limit_threads
 from topomerge.datasets.pairs.grid_pairs import GridPair, load_grids
+from topomerge.datasets.pairs.lookalike_places import sample_places
+from topomerge.datasets.pairs.lookalike_radio import WIFI, simulate_lookalike_radio
 from topomerge.datasets.pairs.lookalikes import (
     LOOKALIKES,
     LookalikeItem,
@@ -30,7 +32,9 @@ from topomerge.datasets.pairs.lookalikes import (
     draw_lookalike_items,
     read_lookalike_signs,
 )
+from topomerge.datasets.pairs.pairs import draw_frames
 from topomerge.datasets.plans.splits import get_seed_range
+from topomerge.datasets.simulation.radio import RadioSettings
 from topomerge.datasets.simulation.signs import (
     READERS,
     Reader,
@@ -43,18 +47,21 @@ from topomerge.datasets.simulation.signs import (
 from topomerge.evaluation.documents import write_table
 from topomerge.evaluation.sign_readers import measure_reader, tabulate_readers
 from topomerge.evaluation.tasks import Row, TaskSettings, measure_missing
-from topomerge.landmarks.evidence import score_landmarks
+from topomerge.landmarks.evidence import LandmarkScorer, score_landmarks
 from topomerge.registration.pipeline import register
-from topomerge.statistics import compute_exact_interval
+from topomerge.registration.posterior import PRIORS, update_posterior
+from topomerge.registration.verify import load_model
+from topomerge.statistics import bootstrap_mean, compute_exact_interval
 from topomerge.training.belief_hypotheses import compute_pose_error, is_hypothesis_right
 from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, Landmarks, LogFn, Sim3, TopometricMap, VoxelGrid
 
 MAKERS = ("topomerge.registration.pipeline", "topomerge.landmarks.evidence", "topomerge.datasets.pairs.lookalikes")
-READINGS = {
+READINGS: dict[str, Reader | RadioSettings | None] = {
     "no landmarks": None,
     "half of the signs, 20 % wrong": Reader(("text",), 0.5, 0.2),
     "nine of ten signs, 2 % wrong": Reader(("text",), 0.9, 0.02),
     "tags": Reader(("tag",), 0.9, 0.0),
+    "WiFi": WIFI,
 }
 HEADS = (
     "landmarks",
@@ -81,7 +88,7 @@ class Settings(TaskSettings):
 
     pairs: int = 12
     again: int = 6
-    readings: list[int] = field(default_factory=lambda: [0, 1, 2, 3])
+    readings: list[int] = field(default_factory=lambda: [0, 1, 2, 3, 4])
 
 
 def make_recipe(settings: Settings) -> LookalikeRecipe:
@@ -93,6 +100,8 @@ def make_recipe(settings: Settings) -> LookalikeRecipe:
 
 def list_inputs(settings: Settings) -> list[str]:
     """Return names of the pairs, or of the buildings whose signs are scored alone."""
+    if settings.data.set == "wifi":
+        return [item.name for item in draw_wifi_items(settings)]
     if settings.data.set == "reader":
         return [f"sign {k}" for k in range(settings.data.limit or PICTURED)]
     if settings.data.set in ALONE:
@@ -110,19 +119,24 @@ def measure(settings: Settings, log_line: LogFn) -> list[Row]:
         path = Path(settings.cache) / "evaluation" / f"{settings.data.set}.jsonl"
         buildings = {name: (k, ALONE[settings.data.set]) for k, name in enumerate(list_inputs(settings))}
         return measure_missing(path, buildings, measure_building, log_line, settings, compute_code_digest(__name__))
+    if settings.data.set == "wifi":
+        path = Path(settings.cache) / "evaluation" / "wifi_lookalikes.jsonl"
+        places = {name_item(item): (item,) for item in draw_wifi_items(settings)}
+        return measure_missing(path, places, measure_wifi, log_line, settings)
     recipe = make_recipe(settings)
     sharing = _Sharing(settings.cache, settings.jobs)
     files = {path.stem: path for path in build_lookalikes(recipe, sharing, log_line)[0]}
     names = tuple(list(READINGS)[k] for k in settings.readings)
-    items = {
-        f"{item.kind}-{item.number}{'-again' if item.again else ''}": (files[item.name], item, names)
-        for item in draw_lookalike_items(recipe)
-        if item.name in files
-    }
+    items = {name_item(item): (files[item.name], item, names) for item in draw_lookalike_items(recipe) if item.name in files}
     path = Path(settings.cache) / "evaluation" / f"{recipe.name}.jsonl"
     items = {k: v for k, v in items.items() if settings.data.only in k}
     rows = measure_missing(path, items, measure_pair, log_line, settings)
     return [{**row, **of} for row in rows for of in row["readings"]]
+
+
+def name_item(item: LookalikeItem) -> str:
+    """Return the name of the row of an item."""
+    return f"{item.kind}-{item.number}{'-again' if item.again else ''}"
 
 
 ALONE = {"signs": "test", "signs_train": "train"}  # sets of signs alone: split of the buildings
@@ -179,6 +193,67 @@ def tabulate_alone(rows: Sequence[Row]) -> str:
     return write_table(["reader", "places", *heads], lines)
 
 
+WORLDS = 5  # draws of access points, and of where the second place lies, of each pair of places
+BELIEVED, DOUBTED = 0.95, 0.4  # probability by walls of places that look alike; of true pairs that walls do not carry
+
+
+def draw_wifi_items(settings: Settings) -> list[LookalikeItem]:
+    """Draw the places that are judged by WiFi alone."""
+    items = draw_lookalike_items(make_recipe(settings))
+    return [item for item in items if settings.data.only in name_item(item)]
+
+
+def measure_wifi(item: LookalikeItem) -> Row:
+    """Compute what WiFi leaves of the belief in a pose that walls hold right; of several that look alike in the worst one."""
+    places = sample_places(item.kind, item.furniture, item.seed)
+    frames = draw_frames(2, item.scaled, np.random.default_rng([item.seed, item.number, LOOKALIKES.index(item.kind)]))
+    grid, worlds = VoxelGrid.from_cells(np.zeros((1, 3), np.int64), np.zeros(3), 0.3), []
+    for draw in range(WORLDS):
+        heard = simulate_lookalike_radio(item, places, draw=draw)
+        scorer = LandmarkScorer(*(build_bare_map(grid, None, of) for of in heard.readings))
+        said = [scorer.score(frames[0] @ pose @ frames[1].inverse()) for pose in ([Sim3()] if item.again else places.poses)]
+        left = [max(update_posterior(spread_belief(p), THRESHOLD, one)["here"] for one in said) for p in (BELIEVED, DOUBTED)]
+        readings = [len(np.unique(of.table["group"])) for of in heard.readings]
+        worlds.append({"relation": heard.relation, "scans": readings, "left": left})
+    return {"kind": item.kind, "again": item.again, "building": item.seed, "worlds": worlds}
+
+
+def spread_belief(here: float) -> dict[str, float]:
+    """Spread what is not believed over the other places, by their priors."""
+    rest = 1 - PRIORS["here"]
+    return {name: here if name == "here" else (1 - here) * prior / rest for name, prior in PRIORS.items()}
+
+
+def tabulate_wifi(rows: Sequence[Row]) -> str:
+    """Tabulate by relation of the places, and of those of one building by kind, how many poses are still believed."""
+    worlds = [{**world, "again": r["again"], "kind": r["kind"], "building": r["building"]} for r in rows for world in r["worlds"]]
+    groups = {
+        f"{RELATION_WORDS[name]}": [w for w in worlds if not w["again"] and w["relation"] == name] for name in RELATION_WORDS
+    }
+    groups["all look-alikes"] = [w for w in worlds if not w["again"]]
+    groups["one place visited twice"] = [w for w in worlds if w["again"]]
+    lines: list[list[object]] = []
+    for name, some in groups.items():
+        if not some:
+            continue
+        buildings = np.array([w["building"] for w in some])
+        believed = np.array([[p >= THRESHOLD for p in w["left"]] for w in some], float)
+        share, low, high = bootstrap_mean(believed[:, 0], buildings)
+        heard = float(np.median([min(w["scans"]) for w in some]))
+        counts = [f"{100 * share:.1f} %", f"{100 * low:.1f} to {100 * high:.1f} %", f"{100 * believed[:, 1].mean():.1f} %"]
+        lines.append([name, len(np.unique(buildings)), len(some), f"{heard:.0f}", *counts])
+    heads = ["places", "buildings", "pairs", "scans of the smaller map, median", "walls .95: still believed", "95 %"]
+    return write_table([*heads, "walls .40: believed"], lines)
+
+
+RELATION_WORDS = {
+    "storey": "two storeys",
+    "wing": "two wings",
+    "row": "two rooms of a row",
+    "building": "two buildings",
+    "": "two parts of one map of walls",
+}
+THRESHOLD = float(load_model()["threshold"])
 SURE_ODDS = float(np.log(10))
 
 
@@ -207,13 +282,19 @@ def measure_pair(file: Path, item: LookalikeItem, readings: Sequence[str]) -> Ro
     pair = load_grids(file)
     outcomes: list[Row] = []
     for name in readings:
-        reader = READINGS[name]
-        signs = (Landmarks(), Landmarks()) if reader is None else read_lookalike_signs(item, reader)
+        signs = read_landmarks(item, READINGS[name])
         some = min(map(len, signs)) > 0
         alone = next((row for row in outcomes if not min(row["landmarks"])), None)
         found = alone if alone is not None and not some else _register_pair(pair, signs)
         outcomes.append({**found, "reading": name, "landmarks": [len(t) for t in signs]})
     return {"kind": item.kind, "again": item.again, "tellable": pair.about.get("tellable"), "readings": outcomes}
+
+
+def read_landmarks(item: LookalikeItem, reading: Reader | RadioSettings | None) -> tuple[Landmarks, Landmarks]:
+    """Read the landmarks of the places of an item by one of `READINGS`."""
+    if isinstance(reading, RadioSettings):
+        return simulate_lookalike_radio(item, sample_places(item.kind, item.furniture, item.seed), reading).readings
+    return (Landmarks(), Landmarks()) if reading is None else read_lookalike_signs(item, reading)
 
 
 def _register_pair(pair: GridPair, told: tuple[Landmarks, Landmarks]) -> Row:
@@ -240,6 +321,8 @@ def is_false(row: Row) -> bool:
 
 def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
     """Tabulate what is wrongly merged and what is believed of true pairs, all and by kind, for each reading."""
+    if settings.data.set == "wifi":
+        return {"landmarks-wifi": tabulate_wifi(rows)}
     if settings.data.set == "reader":
         return {"sign-readers": tabulate_readers(rows)}
     if settings.data.set in ALONE:

@@ -2,13 +2,15 @@
 
 ``python evaluate.py task=locate data=test`` makes maps of simulated buildings of all kinds, one of each by one of some sensors,
 and asks where scans of a later session were taken. Two in six more are of a building without a map. ``data=captures`` asks in
-an atlas of real homes and one capture of a real floor where windows of its other captures are (development set).
+an atlas of real homes and one capture of a real floor where windows of its other captures are (development set). ``data=more``: a
+camera that is turned once, and a robot's laser that drives a few metres. ``data=size``: the same scans in atlases of more and
+more maps; they are made where they are missing, which takes ten seconds each.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from time import process_time
@@ -18,6 +20,7 @@ import numpy as np
 
 from topomerge.datasets.core.builder import limit_threads
 from topomerge.datasets.pairs.localisation import (
+    MORE_SCANS,
     SCANS,
     LocatedMap,
     load_located_map,
@@ -41,6 +44,7 @@ from topomerge.types import Array, LogFn, PointCloud, Sim3
 MAKERS = ("topomerge.fusion.atlas.locate", "topomerge.fusion.atlas.place_search", "topomerge.datasets.pairs.localisation")
 MAPS = {"validation": 24, "test": 50}
 FIRST = {"validation": 0, "test": 24}  # building that is judged: by the first ones of the test the threshold was chosen
+SIZE_SCANS, ASKED, MANY = ("station", "sweep", "walk"), 5, 1000  # by which growth is measured; buildings; maps that none has made
 RIGHT_POSE = (0.3, np.radians(5.0))  # m and rad
 RIGHT_PLACE = 1.0  # m: of captures, whose rooms are cut in different ways, and which drift bends
 CAPTURES, WINDOWS, WINDOW = 12, 2, 7.0  # pairs of captures, windows of each and m along a side
@@ -50,14 +54,22 @@ OUTCOMES = ("right", "wrong", "ambiguous", "not here", "unreadable")
 
 @dataclass
 class Settings(TaskSettings):
-    """Settings of the task; `data.limit`: buildings that are asked for (0: all of the atlas)."""
+    """Settings of the task; `data.limit`: buildings that are asked for (0: all of the atlas).
+
+    Args:
+        sizes: maps of the atlases of ``data=size``.
+    """
+
+    sizes: list[int] = field(default_factory=lambda: [50, 100, 200])
 
 
 def list_inputs(settings: Settings) -> list[str]:
     """Return names of what is measured."""
     if settings.data.set == "captures":
         return [f"capture {k}" for k in range(settings.data.limit or CAPTURES)]
-    split = settings.data.set or "validation"
+    if settings.data.set == "size":
+        return [f"building {k} of {size}" for size in settings.sizes for k in range(FIRST["test"], FIRST["test"] + ASKED)]
+    split = "test" if settings.data.set == "more" else settings.data.set or "validation"
     return [f"building {k}" for k in range(FIRST[split], MAPS[split])][: settings.data.limit or None]
 
 
@@ -69,24 +81,29 @@ def measure(settings: Settings, log_line: LogFn) -> list[Row]:
     if split == "captures":
         items: dict[str, Any] = {name: (k,) for k, name in enumerate(names)}
         return measure_missing(path, items, measure_capture, log_line, settings)
+    kinds = {"more": MORE_SCANS, "size": SIZE_SCANS}.get(split, SCANS)
+    split = split if split in MAPS else "test"
     folder = Path(settings.cache) / "locate" / split
     folder.mkdir(parents=True, exist_ok=True)
-    return measure_missing(path, {n: (split, int(n.split()[1]), folder) for n in names}, measure_building, log_line, settings)
+    numbers = [[int(word) for word in name.split()[1::2]] for name in names]
+    sizes = [of[1] if len(of) > 1 else MAPS[split] for of in numbers]
+    items = {name: (split, of[0], folder, kinds, size) for name, of, size in zip(names, numbers, sizes, strict=True)}
+    return measure_missing(path, items, measure_building, log_line, settings)
 
 
 @cache
-def load_atlas(split: str, folder: Path) -> tuple[PlaceIndex, list[LocatedMap]]:
-    """Load the index of the maps of a split, made where they are missing, and their truth."""
+def load_atlas(split: str, folder: Path, size: int) -> tuple[PlaceIndex, list[LocatedMap]]:
+    """Load the index of so many maps of a split, made where they are missing, and their truth."""
     with limit_threads():
-        maps = [load_located_map(make_located_map(split, k, folder)) for k in range(MAPS[split])]
+        maps = [load_located_map(make_located_map(split, k, folder)) for k in range(size)]
         return PlaceIndex.from_maps({m.path.stem: load_map(m.path) for m in maps}), maps
 
 
-def measure_building(split: str, number: int, folder: Path) -> Row:
-    """Ask where scans of each kind were taken in a building with a map, and for two kinds in one without."""
-    index, maps = load_atlas(split, folder)
+def measure_building(split: str, number: int, folder: Path, kinds: Sequence[str], size: int) -> Row:
+    """Ask where scans of some kinds were taken in a building with a map, and for a third of these in one without."""
+    index, maps = load_atlas(split, folder, size)
     scans = []
-    for n, kind in enumerate(SCANS):
+    for n, kind in enumerate(kinds):
         for negative in (False, True) if (number + n) % 3 == 0 else (False,):
             try:
                 scan = make_located_scan(split, number, kind, negative)
@@ -95,7 +112,7 @@ def measure_building(split: str, number: int, folder: Path) -> Row:
             pose, moved = maps[number].place_scan(scan)
             true = replace(pose, translation=tuple((np.array(pose.translation) + moved).tolist()))  # type: ignore[arg-type]
             scans.append({"kind": kind, **measure_scan(index, scan.cloud, None if negative else (number, true))})
-    return {"scans": scans}
+    return {"scans": scans, "maps": size, "storeys": len(index.storeys)}
 
 
 def measure_scan(index: PlaceIndex, cloud: PointCloud, truth: tuple[int, Sim3] | None, near: float = 0.0) -> Row:
@@ -205,8 +222,28 @@ def classify_outcome(scan: Row) -> str:
     return "right" if scan.get("room") else "wrong"
 
 
+def tabulate_sizes(rows: Sequence[Row]) -> str:
+    """Tabulate a line an atlas, and what 1,000 maps would take by a line through the medians."""
+    lines: list[list[object]] = []
+    sizes = sorted({r["maps"] for r in rows})
+    for size in sizes:
+        own = [r for r in rows if r["maps"] == size]
+        scans = [s for r in own for s in r["scans"]]
+        seconds = [s["seconds"] for s in scans]
+        known, unknown = ([classify_outcome(s) for s in scans if s["stranger"] == no] for no in (False, True))
+        counts = [len(known), known.count("right"), known.count("wrong"), len(unknown), unknown.count("wrong")]
+        lines.append([size, own[0]["storeys"], *counts, f"{np.median(seconds):.2f}", f"{max(seconds):.2f}"])
+    if len(sizes) > 1:
+        slope, start = np.polyfit(sizes, [float(line[-2]) for line in lines], 1)  # type: ignore[arg-type]
+        lines.append([f"{MANY:,}, by a straight line", *["–"] * 6, f"{start + slope * MANY:.0f}", "–"])
+    heads = ["maps", "storeys", "scans of a map", "told right", "told wrong", "of no map", "told wrong"]
+    return write_table([*heads, "s of one core, median", "slowest"], lines)
+
+
 def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
     """Tabulate a line a kind of scan, of places in the atlas and of others."""
+    if settings.data.set == "size":
+        return {"locate-size": tabulate_sizes(rows)}
     lines = []
     for negative in (False, True):
         kinds = list(dict.fromkeys(s["kind"] for r in rows for s in r["scans"]))
