@@ -21,8 +21,7 @@ from topomerge.models.export import Ordered, read_weights, run_with_torch
 from torch import Tensor
 
 from topomerge.archive import replace_on_success
-from topomerge.embedding.network import build_embedder_signature
-from topomerge.embedding.weights import (
+from topomerge.embedding.learned import (
     STATE_FILE,
     STATE_SETTINGS,
     check_settings,
@@ -31,6 +30,7 @@ from topomerge.embedding.weights import (
     find_state,
     read_embedder_card,
 )
+from topomerge.embedding.network import build_embedder_signature
 from topomerge.errors import InputError
 
 if TYPE_CHECKING:

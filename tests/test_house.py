@@ -72,25 +72,21 @@ def tree_of(path: Path) -> ast.Module:
 @cache
 def imports(path: Path) -> list[tuple[str, bool, int]]:
     """(module, at the top level of the file?, line) of every import, leaving out those for type checkers."""
-    tree = tree_of(path)
-    checked = {
-        id(n)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
-        for n in ast.walk(node)
-    }
-    inside = {
-        id(n) for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) for n in ast.walk(node)
-    }
-    found = []
-    for node in ast.walk(tree):
-        if id(node) in checked:
-            continue
-        if isinstance(node, ast.Import):
-            found += [(a.name, id(node) not in inside, node.lineno) for a in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}:{node.lineno}: import absolutely"
-            found += [(f"{node.module}.{a.name}", id(node) not in inside, node.lineno) for a in node.names]
+    found: list[tuple[str, bool, int]] = []
+
+    def visit(node: ast.AST, top: bool) -> None:  # an import is a statement: expressions are not looked into
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.Import):
+                found.extend((a.name, top, child.lineno) for a in child.names)
+            elif isinstance(child, ast.ImportFrom):
+                assert child.level == 0, f"{path}:{child.lineno}: import absolutely"
+                found.extend((f"{child.module}.{a.name}", top, child.lineno) for a in child.names)
+            elif isinstance(child, ast.If) and "TYPE_CHECKING" in ast.dump(child.test):
+                continue
+            elif isinstance(child, ast.stmt | ast.ExceptHandler | ast.match_case):
+                visit(child, top and not isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef))
+
+    visit(tree_of(path), True)
     return found
 
 

@@ -19,7 +19,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from topomerge.embedding.weights import STATE_FILE as EMBEDDER_STATE
+from topomerge.embedding.learned import STATE_FILE as EMBEDDER_STATE
 from topomerge.errors import InputError
 
 STATE_FORMAT = 3

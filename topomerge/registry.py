@@ -157,10 +157,10 @@ NO_LOGGER = "none"
 LOGGERS = Registry(
     "logger",
     "loggers",
-    tensorboard="topomerge.training.loggers:build_board_logger",
-    csv="topomerge.training.loggers:CsvLogger",
-    wandb="topomerge.training.loggers:WandbLogger",
-    mlflow="topomerge.training.loggers:MlflowLogger",
+    tensorboard="topomerge.training.instruments:build_board_logger",
+    csv="topomerge.training.instruments:CsvLogger",
+    wandb="topomerge.training.instruments:WandbLogger",
+    mlflow="topomerge.training.instruments:MlflowLogger",
 )
 DATASETS = Registry("data", "datasets", folder="topomerge.datasets.pairs.pairs_file:read_pairs_table")
 TASKS = Registry(

@@ -25,6 +25,7 @@ from topomerge.datasets.simulation.session import simulate_session
 from topomerge.datasets.simulation.walk import Walk, plan_walk, sample_part
 
 from topomerge import archive
+from topomerge.code_digest import compute_code_digest
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.io.maps import save_map
@@ -123,10 +124,14 @@ def draw_building(split: str, number: int, stranger: bool = False) -> tuple[Buil
 
 
 def make_located_map(split: str, number: int, folder: Path) -> Path:
-    """Make a map with its truth, unless it is there: the frame of the building in it, and how its drift moved each place."""
-    path = folder / f"map_{number:03d}.tmap"
+    """Make a map with its truth, unless it is there: the frame of the building in it, and how its drift moved each place.
+
+    Maps of other code lie in other folders: what scans and extracts makes the map, as the number does.
+    """
+    path = folder / compute_code_digest(__name__)[:12] / f"map_{number:03d}.tmap"
     if path.exists():
         return path
+    path.parent.mkdir(parents=True, exist_ok=True)
     building, rooms, rng = draw_building(split, number)
     sensor = get_sensor(MAPPED_SENSORS[number % len(MAPPED_SENSORS)])
     (frame,) = draw_frames(1, False, rng)
@@ -135,7 +140,7 @@ def make_located_map(split: str, number: int, folder: Path) -> Path:
     straight = scan_building(session, remove_sensor_drift(sensor), rooms, seed, frame=frame)
     assert cloud.poses is not None and straight.poses is not None
     truth = {"frame": frame.matrix, "places": straight.poses[:, :3, 3], "moved": (cloud.poses - straight.poses)[:, :3, 3]}
-    archive.write(truth, folder / f"map_{number:03d}.truth.npz")
+    archive.write(truth, path.with_suffix(".truth.npz"))
     save_map(replace(extract(cloud), source=f"{building.name}:{sensor.name}"), path)
     return path
 

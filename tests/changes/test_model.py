@@ -64,7 +64,10 @@ def test_what_is_built_as_drawn_is_seen(model: list[ModelElement], built: Topome
     assert all(abs(row.shift) < 0.005 for row in rows.values() if np.isfinite(row.shift))
 
 
-@pytest.mark.parametrize("shift", [0.02, 0.05, 0.10, -0.05])
+LONGER_SHIFTS = [pytest.param(shift, marks=pytest.mark.longer) for shift in (0.05, 0.10)]
+
+
+@pytest.mark.parametrize("shift", [0.02, -0.05, *LONGER_SHIFTS])
 def test_a_wall_that_stands_elsewhere_says_by_how_much(model: list[ModelElement], built: TopometricMap, shift: float) -> None:
     rows = judge(model, built, scan(shift))
     row = rows["at 4"]
@@ -99,7 +102,7 @@ def scan_side(shift: float) -> TopometricMap:
     return extract(points + np.random.default_rng(1).normal(0, 0.004, points.shape))
 
 
-@pytest.mark.parametrize("shift", [0.10, -0.10, 0.05])
+@pytest.mark.parametrize("shift", [-0.10, *LONGER_SHIFTS])
 def test_a_wall_seen_from_one_side_is_not_taken_for_its_other_face(shift: float) -> None:
     walls = {"left": ((-THICK, 0, 0), (0, 8, 2.7)), "low": ((0, -THICK, 0), (8, 0, 2.7))}
     walls |= {"high": ((0, 8, 0), (8, 8 + THICK, 2.7)), "thin": ((7.94, 0, 0), (8.06, 8, 2.7))}
@@ -118,7 +121,7 @@ def test_what_is_too_narrow_to_be_measured_is_not_called_elsewhere() -> None:
 
 def test_a_door_that_stands_elsewhere_says_by_how_much(model: list[ModelElement], built: TopometricMap) -> None:
     assert judge(model, built, built)["door"].state == "seen"
-    for moved in (0.5, 0.9, -0.8):
+    for moved in (0.5, -0.8):
         door = box("door", "door", (3.95, 1.55 - moved, 0), (4.05, 2.45 - moved, 2.05))
         found = compare_with_model([e if e.guid != "door" else door for e in model], built, built, Placement(Sim3()))
         (row,) = [r for r in found.elements if r.element.guid == "door"]

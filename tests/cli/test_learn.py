@@ -9,9 +9,8 @@ import pytest
 
 from tests.scenes_map import building
 from topomerge.cli.main import main as cli
-from topomerge.embedding.learned import load_embedder
+from topomerge.embedding.learned import find_embedder, load_embedder
 from topomerge.embedding.quarter_turns import get_rows
-from topomerge.embedding.weights import find_embedder
 
 SHIPPED = str(find_embedder())
 

@@ -16,12 +16,11 @@ import pytest
 
 from tests.scenes_map import building
 from topomerge.embedding.graph import build_graph_arrays
-from topomerge.embedding.learned import load_embedder
+from topomerge.embedding.learned import EMBEDDER_FILE, find_embedder, load_embedder, read_embedder_card
 from topomerge.embedding.network import Geometry, Network, Node
 from topomerge.embedding.quarter_turns import TurnedRows, join_rooms
 from topomerge.embedding.sheets import build_sheet_arrays
 from topomerge.embedding.surroundings import CROP_SHAPES
-from topomerge.embedding.weights import EMBEDDER_FILE, find_embedder, read_embedder_card
 from topomerge.errors import InputError
 from topomerge.networks.network import card_of
 from topomerge.registry import NODES

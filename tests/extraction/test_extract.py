@@ -140,7 +140,7 @@ def test_a_mezzanine_is_a_storey():
 def test_ten_isolated_rooms():
     result = extract(scenes.isolated_rooms().points(0.005))
     assert len(result.rooms) == 10 and len(result.edges) == 0
-    assert len(extract(scenes.isolated_rooms().points(0.005), preset="thesis").rooms) == 1
+    assert len(extract(scenes.isolated_rooms(3).points(0.005), preset="thesis").rooms) == 1
 
 
 @pytest.mark.parametrize("scene", [scenes.single_wall(), scenes.Scene().box(0, 0, 0, 0.4, 0.4, 2.0)])

@@ -385,7 +385,7 @@ def write_plans(folder: Path) -> dict[str, Path]:
 
 def write_embedder(folder: Path) -> dict[str, Path]:
     """The embedder that ships, and its card."""
-    from topomerge.embedding.weights import find_embedder
+    from topomerge.embedding.learned import find_embedder
     from topomerge.networks.network import card_of
 
     return {path.name: Path(shutil.copy(path, folder)) for path in (find_embedder(), card_of(find_embedder()))}

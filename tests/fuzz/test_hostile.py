@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
+import shutil
 import struct
 import zipfile
 import zlib
@@ -229,16 +230,26 @@ def test_pipes_and_devices_are_not_waited_for(worker: Worker, tmp_path: Path) ->
 STRAY_PLACES = ["../precious.txt", "{elsewhere}/precious.txt", "maps/../../precious.txt", "link/precious.txt", 5]
 
 
-@pytest.mark.parametrize("name", STRAY_PLACES)
-def test_an_atlas_of_a_stranger_deletes_and_writes_nothing_elsewhere(tmp_path: Path, name: object) -> None:
-    """What looks like a change that was interrupted names files of other folders."""
+@pytest.fixture(scope="module")
+def sound_atlas(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An atlas of one map, to be copied."""
     from tests.scenes_map import building
+    from topomerge.fusion.atlas.store import add
+
+    folder = tmp_path_factory.mktemp("sound") / "atlas"
+    add(folder, [("house", building(2, 2))], lambda *_, **__: "")
+    return folder
+
+
+@pytest.mark.parametrize("name", STRAY_PLACES)
+def test_an_atlas_of_a_stranger_deletes_and_writes_nothing_elsewhere(sound_atlas: Path, tmp_path: Path, name: object) -> None:
+    """What looks like a change that was interrupted names files of other folders."""
     from topomerge.errors import InputError
     from topomerge.fusion.atlas.folder import GONE, NEXT
-    from topomerge.fusion.atlas.store import add, read_atlas
+    from topomerge.fusion.atlas.store import read_atlas
 
     folder = tmp_path / "atlas"
-    add(folder, [("house", building(2, 2))], lambda *_, **__: "")
+    shutil.copytree(sound_atlas, folder)
     (tmp_path / "precious.txt").write_text("mine")
     (folder / "link").symlink_to(tmp_path)
     (folder / NEXT).mkdir()
@@ -268,8 +279,8 @@ def model_with(folder: Path, pattern: str, other: str) -> str:
     ("pattern", "other"),
     [
         ("IFCPOLYLINE", "#N=IFCPOLYLINE(());"),
-        ("IFCPOLYLINE", "#N=IFCPOLYLINE((#9001,#9002));"),
-        ("IFCEXTRUDEDAREASOLID", "#N=IFCBOOLEANRESULT(.UNION.,#N,#N);"),
+        pytest.param("IFCPOLYLINE", "#N=IFCPOLYLINE((#9001,#9002));", marks=pytest.mark.longer),
+        pytest.param("IFCEXTRUDEDAREASOLID", "#N=IFCBOOLEANRESULT(.UNION.,#N,#N);", marks=pytest.mark.longer),
         ("IFCEXTRUDEDAREASOLID", "#N=IFCBOOLEANRESULT(.UNION.,#9001,#9001);\n#9001=IFCBOOLEANRESULT(.UNION.,#N,#N);"),
         ("IFCLOCALPLACEMENT", "#N=IFCLOCALPLACEMENT(#N,#3);"),
     ],
@@ -278,6 +289,7 @@ def test_models_that_end_the_library(worker: Worker, tmp_path: Path, pattern: st
     assert "damaged" in refused(worker, tmp_path / "a.ifc", model_with(tmp_path, pattern, other))
 
 
+@pytest.mark.longer  # a chain that leads to itself is refused above
 def test_models_that_are_nested_too_deep(worker: Worker, tmp_path: Path) -> None:
     for depth, state in ((100, "read"), (100_000, "refused")):
         chain = "".join(f"#{9000 + i}=IFCLOCALPLACEMENT(#{9001 + i},#3);\n" for i in range(depth))

@@ -101,10 +101,14 @@ def test_the_scale_matters():
             assert (net.geometry(one) - net.geometry(big)).abs().max() > 1e-3, part
 
 
-@pytest.mark.parametrize("node", NODES, ids=node_name)
+SCALAR_PARTS = ("scalars", "engineered", "shapedna", "landmarks")
+
+
+# Each node behind the same parts, and each part before the same node: what lies between them is one array.
 @pytest.mark.parametrize(
-    "parts",
-    [("scalars", "engineered", "shapedna", "landmarks"), ("pointnet", "voxelcnn"), ("pointnet_local",), tuple(CROP_SHAPES)],
+    ("parts", "node"),
+    [pytest.param(SCALAR_PARTS, node, id=node_name(node)) for node in NODES]
+    + [(parts, NODES[1]) for parts in (("pointnet", "voxelcnn"), ("pointnet_local",), tuple(CROP_SHAPES))],
 )
 def test_gradients_reach_every_weight(parts, node):
     net = network(*parts, node=node).train()

@@ -25,7 +25,7 @@ from starlette.testclient import TestClient
 from topomerge.errors import InputError
 from topomerge.studio.folder import StudioFolder, UploadLimits, clean_name
 from topomerge.studio.guard import POLICY, Access, find_refusal
-from topomerge.studio.jobs import Job, JobQueue
+from topomerge.studio.merges import Job, JobQueue
 from topomerge.studio.server import LARGEST_REQUEST, PAGE_FILES, Studio
 
 BASE = "http://127.0.0.1:8000"

@@ -10,8 +10,8 @@ import pytest
 
 from topomerge.errors import InputError
 from topomerge.training.embedding import TASK
-from topomerge.training.model_page import list_experiments, write_model_page
 from topomerge.training.settings import Training, convert_to_dict
+from topomerge.training.table import list_experiments, write_model_page
 
 START = {"command": "python train.py experiment=x", "commit": "0123456789abcdef"}
 

@@ -228,7 +228,7 @@ EMBED = Command(
 
 def run_export_embedder(args: argparse.Namespace) -> int:
     """`topomerge export-embedder`: the best embedder of a run, or what an earlier version wrote, as ONNX with its card."""
-    from topomerge.embedding.weights import EMBEDDER_FILE, find_state, read_embedder_card
+    from topomerge.embedding.learned import EMBEDDER_FILE, find_state, read_embedder_card
     from topomerge.networks.network import card_of
 
     state = find_state(args.run_folder)

@@ -12,8 +12,7 @@ from typing import Any
 from topomerge.archive import convert_to_plain
 from topomerge.datasets.pairs.items import Recipe
 from topomerge.embedding.engineered import CONTEXT_KINDS
-from topomerge.embedding.learned import EMBEDDERS
-from topomerge.embedding.weights import EMBEDDER_FILE, PRETRAINED, find_embedder, read_embedder_card
+from topomerge.embedding.learned import EMBEDDER_FILE, EMBEDDERS, PRETRAINED, find_embedder, read_embedder_card
 from topomerge.errors import InputError
 from topomerge.fusion.inputs import POSE_SOURCES
 

@@ -25,9 +25,8 @@ from topomerge.edits.journal import ConflictError
 from topomerge.errors import InputError, make_printable
 from topomerge.studio.folder import DIFF_PAGE, StudioFolder, UploadError, UploadLimits
 from topomerge.studio.guard import REPORT_POLICY, Access, Guard
-from topomerge.studio.jobs import Job, JobError, JobQueue
 from topomerge.studio.maps import OpenMaps
-from topomerge.studio.merges import accept_placed, decide, describe_merge, place_pair
+from topomerge.studio.merges import Job, JobError, JobQueue, accept_placed, decide, describe_merge, place_pair
 
 LARGEST_REQUEST = 1 << 20  # bytes of JSON
 LOOK_EVERY = 2.0  # s between two looks at the folder

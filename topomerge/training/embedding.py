@@ -14,8 +14,8 @@ import torch
 from matplotlib.figure import Figure
 
 from topomerge.checkpoint import load_state
+from topomerge.embedding.learned import STATE_FILE, STATE_SETTINGS
 from topomerge.embedding.network import LANDMARK_PART, Network, build_network
-from topomerge.embedding.weights import STATE_FILE, STATE_SETTINGS
 from topomerge.errors import InputError
 from topomerge.matching.assignment import assign_certain, compute_certainty
 from topomerge.models.embedder import Embedder, match_scores

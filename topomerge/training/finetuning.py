@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from topomerge.datasets.pairs.own_pairs import OWN_DATA, build_own_sets
-from topomerge.embedding.weights import EMBEDDER_FILE, PRETRAINED
+from topomerge.embedding.learned import EMBEDDER_FILE, PRETRAINED
 from topomerge.errors import InputError
 from topomerge.models.export import check_exporter
 from topomerge.models.weights import read_embedder

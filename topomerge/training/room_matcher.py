@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from topomerge.embedding.learned import read_embedder_card
 from topomerge.embedding.quarter_turns import QUARTERS, TurnedRows, compute_room_features, rotate_to_walls
-from topomerge.embedding.weights import read_embedder_card
 from topomerge.errors import InputError
 from topomerge.matching.assignment import assign_certain, count_pairs, has_twin, rank_partners
 from topomerge.matching.room_matcher import Matcher, RoomsSeen, build_rooms_seen, build_signature, match_turns, read_matcher

@@ -160,7 +160,7 @@ def check_start(settings: Any) -> None:
         raise InputError(f"watch: unknown {settings.watch!r}; {', '.join(possible)} are possible for task={settings.task}")
     check_accelerator(settings)
     if names := [name for name in settings.logger if name != NO_LOGGER]:
-        from topomerge.training.loggers import check_installed
+        from topomerge.training.instruments import check_installed
 
         check_installed(names)
     check_folder(settings.folder, asdict(settings))

@@ -19,9 +19,8 @@ import numpy as np
 
 from topomerge import archive
 from topomerge.edits.apply import load_corrected_map
-from topomerge.embedding.learned import DEFAULT
+from topomerge.embedding.learned import DEFAULT, read_embedder_card
 from topomerge.embedding.quarter_turns import Descriptor, Rows, TurnedRows, get_rows
-from topomerge.embedding.weights import read_embedder_card
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.folder import Entry, StoredAtlas
 from topomerge.fusion.atlas.partners import ROOM_NEIGHBOURS, compute_vectors, list_owners

@@ -1,6 +1,7 @@
 """Maps written for other tools: a file for each format, all of them reached through `outputs`.
 
-Nothing is imported until a format is written. To add one, write a module with a function (map, path) and enter it here.
+Nothing is imported until a format is written; formats in XML share `write_xml`.
+To add one, write a module with a function (map, path) and enter it here.
 """
 
 from __future__ import annotations
@@ -16,6 +17,11 @@ from topomerge.errors import InputError
 
 if TYPE_CHECKING:
     from topomerge.types import TopometricMap
+
+import re
+from xml.etree import ElementTree as xml
+
+from topomerge.archive import replace_on_success
 
 Save = Callable[[Path], None]
 
@@ -132,3 +138,22 @@ def _check_package(name: str, form: Format) -> None:
         import_module(package)
     except ImportError as error:
         raise InputError(f"--to {name}: needs the Python package {package}: pip install 'topomerge[{extra}]'") from error
+
+
+FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def replace_forbidden(value: str) -> str:
+    """Return a text without the characters that XML cannot hold."""
+    return FORBIDDEN.sub("\ufffd", value)
+
+
+def write_xml(root: Any, path: Path) -> None:
+    """Write a document, indented, in UTF-8.
+
+    Raises:
+        InputError: the path can't be written.
+    """
+    xml.indent(root)
+    with replace_on_success(path) as temporary:
+        xml.ElementTree(root).write(temporary, encoding="UTF-8", xml_declaration=True)

@@ -28,7 +28,6 @@ DISTANCE_STEPS = np.linspace(0.0, DISTANCE_CAP, 201)  # m, to which distances ar
 BODY = (0.3, 2.2)  # m above the floor: what stands there is averaged
 LINE_REACH, LEAST_ON_LINE = 3, 4  # columns around a point that its line is drawn through, and the least number of points there
 STRAIGHT = 0.7  # lines that are less straight are left out: corners
-LEAST_FACING = 0.3  # cosine between a line's normal and the way to empty space, from which its side is known
 PARTNER_REACH = 3  # columns in which partners are looked for
 LINE_SIGMAS = (0.1, 0.06, 0.04, 0.03)  # m, of the robust weights, round by round
 INDEPENDENT = 8.0  # columns of a wall whose errors are one

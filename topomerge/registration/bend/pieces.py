@@ -20,7 +20,6 @@ PIECE_SIZE = 5.0  # m, of a piece along a main direction; rooms up to `WHOLE_SIZ
 WHOLE_SIZE = 7.5
 ROOM_WALL_REACH = 0.6  # m around a room's floor: the walls there are its walls
 LEAST_WALLS = 8  # columns of walls, without which a piece can't be registered and gets none
-THROUGH_WALL = 2.0  # times the length of a joint between pieces that no door joins
 STOREY_LENGTH = 10.0  # m of walk from a storey to the next one
 SOFTER = 2.0  # times the fitted drift of a sensor: rooms that drifted within themselves are no rigid pieces (validation pairs)
 
