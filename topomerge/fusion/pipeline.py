@@ -196,8 +196,8 @@ def merge(
     """Bring maps together, or say why not. `merge([b, a])` gives the inverse transform.
 
     Args:
-        maps: topometric maps or `.tmap` files, two or more, or what `registration.prepared.prepare` made of them; `atlas` brings more than two together, as many as belong to the first
-            one.
+        maps: topometric maps, `.tmap` files, or what `registration.prepared.prepare` made of maps, two or more; `atlas` brings
+            more than two together, as many as belong to the first one.
         scale: "fixed", or "free" where the scale of the second map is unknown.
         force: give the best transform and its joined map, too, where it is not believed; the status stays "abstained".
         threshold: probability from which a merge is believed; that of the calibration if None;
