@@ -330,3 +330,20 @@ def test_the_figure_of_the_readme_needs_all_three_methods(module) -> None:
     result, of = compute_headline(rows)["peers-right"]
     assert of == "1 of these pairs" and [part.split()[0] for part in result.split("; ")] == ["100", "0", "0"]
     assert not compute_headline([row for row in rows if row["method"] != "kiss03"])
+
+
+def test_a_scan_in_whole_maps_is_counted_by_its_pose_and_by_the_map_with_most_inliers(module) -> None:
+    scans = module("scans")
+    assert scans.choose_maps(24, 10)[0] == 24 and len(set(scans.choose_maps(24, 10))) == 10
+    turned = Sim3(0.3, (2.0, 1.0, 0.0))
+    error = scans.measure_error(Sim3(0.3, (2.1, 1.0, 5.0)).matrix, turned)
+    assert abs(error["away"] - 0.1) < 1e-9 and error["turned"] < 1e-9
+    good, far = {"away": 0.1, "turned": 0.0}, {"away": 9.0, "turned": 0.0}
+    ours = {"status": "located", "room": True, "seconds": 0.5, "stranger": False}
+
+    def row(own: dict, inliers: float) -> dict:
+        kiss = [{"map": 24, "inliers": inliers, "seconds": 1.0, **own}, {"map": 3, "inliers": 9.0, "seconds": 1.0, **far}]
+        return {"kind": "sweep", "building": 24, "ours": ours, "kiss": kiss}
+
+    table = scans.tabulate([row(good, 20.0), row(good, 5.0), row(far, 20.0)])
+    assert "| sweep | 3 | 2 | 2 | 1 | 1.00 | 50 | 3 | 0 | 0.50 |" in table

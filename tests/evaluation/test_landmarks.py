@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from topomerge.datasets.pairs.lookalikes import LookalikeItem
 
 from topomerge.errors import InputError
 from topomerge.evaluation import sign_readers
@@ -13,6 +14,9 @@ from topomerge.evaluation.landmarks import (
     list_inputs,
     measure,
     measure_building,
+    measure_wifi,
+    read_landmarks,
+    spread_belief,
     tabulate,
 )
 from topomerge.evaluation.sign_readers import draw_sign, measure_reader, tabulate_readers
@@ -58,6 +62,35 @@ def test_signs_alone_are_scored_and_tabulated(tmp_path):
     wrong = [[name, relation, -5.0 if relation else 5.0] for name in READ_ALONE for relation in ("",) * 4 + (*RELATIONS,)]
     table = tabulate([{"scored": wrong}], settings)["landmark-odds"]
     assert table.count("| 1 | " + " | ".join(["5.007", "1.000"] * 5)) == len(READ_ALONE)
+
+
+ROOM = LookalikeItem("same-room", 0, 7, "same", ("tls", "tls"), False)
+
+
+def test_wifi_leaves_less_of_a_look_alike_than_of_one_place():
+    """Another room of a row is believed less than the same one."""
+    heard = read_landmarks(ROOM, READINGS["WiFi"])
+    assert all(len(of) and of.is_kind("radio").all() for of in heard)
+    assert [len(of) for of in read_landmarks(ROOM, None)] == [0, 0]
+    other, again = measure_wifi(ROOM), measure_wifi(LookalikeItem(*list(vars(ROOM).values())[:-1], again=True))
+    assert {w["relation"] for w in other["worlds"]} == {"row"} and {w["relation"] for w in again["worlds"]} == {""}
+    assert all(0 <= p <= 1 for row in (other, again) for w in row["worlds"] for p in w["left"])
+    assert np.mean([w["left"] for w in other["worlds"]]) < np.mean([w["left"] for w in again["worlds"]])
+    assert abs(sum(spread_belief(0.95).values()) - 1) < 1e-9 and spread_belief(0.95)["here"] == 0.95
+
+
+def test_wifi_is_tabulated_by_how_the_second_place_lies():
+    settings = Settings()
+    settings.data.set = "wifi"
+    world = {"scans": [9, 12]}
+    rows = [
+        {"kind": "storeys", "again": False, "building": k, "worlds": [{**world, "relation": "storey", "left": [p, 0.1]}] * 2}
+        for k, p in enumerate((0.99, 0.2))
+    ]
+    rows.append({"kind": "storeys", "again": True, "building": 0, "worlds": [{**world, "relation": "", "left": [0.99, 0.9]}]})
+    table = tabulate(rows, settings)["landmarks-wifi"]
+    assert "| two storeys | 2 | 4 | 9 | 50.0 % | 0.0 to 100.0 % | 0.0 % |" in table
+    assert "| one place visited twice | 1 | 1 | 9 | 100.0 %" in table and "two wings" not in table
 
 
 @pytest.mark.parametrize("height", [10, 40])

@@ -38,3 +38,21 @@ def test_the_table_counts_each_outcome() -> None:
 def test_buildings_by_which_the_threshold_was_chosen_are_not_judged() -> None:
     assert list_inputs(Settings(data=Data(set="test")))[0] == "building 24" and len(list_inputs(Settings())) == 24
     assert len(list_inputs(Settings(data=Data(set="captures", limit=3)))) == 3
+
+
+def test_more_maps_are_tabulated_with_what_a_thousand_would_take() -> None:
+    settings = Settings(data=Data(set="size"), sizes=[50, 100])
+    names = list_inputs(settings)
+    assert len(names) == 10 and names[0] == "building 24 of 50" and names[-1] == "building 28 of 100"
+
+    def row(size: int) -> dict[str, object]:
+        told = {"status": "located", "room": True, "seconds": size / 50, "stranger": False}
+        return {"maps": size, "storeys": size, "scans": [told, {**told, "stranger": True, "status": "not here"}]}
+
+    table = tabulate([row(50), row(100)], settings)["locate-size"]
+    assert "| 50 | 50 | 1 | 1 | 0 | 1 | 0 | 1.00 | 1.00 |" in table
+    assert "| 1,000, by a straight line | – | – | – | – | – | – | 20 | – |" in table
+
+
+def test_a_turn_and_a_drive_are_asked_for_in_the_buildings_of_the_test() -> None:
+    assert list_inputs(Settings(data=Data(set="more", limit=2))) == ["building 24", "building 25"]
