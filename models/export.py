@@ -208,6 +208,30 @@ def export_network(module: nn.Module, signature: Signature, sample: Sequence[Ten
         temporary.write_bytes(model.SerializeToString(deterministic=True))
 
 
+def load_exported_weights(module: nn.Module, path: str | Path) -> None:
+    """Load the weights of a file that `export_network` wrote of such a module.
+
+    Raises:
+        InputError: no such file, not onnx, or the weights of another network.
+    """
+    check_exporter()
+    import onnx
+
+    try:
+        graph = onnx.load(str(path)).graph
+    except Exception as error:  # onnx and protobuf have kinds of their own
+        raise InputError(f"{path}: can't be read as ONNX ({' '.join(str(error).split())[:80]})") from error
+    stored = {one.name.partition(".")[2]: one for one in graph.initializer}  # below `_Positional.network`
+    weights = module.state_dict()
+    needed = {name: tuple(value.shape) for name, value in weights.items() if not name.endswith("num_batches_tracked")}
+    differs = [name for name, shape in needed.items() if name not in stored or tuple(stored[name].dims) != shape]
+    if differs:
+        raise InputError(f"{path}: is another network than these settings make ({len(differs)} weights differ, as {differs[0]})")
+    with torch.no_grad():
+        for name in needed:
+            weights[name].copy_(torch.tensor(onnx.numpy_helper.to_array(stored[name])))
+
+
 def check_exporter() -> None:
     """Refuse to train what could not be exported.
 

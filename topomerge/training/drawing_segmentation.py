@@ -153,9 +153,11 @@ class DrawingJob(ExportedJob):
             * torch.as_tensor(bright, device=self.device)[:, None, None, None]
         )
         x, truth = torch.rot90(x, turn, (2, 3)), torch.rot90(self.truths[chosen].long(), turn, (1, 2))
-        with torch.autocast(self.device.type, torch.bfloat16):  # half the time, on processors too
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type != "cpu" or has_bfloat_units()):
             scores = self.network(x.contiguous(memory_format=torch.channels_last))
         loss = functional.cross_entropy(scores.float(), truth, self.weight)
+        if options.dice:
+            loss = loss + options.dice * compute_dice_loss(scores.float(), truth)
         return self.optimize(loss, options, state)
 
     def count_items(self, batch: tuple[Any, ...]) -> int:
@@ -170,6 +172,27 @@ class DrawingJob(ExportedJob):
     def compute_scores(self) -> dict[str, float]:
         """Compute the scores of the watched pages."""
         return score_pages(self.watched, self.run())
+
+
+def has_bfloat_units() -> bool:
+    """Return whether the processor computes with numbers of 16 bits: without such units they take 2.3 times as long."""
+    return bool(torch.cpu.get_capabilities().get("amx_bf16") or torch.cpu.get_capabilities().get("avx512_bf16"))
+
+
+def compute_dice_loss(scores: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    """Compute 1 less the mean Dice coefficient of the classes that a batch shows, as many pixels as they may have
+    (Milletari et al. 2016).
+
+    Args:
+        scores: (n, c, h, w), not normalised; truth: (n, h, w).
+    """
+    count = scores.shape[1]
+    probability = scores.softmax(dim=1).movedim(1, -1).reshape(-1, count)
+    flat = truth.reshape(-1)
+    predicted, true = probability.sum(dim=0), torch.bincount(flat, minlength=count)
+    both = probability.new_zeros(count).index_add(0, flat, probability.gather(1, flat[:, None])[:, 0])
+    share = 2 * both / (predicted + true).clamp(min=1.0)
+    return 1 - share[true > 0].mean()
 
 
 def score_pages(pages: Sequence[Page], network: Run) -> dict[str, float]:

@@ -21,10 +21,12 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 import numpy as np
 import torch
 
+from topomerge.archive import find_weights_file
 from topomerge.checkpoint import NETWORK_FILE, find_state_folder, load_state, read_network, save_state, write_network
+from topomerge.embedding.weights import PRETRAINED
 from topomerge.errors import InputError
-from topomerge.models.export import check_exporter, export_network, run_with_torch
-from topomerge.networks.network import Run, Signature
+from topomerge.models.export import check_exporter, export_network, load_exported_weights, run_with_torch
+from topomerge.networks.network import WEIGHTS_PACKAGE, Run, Signature
 from topomerge.registry import SCHEDULES, TASKS
 from topomerge.training.descent import build_optimizer
 from topomerge.training.instruments import (
@@ -462,6 +464,12 @@ class ExportedJob(NetworkJob):
         module, signature, _ = self.exported()
         return run_with_torch(module, signature)
 
+    def load_weights(self, path: Path) -> None:
+        """Start from exported weights."""
+        load_exported_weights(self.exported().module, path)
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        self.origin = {**self.origin, "init_from": digest}
+
     def write_weights(self, path: Path) -> None:
         """Write the weights as the package has them."""
         module, signature, sample = self.exported()
@@ -480,13 +488,18 @@ def run_network(job: Job, settings: NetworkTask, steps: int, log_line: LogFn) ->
     """
     check_exporter()
     state, chief = State(), get_rank() == 0
+    task = TASKS[settings.task]
+    if settings.init_from and not settings.resume:
+        if not isinstance(job, ExportedJob):
+            raise InputError(f"task={settings.task}: init_from is for networks that are exported; leave it out")
+        shipped = settings.init_from == PRETRAINED
+        job.load_weights(find_weights_file(WEIGHTS_PACKAGE, task.file) if shipped else Path(settings.init_from))
     if settings.resume:
         state = State(**load_state(settings.folder / "last", job.network, job.get_optimizer(), NETWORK_FILE))
     if chief:
         device = str(next(job.network.parameters()).device)
         begin_run(settings, torch.cuda.get_device_name() if device.startswith("cuda") else device, torch.get_num_threads())
     log = MetricsLog(settings, state.epoch) if chief else None
-    task = TASKS[settings.task]
     schedule = Schedule(settings, steps, lower=settings.watch in task.lower)
     best = Loop(job, schedule, state, log, log_line).run()
     if settings.export and chief:

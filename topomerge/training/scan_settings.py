@@ -93,7 +93,7 @@ class DrawingSegmentation(RasterTask):
     crop: px of a side of a page, a multiple of 32.
     pages: that are at hand at a time; fresh: of them that are drawn anew in each step.
     widths: channels of the page's own pixels and of the five levels below.
-    classes: weights of `networks.drawing.DRAWING_CLASSES` in the cross-entropy.
+    classes: weights of `networks.drawing.DRAWING_CLASSES` in the cross-entropy; dice: of the Dice loss beside it.
     """
 
     task: str = "drawing_segmentation"
@@ -112,6 +112,7 @@ class DrawingSegmentation(RasterTask):
     rate: float = 3e-3
     widths: list[int] = field(default_factory=lambda: [8, 24, 40, 64, 96, 128])
     classes: list[float] = field(default_factory=lambda: [1.0, 1.0, 2.0, 3.0, 3.0, 1.0, 2.0, 1.0])
+    dice: float = 0.0
     watch: str = "mean_iou"
 
     def check(self) -> None:

@@ -178,9 +178,11 @@ class NetworkTask(TaskSettings, NetworkSettings):
 
     Args:
         hold_out: the scans of every n-th physical building are watched and train nothing.
+        init_from: `pretrained`, or a file of exported weights, from which the whole network starts; empty: from random numbers.
     """
 
     hold_out: int = 8
+    init_from: str = ""
 
     def check(self) -> None:
         """Refuse what makes no sense."""
