@@ -23,7 +23,7 @@ import torch
 
 from topomerge.archive import find_weights_file
 from topomerge.checkpoint import NETWORK_FILE, find_state_folder, load_state, read_network, save_state, write_network
-from topomerge.embedding.weights import PRETRAINED
+from topomerge.embedding.learned import PRETRAINED
 from topomerge.errors import InputError
 from topomerge.models.export import check_exporter, export_network, load_exported_weights, run_with_torch
 from topomerge.networks.network import WEIGHTS_PACKAGE, Run, Signature
