@@ -76,7 +76,7 @@ def read_embedder(path: str | Path | None = None) -> tuple[Embedder, dict[str, A
     """Read the network, ready to use, and on what it was trained.
 
     Args:
-        path: as of `embedding.weights.find_embedder`, or a folder with the state of a training.
+        path: as of `embedding.learned.find_embedder`, or a folder with the state of a training.
 
     Raises:
         InputError: no embedder there, or damaged, of another format or class.
