@@ -30,8 +30,8 @@ MOST_POINTS = 100_000_000  # points that a sampled or extruded file may become; 
 @dataclass(frozen=True)
 class Piece:
     """Some of the points of a file. `free`, `rooms` and `drawn_rooms` describe the whole file and come with its first piece;
-    `poses` come with the first piece whose points need them, and are counted by `pose_of` over all pieces; `landmarks` come with any, also with
-    one without points."""
+    `poses` come with the first piece whose points need them, and are counted by `pose_of` over all pieces; `landmarks` come with
+    any, also with one without points."""
 
     points: Array  # (n, 3) float, in the file's frame and unit
     colors: Array | None = None  # (n, 3) uint8
