@@ -79,14 +79,6 @@ def test_one_room_speaks_against_a_door_and_two_for_it(cut):
     assert at_the_door(cut, part(cut, two), part(cut, two)) == 2 * at_the_door(cut, part(cut, two))
 
 
-def test_one_room_of_a_drawing_does_not_speak_against_a_door(cut):
-    plan, region, _, passages, door = cut
-    for room, expected in ((lambda x: np.zeros(len(x), np.int64), 0.0), (lambda x: (x > DOOR_X).astype(np.int64), LOG_ODDS)):
-        drawn = replace(part(cut, room, (1.0, 1.0)), joins=False)
-        odds = compute_door_log_odds(region, plan.edge, passages, rasterise_part_rooms(plan, [drawn]))
-        assert odds[door] == pytest.approx(expected, abs=0.5)
-
-
 def test_what_a_map_is_less_sure_of_counts_less(cut):
     assert at_the_door(cut, part(cut, one, (0.4, 0.9))) == -GLIMPSED * LOG_ODDS
     assert at_the_door(cut, part(cut, two, (0.9, 0.4))) == pytest.approx(GLIMPSED * LOG_ODDS, rel=0.1)
