@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from io import BytesIO
 
 import numpy as np
@@ -16,8 +15,7 @@ from topomerge.datasets.drawings.sheet import Drawing, choose_hand
 from topomerge.networks.drawing import PAGE
 from topomerge.types import Array
 
-SCALES = 8.0, 34.0  # px/m, of the pages that are learned from: what pages have that are looked at (`io.drawing`)
-MOST_REDUCED = 2.4  # times as fine as they are looked at are pages that are made smaller first
+SCALES = 8.0, 50.0  # px/m, of the pages that are learned from
 
 
 def spoil_page(drawing: Drawing, rng: np.random.Generator) -> Drawing:
@@ -111,26 +109,10 @@ def sample_drawing(shapes: Sequence[DrawingShapes], rng: np.random.Generator, si
     points = np.concatenate([r.polygon for r in one.rooms])
     low, high = points.min(axis=0), points.max(axis=0)
     extent = float(np.ptp(points, axis=0).max())
-    coarsest = float(np.clip(0.75 * side / (extent + 4), SCALES[0], 0.5 * SCALES[1]))
-    scale = float(np.exp(rng.uniform(np.log(coarsest), np.log(SCALES[1]))))
-    finer = float(np.exp(rng.uniform(0, np.log(MOST_REDUCED)))) if rng.random() < 0.5 else 1.0
-    drawn = round(side * finer)
+    fit = side / (extent + 4)
+    scale = float(np.clip(fit * np.exp(rng.uniform(-0.3, 1.4)), *SCALES))
     window = side / scale
-    kind = rng.random()
-    centre = rng.uniform(low - 1.0, high + 1.0) if kind < 0.4 else (low + high) / 2
-    if kind > 0.6 and one.openings:
-        centre = one.openings[int(rng.integers(len(one.openings)))].line.mean(axis=0) + rng.normal(0, window / 6, 2)
-    drawing = draw_plan(one, choose_hand(rng), rng, (drawn, drawn), scale * drawn / side, centre - window / 2)
-    return reduce_drawing(spoil_page(drawing, rng) if corrupted else drawing, side)
-
-
-def reduce_drawing(drawing: Drawing, side: int) -> Drawing:
-    """Return a square page as one of fewer pixels, (side, side), as a picture is made smaller before it is looked at."""
-    before = len(drawing.classes)
-    if before == side:
-        return drawing
-    picture = np.asarray(Image.fromarray(drawing.picture).resize((side, side), Image.Resampling.BOX))
-    at = ((np.arange(side) + 0.5) * before / side).astype(int)
-    share = side / before
-    texts = tuple(replace(text, place=(text.place[0] * share, text.place[1] * share)) for text in drawing.texts)
-    return Drawing(picture, drawing.classes[at][:, at], drawing.rooms[at][:, at], texts, drawing.scale * share)
+    centre = rng.uniform(low - 1.0, high + 1.0) if rng.random() < 0.6 else (low + high) / 2
+    corner = centre - window / 2
+    drawing = draw_plan(one, choose_hand(rng), rng, (side, side), scale, corner)
+    return spoil_page(drawing, rng) if corrupted else drawing

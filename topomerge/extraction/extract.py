@@ -18,7 +18,7 @@ from topomerge.extraction.elevations.wall_doors import WALL_DOOR_FEATURES, build
 from topomerge.extraction.landmarks import add_landmarks
 from topomerge.extraction.navigable import add_crossed_cells, compute_navigable_volume, find_free_space
 from topomerge.extraction.parameters import DefaultParameters, Parameters, ThesisParameters, resolve_parameters
-from topomerge.extraction.plans.part_rooms import PartRooms, build_drawn_rooms
+from topomerge.extraction.plans.part_rooms import PartRooms
 from topomerge.extraction.plans.passages import Pair, Passage, compute_door_features, predict_door, sort_pair
 from topomerge.extraction.plans.plan_network import LOOKS
 from topomerge.extraction.plans.storey_floor import build_floor
@@ -251,8 +251,7 @@ def gather_evidence(
     looks = JOINED_LOOKS if parts else LOOKS
     rasters, places = rasterise_storeys(scan, navigable, p.standing_height, looks), scan.places
     narrow = min(p.narrow, p.slice_door if scan.flat else p.door)
-    rooms = (*parts, *build_drawn_rooms(scan.drawn_rooms))
-    storeys = [segment_storey(rasters, i, narrow, rooms, places) for i in range(len(rasters.numbers))]
+    storeys = [segment_storey(rasters, i, narrow, parts, places) for i in range(len(rasters.numbers))]
     watch.begin("walls", 0.6)
     walls = unroll_walls(scan, navigable, rasters, storeys) if p.walls else None
     return Evidence(rasters, find_passages(storeys, walls, p.walls and not parts), walls)

@@ -40,7 +40,6 @@ class Scan:
         raised: is it a robot's grid or a drawing, whose walls were all raised alike (`slices.is_raised`)?
         flat: is it a slice, in which nothing tells walls from what else stands about (`slices.is_slice`)?
         landmarks: of its file, in the frame of the grid.
-        drawn_rooms: (k, 4) floor of rooms as a drawing parts them, in that frame: place, m, and number; None elsewhere.
     """
 
     grid: VoxelGrid
@@ -54,7 +53,6 @@ class Scan:
     raised: bool = False
     flat: bool = False
     landmarks: Landmarks = field(default_factory=Landmarks)
-    drawn_rooms: Array | None = None
 
     @property
     def places(self) -> Array:
@@ -112,7 +110,6 @@ def read_scan(
         grid = coarsen_until_dense(grid, least_neighbours, chunks.warnings)
     landmarks = join_landmarks(chunks.landmarks)
     scan = Scan(grid, close, chunks.rays, chunks.free, chunks.source, tuple(chunks.warnings), landmarks=landmarks)
-    scan = replace(scan, drawn_rooms=chunks.drawn_rooms)
     return scan if levelled is None else replace(scan, levelling=levelled.matrix, warnings=(*levelled.warnings, *scan.warnings))
 
 
@@ -144,7 +141,6 @@ class _Chunks:
         self.free: VoxelGrid | None = None
         self.warnings: list[str] = []
         self.landmarks: list[Landmarks] = []
-        self.drawn_rooms: Array | None = None
         self._rays: list[tuple[Array, Array]] = []
         self._step = 1  # of the rays, every one or every second, fourth ... is held
 
@@ -158,7 +154,6 @@ class _Chunks:
             self.free = chunk.free or self.free
             self.warnings += [w for w in chunk.warnings if w not in self.warnings]
             self.landmarks += [] if chunk.landmarks is None else [chunk.landmarks]
-            self.drawn_rooms = self.drawn_rooms if chunk.drawn_rooms is None else chunk.drawn_rooms
             if chunk.poses is not None and chunk.pose_of is not None and len(chunk):
                 self._add_rays(*_select_rays(chunk, chunk.poses, chunk.pose_of))
             yield chunk

@@ -17,7 +17,7 @@ from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError
 from topomerge.io.drawing import NAME_HEIGHT, TracedDrawing, build_name_landmarks, build_stairs_landmarks, trace_drawing
 from topomerge.io.drawn_page import find_page
-from topomerge.io.drawn_storeys import DrawnStorey, find_storeys
+from topomerge.io.drawn_storeys import find_storeys
 from topomerge.io.grey_levels import find_grey_levels, is_clear_cut, is_unknown_grey
 from topomerge.io.piece import (
     BLOCK_POINTS,
@@ -35,7 +35,6 @@ OUTSIDE_SHARE = 1 / 3  # of the floor: more outside of every wall is suspicious;
 FEW_WALLS = 4  # of 8 directions in which a place outside of the walls meets one, at most
 PIXELS_LOOKED_AT = 4_000_000  # of a larger picture every second, third ... pixel
 BODY_RADIUS = 0.25  # m; floor where no body fits is no floor but the lines of walls
-DRAWN_STEP = 0.05  # m
 SLAB = 0.3  # m between the walls of a drawn storey and the next floor
 NARROW, WIDE = 0.1, 0.3  # of the pixels of walls, at most, and of floor, at least, that lie deeper than that in what is like them
 
@@ -166,34 +165,19 @@ def build_drawn_pieces(path: Path, traced: TracedDrawing, options: ReadOptions, 
     """
     storeys, warnings = find_storeys(path, traced, number)
     height = (options.extrude + SLAB) / options.factor
-    parts, grids, drawn = [], [], [np.zeros((0, 4))]
+    parts, grids = [], []
     for level, storey in enumerate(storeys):
         plan = Plan(path, traced.resolution, (*storey.corner, 0.0))
         at = storey.corner, NAME_HEIGHT / options.factor + level * height, path.name
         parts.append(build_name_landmarks(traced.texts, storey.free, plan.resolution, *at))
         parts.append(build_stairs_landmarks(storey.stairs, plan.resolution, *at))
         grids.append(plan)
-        drawn.append(list_drawn_rooms(storey, plan, level * height, int(drawn[-1][:, 3].max(initial=-1)) + 1))
-    about = Piece(np.empty((0, 3)), warnings=(*traced.warnings, *warnings), done=0.1)
-    yield replace(about, landmarks=join_landmarks(parts), drawn_rooms=np.concatenate(drawn))
+    yield Piece(np.empty((0, 3)), warnings=(*traced.warnings, *warnings), done=0.1, landmarks=join_landmarks(parts))
     closed = options if len(storeys) == 1 else replace(options, ceiling=True)  # else the next floor is the ceiling
     for level, (storey, plan) in enumerate(zip(storeys, grids, strict=True)):
         for piece in extrude(path, storey.occupied, storey.free, plan, closed):
             raised = piece.points + [0.0, 0.0, level * height] if level else piece.points
             yield replace(piece, points=raised, done=0.1 + 0.9 * (level + piece.done) / len(storeys))
-
-
-def list_drawn_rooms(storey: DrawnStorey, plan: Plan, floor: float, first: int) -> Array:
-    """List (k, 4) places about `DRAWN_STEP` apart on the floor of rooms that drawn walls and doors part, and their numbers.
-
-    Args:
-        floor: its height; first: number of the first room.
-    """
-    rooms, _ = ndimage.label(storey.free & ~storey.door)
-    step = max(int(DRAWN_STEP / plan.resolution), 1)
-    rows, columns = (at * step for at in np.nonzero(rooms[::step, ::step]))
-    x, y = plan.origin[0] + (columns + 0.5) * plan.resolution, plan.origin[1] + (len(rooms) - rows - 0.5) * plan.resolution
-    return np.column_stack([x, y, np.full(len(rows), floor), rooms[rows, columns] - 1 + first])
 
 
 def read_picture(path: Path) -> Array:

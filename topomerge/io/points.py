@@ -192,13 +192,15 @@ class Gatherer:
         self.source, self.up, self.factor, self.chunk = source, up, factor, chunk
         self.rotation = frame.get_axis_rotation(up or "z")
         self.shift: Array | None = None
-        self.warnings, self.dropped, self.size = list(warnings), 0, 0
-        self.parts, self.sample = list[_Part](), PointSample()
+        self.warnings = list(warnings)
+        self.sample = PointSample()
+        self.dropped = 0
+        self.parts: list[_Part] = []
+        self.size = 0
         self.poses: Array | None = None
         self.landmarks: list[Landmarks] = []
         self.objects = ObjectFinder()
         self.free: VoxelGrid | None = None
-        self.drawn_rooms: Array | None = None
         self.rooms: tuple[TrueRoom, ...] = ()
         self.pending: PointCloud | None = None  # the last full cloud, held back because the last one carries the warnings
 
@@ -227,8 +229,7 @@ class Gatherer:
             self.warnings.append(f"{self.dropped:,} points were not finite and are left out")
         self.warnings += warn_about(self.sample.points, self.up)
         found = join_landmarks([*self.landmarks, self.objects.find_objects("classes of points")])
-        told = tuple(dict.fromkeys(self.warnings))
-        yield replace(self.pending, warnings=told, landmarks=found if len(found) else None, drawn_rooms=self.drawn_rooms)
+        yield replace(self.pending, warnings=tuple(dict.fromkeys(self.warnings)), landmarks=found if len(found) else None)
 
     def _update_metadata(self, piece: Piece) -> None:
         """Keep what a piece says about the whole file."""
@@ -240,8 +241,6 @@ class Gatherer:
         if piece.landmarks is not None and len(piece.landmarks):
             place = partial(frame.transform_points, rotation=self.rotation, factor=self.factor)
             self.landmarks.append(transform_landmarks(clean_landmarks(piece.landmarks), place, scale=self.factor))
-        if (drawn := piece.drawn_rooms) is not None:
-            self.drawn_rooms = np.column_stack([frame.transform_points(drawn[:, :3], self.rotation, self.factor), drawn[:, 3]])
         if piece.free is not None and len(piece.free):
             self.free = frame.transform_grid(piece.free, self.rotation, self.factor)
 
@@ -262,8 +261,9 @@ class Gatherer:
 
     def _emit_cloud(self, part: _Part) -> Iterator[PointCloud]:
         assert self.shift is not None
-        at, known = (part.points, self.shift, part.colors, part.labels), (self.poses, part.pose_of, self.free, self.rooms)
-        cloud = PointCloud(*at, *known, self.source)
+        cloud = PointCloud(
+            part.points, self.shift, part.colors, part.labels, self.poses, part.pose_of, self.free, self.rooms, self.source
+        )
         cloud = replace(cloud, intensities=part.intensities, upright=self.up is None)
         self.free, self.rooms = None, ()
         if self.pending is not None:

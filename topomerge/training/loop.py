@@ -21,12 +21,10 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 import numpy as np
 import torch
 
-from topomerge.archive import find_weights_file
 from topomerge.checkpoint import NETWORK_FILE, find_state_folder, load_state, read_network, save_state, write_network
-from topomerge.embedding.learned import PRETRAINED
 from topomerge.errors import InputError
-from topomerge.models.export import check_exporter, export_network, load_exported_weights, run_with_torch
-from topomerge.networks.network import WEIGHTS_PACKAGE, Run, Signature
+from topomerge.models.export import check_exporter, export_network, run_with_torch
+from topomerge.networks.network import Run, Signature
 from topomerge.registry import SCHEDULES, TASKS
 from topomerge.training.descent import build_optimizer
 from topomerge.training.instruments import (
@@ -44,6 +42,7 @@ from topomerge.training.instruments import (
 from topomerge.training.processes import average_buffers, average_gradients, get_rank, start_fabric
 from topomerge.training.run_folder import EtaClock, MetricsLog, begin_run, export_files, write_card
 from topomerge.training.settings import NetworkSettings, NetworkTask
+from topomerge.training.starts import start_from_exported
 from topomerge.training.tasks import check_accelerator
 from topomerge.types import LogFn
 
@@ -464,12 +463,6 @@ class ExportedJob(NetworkJob):
         module, signature, _ = self.exported()
         return run_with_torch(module, signature)
 
-    def load_weights(self, path: Path) -> None:
-        """Start from exported weights."""
-        load_exported_weights(self.exported().module, path)
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        self.origin = {**self.origin, "init_from": digest}
-
     def write_weights(self, path: Path) -> None:
         """Write the weights as the package has them."""
         module, signature, sample = self.exported()
@@ -490,10 +483,7 @@ def run_network(job: Job, settings: NetworkTask, steps: int, log_line: LogFn) ->
     state, chief = State(), get_rank() == 0
     task = TASKS[settings.task]
     if settings.init_from and not settings.resume:
-        if not isinstance(job, ExportedJob):
-            raise InputError(f"task={settings.task}: init_from is for networks that are exported; leave it out")
-        shipped = settings.init_from == PRETRAINED
-        job.load_weights(find_weights_file(WEIGHTS_PACKAGE, task.file) if shipped else Path(settings.init_from))
+        start_from_exported(job, settings, task.file)
     if settings.resume:
         state = State(**load_state(settings.folder / "last", job.network, job.get_optimizer(), NETWORK_FILE))
     if chief:

@@ -34,47 +34,30 @@ class PartRooms:
         room: (k,) int64 of each place.
         entered: (R,) probability that somebody was in each room.
         area: m2 of each place.
-        joins: is one room on both sides evidence against a door? Not of a drawing, half of whose doors may be missed.
     """
 
     places: Array
     room: Array
     entered: Array
     area: float
-    joins: bool = True
 
 
 class PlacedRooms(NamedTuple):
-    """A part's rooms in the columns of a storey, (nx, ny), -1 none, of each room (R,) 0..1 how sure the part is of it, and
-    `joins` of the part."""
+    """A part's rooms in the columns of a storey, (nx, ny), -1 none, and of each room (R,) 0..1 how sure the part is of it."""
 
     room: Array
     certainty: Array
-    joins: bool = True
 
 
 def rasterise_part_rooms(plan: StoreyPlan, parts: Sequence[PartRooms]) -> list[PlacedRooms]:
     """Return the rooms of parts in the columns of a storey."""
-    certainties = [np.where(part.entered < 0.5, GLIMPSED, 1.0) for part in parts]
-    return [PlacedRooms(_find_column_rooms(plan, p), sure, p.joins) for p, sure in zip(parts, certainties, strict=True)]
-
-
-def build_drawn_rooms(rooms: Array | None) -> tuple[PartRooms, ...]:
-    """Build what a drawing says of where rooms part (docs/adr/0048).
-
-    Args:
-        rooms: (k, 4) places on their floor, m, and number of the room; None: it is no drawing.
-    """
-    if rooms is None or not len(rooms):
-        return ()
-    number = rooms[:, 3].astype(np.int64)
-    return (PartRooms(rooms[:, :3], number, np.ones(int(number.max()) + 1), 0.0, joins=False),)
+    return [PlacedRooms(_find_column_rooms(plan, part), np.where(part.entered < 0.5, GLIMPSED, 1.0)) for part in parts]
 
 
 def find_boundary_columns(rooms: Sequence[PlacedRooms]) -> Array:
     """(nx, ny) bool: where rooms of a part meet that somebody was in. Regions end there even if the cells show nothing."""
     out = np.zeros(rooms[0].room.shape, bool)
-    for room, certainty, _ in rooms:
+    for room, certainty in rooms:
         sure = np.where(np.append(certainty == 1, False)[room], room, -1)
         highest, lowest = ndimage.maximum_filter(sure, 3), ndimage.minimum_filter(np.where(sure < 0, len(certainty), sure), 3)
         out |= (sure >= 0) & (highest != lowest)
@@ -97,8 +80,7 @@ def compute_door_log_odds(
         x, y = passage.place
         box = slice(max(x - reach, 0), x + reach + 1), slice(max(y - reach, 0), y + reach + 1)
         sides = region[box] == a, region[box] == b
-        scores = [(_score_separation(part.room[box], part.certainty, sides), part.joins) for part in rooms]
-        out[a, b] = LOG_ODDS * sum(score for score, joins in scores if joins or score > 0)
+        out[a, b] = LOG_ODDS * sum(_score_separation(room[box], certainty, sides) for room, certainty in rooms)
     return out
 
 
