@@ -12,7 +12,7 @@ import numpy as np
 from topomerge.archive import convert_to_plain, replace_on_success
 from topomerge.changes.compare import Change, Changes
 from topomerge.errors import InputError
-from topomerge.io.exports.__init__ import replace_forbidden
+from topomerge.io.exports import replace_forbidden
 from topomerge.io.exports.geojson import format_collection, round_positions
 from topomerge.io.listing import format_columns, format_json
 from topomerge.types import Array

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as xml
 
-from topomerge.io.exports.__init__ import replace_forbidden, write_xml
+from topomerge.io.exports import replace_forbidden, write_xml
 from topomerge.types import TopometricMap, find_room_names
 
 SPACE = "http://graphml.graphdrawing.org/xmlns"

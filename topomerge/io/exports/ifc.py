@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from topomerge.archive import replace_on_success
-from topomerge.io.exports.__init__ import replace_forbidden
+from topomerge.io.exports import replace_forbidden
 from topomerge.io.listing import describe_room
 from topomerge.structure.floors import is_flight, measure_room_levels
 from topomerge.structure.plan_structure import build_plan_structure

@@ -19,7 +19,7 @@ from xml.etree import ElementTree as xml
 import numpy as np
 import shapely
 
-from topomerge.io.exports.__init__ import replace_forbidden, write_xml
+from topomerge.io.exports import replace_forbidden, write_xml
 from topomerge.structure.floors import compute_jambs, find_inside_point, is_flight, measure_room_levels
 from topomerge.structure.plan_structure import PlanStructure, build_plan_structure
 from topomerge.structure.walls import build_wall_polygon
