@@ -6,22 +6,20 @@ To add one, write a module with a function (map, path) and enter it here.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree as xml
 
+from topomerge.archive import replace_on_success
 from topomerge.errors import InputError
 
 if TYPE_CHECKING:
     from topomerge.types import TopometricMap
-
-import re
-from xml.etree import ElementTree as xml
-
-from topomerge.archive import replace_on_success
 
 Save = Callable[[Path], None]
 
