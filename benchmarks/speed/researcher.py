@@ -96,10 +96,9 @@ def main(page: str = "", most: int = len(STEPS)) -> None:
         rows = []
         for what, words in STEPS[:most]:
             processor, clock = time_step(words, folder)
-            typed = words.removeprefix("-m ") if words.startswith("-m topomerge ") else f"python {words}"
-            rows.append([what, f"`{typed}`", f"{processor:.0f}", f"{clock:.0f}"])
+            rows.append([what, f"`{words}`", f"{processor:.0f}", f"{clock:.0f}"])
             print(f"# {what}: {processor:.1f} s of processor, {clock:.1f} s", flush=True)
-    table = write_table(["what", "typed", "s of processor", "s by the clock"], rows)
+    table = write_table(["what", "typed behind `python`", "s of processor", "s by the clock"], rows)
     print(table)
     if page:
         write_blocks(Path(page), {"researcher": table}, build_stamp(f"{COMMAND} {page}", MODULES))
