@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy import ndimage
 
 from topomerge.errors import InputError
 from topomerge.io import grid, read_points
@@ -274,3 +275,21 @@ def test_cases_of_strangers(case_dir: Path) -> None:
 def test_real_storeys_are_not_drowned_in_floor(data_dir: Path, name: str, least: float, most: float) -> None:
     """Their editor saved unknown as 206, which free_thresh 0.196 takes for floor."""
     assert least < read(data_dir / "storeys_jsk" / f"{name}.yaml")[1].mean() < most
+
+
+def test_walls_washed_out_by_scaling_are_walls(tmp_path: Path) -> None:
+    picture = two_rooms()
+    small = np.asarray(Image.fromarray(picture).resize((picture.shape[1] // 2, picture.shape[0] // 2), Image.Resampling.BOX))
+    small = np.where(small == (WALL + UNKNOWN + 1) // 2, 130, small)
+    occupied, free, _ = read(write(tmp_path, small, name="small.png"))
+    assert ndimage.label(free)[1] == 1 and not (occupied & free).any()
+    outside, _ = ndimage.label(~occupied)
+    assert outside[0, 0] != outside[small.shape[0] // 2, small.shape[1] // 2]  # no way leads out through the walls
+
+
+def test_grey_areas_and_rims_of_walls_stay_unknown(tmp_path: Path) -> None:
+    picture = two_rooms()
+    picture[10:20, 10:30] = 120  # painted by hand
+    picture[59, 60:222] = 140  # along the outer side of a black wall
+    occupied, _, _ = read(write(tmp_path, picture))
+    np.testing.assert_array_equal(occupied, picture == WALL)

@@ -13,6 +13,10 @@ APART = 20  # levels of 255, at least, from the grey of unknown to that of floor
 NEAR_TWO_GREYS = 0.9  # of the pixels of all but the commonest grey: of real maps of three values .9 to 1 lie around the second
 NEAR_TWO_GREYS_JPEG = 0.7  # likewise; its noise carries pixels further
 BETWEEN = 0.2  # pixels between the two greys for each one of noise around that of unknown, at most, where the two are clear cut
+LEAST_BLACK = 0.25  # of a pixel of a wall that was washed out when the picture was made smaller
+FLOOR_GREY, LEAST_UNKNOWN = 250, 0.1  # lighter is floor; share of the pixels that have the very grey of unknown
+BESIDE_WALL = 20  # levels of 255 by which it is darker than what lies on both sides
+LEAST_WASHED = 0.2  # of a grid's walls: of those that robots leave at most .13 are grey lines, of a storey made smaller .26
 USUAL_UNKNOWN, USUAL_WITHIN = 205, 4  # levels of 255: the grey of unknown of ROS, and how far pictures saved again are from it
 
 
@@ -80,6 +84,33 @@ def is_unknown_grey(grey: GreyLevels, levels: Array, counted: Array) -> bool:
     inner[1:-1, 1:-1] = True
     border = levels[counted & ~inner]
     return bool((border < grey.middle).sum() > (border >= grey.middle).sum())
+
+
+def find_washed_walls(levels: Array, counted: Array, occupied: Array) -> Array:
+    """Find the thin lines (h, w) bool that are darker than unknown: walls washed out when the picture was made smaller.
+
+    A grid has three values, so that darker pixels hold black. Lines alone: the washed-out rim of a black wall would thicken it.
+
+    Args:
+        levels: (h, w) uint8; where the grey of unknown is not that of ROS, darker ones may be anything, and no wall is found.
+        counted: (h, w) bool, the pixels that are neither walls nor transparent.
+        occupied: (h, w) bool, the walls that are black enough: where these are most of all, none was washed out.
+    """
+    shares = np.bincount(levels[counted], minlength=256) / max(int(counted.sum()), 1)
+    unknown = int(shares[:FLOOR_GREY].argmax())
+    if abs(unknown - USUAL_UNKNOWN) > USUAL_WITHIN or shares[unknown] < LEAST_UNKNOWN:
+        return np.zeros(levels.shape, bool)
+    value = levels.astype(np.int16)
+    around = np.pad(value, 2, constant_values=unknown)
+    line = np.zeros(levels.shape, bool)
+    for turned, out in ((around, line), (around.T, line.T)):
+        h = len(out)
+        middle = turned[2:-2, 2:-2]
+        before, after = turned[1 : 1 + h, 2:-2], turned[3 : 3 + h, 2:-2]
+        farther = np.minimum(turned[:h, 2:-2], turned[4 : 4 + h, 2:-2])
+        out |= (middle <= before) & (middle <= after) & (middle + BESIDE_WALL < farther)
+    washed = line & counted & (value < (1 - LEAST_BLACK) * unknown)
+    return washed if washed.sum() >= LEAST_WASHED * (washed.sum() + occupied.sum()) else np.zeros(levels.shape, bool)
 
 
 def _get_level_window(level: int) -> slice:

@@ -18,7 +18,7 @@ from topomerge.errors import InputError
 from topomerge.io.drawing import NAME_HEIGHT, TracedDrawing, build_name_landmarks, build_stairs_landmarks, trace_drawing
 from topomerge.io.drawn_page import find_page
 from topomerge.io.drawn_storeys import find_storeys
-from topomerge.io.grey_levels import find_grey_levels, is_clear_cut, is_unknown_grey
+from topomerge.io.grey_levels import GreyLevels, find_grey_levels, find_washed_walls, is_clear_cut, is_unknown_grey
 from topomerge.io.piece import (
     BLOCK_POINTS,
     MOST_POINTS,
@@ -335,7 +335,7 @@ def read_pixels(path: Path, plan: Plan) -> tuple[Array, Array, tuple[str, ...]]:
         raise InputError(f"{path}: {wrong}; is free space white and are walls black? mend thresholds, negate or mode")
     doubts: list[str] = []
     if plan.mode == "trinary":
-        free, notes = _remove_unknown(path, image, plan, occupied, free)
+        occupied, free, notes = _read_greys(path, image, plan, occupied, free)
         doubts += [notes] if notes else []
     if is_inverted(occupied, free, plan.resolution):
         advice = (
@@ -349,16 +349,30 @@ def read_pixels(path: Path, plan: Plan) -> tuple[Array, Array, tuple[str, ...]]:
     return occupied, free, tuple(doubts)
 
 
-def _remove_unknown(path: Path, image: tuple[Array, Array], plan: Plan, occupied: Array, free: Array) -> tuple[Array, str]:
-    """The free pixels without those that are unknown by their grey, and the warning about them, "" for none."""
+def _read_greys(path: Path, image: tuple[Array, Array], plan: Plan, occupied: Array, free: Array) -> tuple[Array, Array, str]:
+    """The occupied pixels with walls that are grey lines, the free ones without those that are unknown by their grey, and the
+    warning about them, "" for none."""
     bright, clear = image
     counted = ~(occupied | clear | np.isnan(bright))
     levels = np.round(np.nan_to_num(bright.clip(0.0, 1.0)) * 255.0).astype(np.uint8)
     levels = 255 - levels if plan.negate else levels
     with plan.image.open("rb") as stream:
         lossy = stream.read(len(JPEG_MAGIC)) == JPEG_MAGIC
+    if not lossy:
+        occupied = occupied | find_washed_walls(levels, counted, occupied)
+        free = free & ~occupied
     grey = find_grey_levels(levels[counted], lossy)
-    if grey is None or grey.threshold >= plan.free:
+    if grey is None:
+        return occupied, free, ""
+    known, text = _remove_unknown(path, plan, grey, levels, free, counted, lossy)
+    return occupied, known, text
+
+
+def _remove_unknown(
+    path: Path, plan: Plan, grey: GreyLevels, levels: Array, free: Array, counted: Array, lossy: bool
+) -> tuple[Array, str]:
+    """The free pixels without those that are unknown by their grey, and the warning about them, "" for none."""
+    if grey.threshold >= plan.free:
         return free, ""
     is_floor = bool((free & (levels == grey.unknown)).any())
     if is_floor and not is_unknown_grey(grey, levels, counted):
