@@ -39,7 +39,6 @@ from topomerge.embedding.quarter_turns import (
     rotate_to_walls,
 )
 from topomerge.embedding.shapedna import build_shapedna
-from topomerge.embedding.sheets import build_tilted_sheet_arrays
 from topomerge.embedding.surroundings import CROP_SHAPES, cut_crops
 from topomerge.errors import InputError
 from topomerge.networks.network import WEIGHTS_PACKAGE, Run, card_of, open_network, read_card
@@ -273,6 +272,8 @@ class LearnedEmbedder:
     def _add_sheets(self, arrays: dict[str, Array], map: TopometricMap, scale: float) -> list[dict[str, Array]]:
         if self.network.turns == 1:
             return [arrays]
+        from topomerge.embedding.sheets import build_tilted_sheet_arrays  # here: a machine that only trains reads no maps
+
         return [arrays | sheet for sheet in build_tilted_sheet_arrays(map, scale)]
 
     def _build_graph_arrays(self, map: TopometricMap) -> dict[str, Array]:
