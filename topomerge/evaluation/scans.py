@@ -34,7 +34,7 @@ from topomerge.io.points import read_points
 from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.types import Array, PointCloud, TopometricMap, TrueRoom, VoxelGrid
 
-SCAN_FORMAT = 3  # raise it when the same case gives other bytes
+SCAN_FORMAT = 4  # raise it when the same case gives other bytes
 EDITED_SOURCE = "edited"
 COMMON = 0.6  # share of the rooms that the two sessions of a pair have in common
 ADRIFT = 1.5  # degrees about every 15 m: three times a hand-held camera's
