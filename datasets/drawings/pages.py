@@ -12,10 +12,14 @@ from topomerge.datasets.drawings.hands import draw_plan
 from topomerge.datasets.drawings.shapes import DrawingShapes, mirror_shapes
 from topomerge.datasets.drawings.sheet import Drawing, choose_hand
 
+from topomerge.io.drawing import COARSEST, FINEST
 from topomerge.networks.drawing import PAGE
 from topomerge.types import Array
 
-SCALES = 8.0, 50.0  # px/m, of the pages that are learned from
+SEEN_SCALES = 1 / COARSEST, 1 / FINEST  # px/m at which a page whose scale is known is looked at
+UNKNOWN_SCALES = 25.0, 45.0  # px/m: of pages whose scale is not known
+MOST_SHRUNK = 2.0  # times as fine as they are looked at are pages that are made smaller first
+AT_FINEST, AT_OTHERS = 0.5, 0.4  # of the pages that are learned from; the rest are of unknown scale
 
 
 def spoil_page(drawing: Drawing, rng: np.random.Generator) -> Drawing:
@@ -103,16 +107,43 @@ def spoil_light(pixels: Array, rng: np.random.Generator) -> Array:
 
 
 def sample_drawing(shapes: Sequence[DrawingShapes], rng: np.random.Generator, side: int = 256, corrupted: bool = True) -> Drawing:
-    """Draw a window of one of the plans in a hand at random: what the network of drawings learns from."""
+    """Draw a window of one of the plans in a hand at random, as large as the network of drawings sees pages."""
     one = shapes[int(rng.integers(len(shapes)))]
     one = mirror_shapes(one) if rng.random() < 0.5 else one
-    points = np.concatenate([r.polygon for r in one.rooms])
-    low, high = points.min(axis=0), points.max(axis=0)
-    extent = float(np.ptp(points, axis=0).max())
-    fit = side / (extent + 4)
-    scale = float(np.clip(fit * np.exp(rng.uniform(-0.3, 1.4)), *SCALES))
+    scale = _sample_scale(rng)
     window = side / scale
-    centre = rng.uniform(low - 1.0, high + 1.0) if rng.random() < 0.6 else (low + high) / 2
-    corner = centre - window / 2
-    drawing = draw_plan(one, choose_hand(rng), rng, (side, side), scale, corner)
-    return spoil_page(drawing, rng) if corrupted else drawing
+    corner = _sample_centre(one, rng, window) - window / 2
+    fine = round(side * float(np.exp(rng.uniform(0, np.log(MOST_SHRUNK)))))
+    drawing = draw_plan(one, choose_hand(rng), rng, (fine, fine), fine / window, corner)
+    return shrink_drawing(spoil_page(drawing, rng) if corrupted else drawing, side)
+
+
+def _sample_centre(shapes: DrawingShapes, rng: np.random.Generator, window: float) -> Array:
+    """(2,) m: anywhere in the plan, its middle, or about an opening."""
+    points = np.concatenate([r.polygon for r in shapes.rooms])
+    low, high = points.min(axis=0), points.max(axis=0)
+    kind = rng.random()
+    if kind < 0.4 and shapes.openings:
+        opening = shapes.openings[int(rng.integers(len(shapes.openings)))]
+        return np.asarray(opening.line.mean(axis=0) + rng.normal(0, window / 6, 2))
+    return np.asarray(rng.uniform(low - 1.0, high + 1.0) if kind < 0.8 else (low + high) / 2)
+
+
+def _sample_scale(rng: np.random.Generator) -> float:
+    """Px/m at which a page is looked at."""
+    kind = rng.random()
+    if kind < AT_FINEST:
+        return SEEN_SCALES[1]
+    low, high = SEEN_SCALES if kind < AT_FINEST + AT_OTHERS else UNKNOWN_SCALES
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def shrink_drawing(drawing: Drawing, side: int) -> Drawing:
+    """Return a square drawing of so many pixels a side, the picture as `io.drawing.resize_picture` makes it."""
+    old = len(drawing.picture)
+    if old == side:
+        return drawing
+    picture = np.asarray(Image.fromarray(drawing.picture).resize((side, side), Image.Resampling.BOX))
+    at = ((np.arange(side) + 0.5) * old / side).astype(int)
+    classes, rooms = drawing.classes[at][:, at], drawing.rooms[at][:, at]
+    return Drawing(picture, classes, rooms, drawing.texts, drawing.scale * side / old)

@@ -29,7 +29,9 @@ def parse_dark_lines(picture: np.ndarray, resolution: float | None = None) -> Pa
     """Parse a picture without a network: dark pixels are walls, and what they enclose is floor."""
     dark = picture.mean(axis=2) < 128
     label, _ = ndimage.label(~dark)
-    return ParsedDrawing(dark, ~dark & (label != label[0, 0]), np.zeros_like(dark), np.zeros_like(dark), 1.0)
+    return ParsedDrawing(
+        dark, ~dark & (label != label[0, 0]), np.zeros_like(dark), np.zeros_like(dark), np.zeros(dark.shape, np.float32), 1.0
+    )
 
 
 def _cut(start: float, end: float, gaps: list[tuple[float, float]]) -> list[tuple[float, float]]:

@@ -250,7 +250,7 @@ def trace_two(shift=(6, 3), titles=("FIRST FLOOR", "GROUND FLOOR"), other=False)
     free |= door
     occupied &= ~free
     texts = tuple(PictureText(t, (c + 60.0, r + 165.0), 10.0, 1.0) for t, (c, r) in zip(titles, boxes, strict=False))
-    return TracedDrawing(ParsedDrawing(occupied, free, door, np.zeros_like(free), 1.0), 0.05, texts, ())
+    return TracedDrawing(ParsedDrawing(occupied, free, door, np.zeros_like(free), door.astype(np.float32), 1.0), 0.05, texts, ())
 
 
 def test_two_plans_on_a_sheet_are_storeys_over_each_other(tmp_path):

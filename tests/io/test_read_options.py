@@ -15,7 +15,8 @@ from tests.samples import box_points
 from topomerge.errors import InputError
 from topomerge.io import frame, read_chunks, read_points
 from topomerge.io import points as reading
-from topomerge.io.points import PointSample, compute_flatness, warn_about
+from topomerge.io.point_warnings import compute_flatness, warn_about
+from topomerge.io.points import PointSample
 from topomerge.types import VoxelGrid
 
 

@@ -239,7 +239,10 @@ def transform_cloud(cloud: PointCloud, matrix: Array) -> PointCloud:
     poses = None if cloud.poses is None else matrix @ np.asarray(cloud.poses, np.float64)
     free = None if cloud.free is None else transform_grid(cloud.free, matrix)
     landmarks = cloud.landmarks and transform_landmarks(cloud.landmarks, partial(transform_points, matrix))
-    return replace(cloud, points=points, poses=poses, free=free, landmarks=landmarks)
+    drawn = cloud.drawn_doors
+    if drawn is not None:
+        drawn = np.column_stack([transform_points(matrix, drawn[:, :3]), drawn[:, 3]])
+    return replace(cloud, points=points, poses=poses, free=free, landmarks=landmarks, drawn_doors=drawn)
 
 
 def transform_grid(grid: VoxelGrid, matrix: Array) -> VoxelGrid:

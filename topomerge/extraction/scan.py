@@ -40,6 +40,7 @@ class Scan:
         raised: is it a robot's grid or a drawing, whose walls were all raised alike (`slices.is_raised`)?
         flat: is it a slice, in which nothing tells walls from what else stands about (`slices.is_slice`)?
         landmarks: of its file, in the frame of the grid.
+        drawn_doors: (k, 4) floor on which a drawing shows doors, in that frame: place, m, and probability; None elsewhere.
     """
 
     grid: VoxelGrid
@@ -53,6 +54,7 @@ class Scan:
     raised: bool = False
     flat: bool = False
     landmarks: Landmarks = field(default_factory=Landmarks)
+    drawn_doors: Array | None = None
 
     @property
     def places(self) -> Array:
@@ -110,6 +112,7 @@ def read_scan(
         grid = coarsen_until_dense(grid, least_neighbours, chunks.warnings)
     landmarks = join_landmarks(chunks.landmarks)
     scan = Scan(grid, close, chunks.rays, chunks.free, chunks.source, tuple(chunks.warnings), landmarks=landmarks)
+    scan = replace(scan, drawn_doors=chunks.drawn_doors)
     return scan if levelled is None else replace(scan, levelling=levelled.matrix, warnings=(*levelled.warnings, *scan.warnings))
 
 
@@ -141,6 +144,7 @@ class _Chunks:
         self.free: VoxelGrid | None = None
         self.warnings: list[str] = []
         self.landmarks: list[Landmarks] = []
+        self.drawn_doors: Array | None = None
         self._rays: list[tuple[Array, Array]] = []
         self._step = 1  # of the rays, every one or every second, fourth ... is held
 
@@ -154,6 +158,7 @@ class _Chunks:
             self.free = chunk.free or self.free
             self.warnings += [w for w in chunk.warnings if w not in self.warnings]
             self.landmarks += [] if chunk.landmarks is None else [chunk.landmarks]
+            self.drawn_doors = self.drawn_doors if chunk.drawn_doors is None else chunk.drawn_doors
             if chunk.poses is not None and chunk.pose_of is not None and len(chunk):
                 self._add_rays(*_select_rays(chunk, chunk.poses, chunk.pose_of))
             yield chunk

@@ -25,7 +25,13 @@ from topomerge.extraction.plans.passages import (
     sort_pair,
 )
 from topomerge.extraction.plans.plan import build_storey_plan, locate_columns, remove_upper_sides
-from topomerge.extraction.plans.plan_network import LOOKS, compute_column_probabilities, load_weights, remove_furniture
+from topomerge.extraction.plans.plan_network import (
+    LOOKS,
+    add_drawn_doors,
+    compute_column_probabilities,
+    load_weights,
+    remove_furniture,
+)
 from topomerge.extraction.plans.storey_plan import ClassifiedStorey, Merge, StoreyPlan
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.slices import is_raised
@@ -123,6 +129,8 @@ def rasterise_storeys(scan: Scan, navigable: VoxelGrid, standing_height: float, 
     for k in numbers:
         plan = build_storey_plan(coarse, floor, of_coarse, k, scan.crossed)
         probability = compute_column_probabilities(plan, load_weights(raised), looks)
+        if scan.drawn_doors is not None:
+            probability = add_drawn_doors(plan, probability, scan.drawn_doors)
         plans.append(remove_furniture(plan, probability))
         probabilities.append(probability)
     return RasterisedStoreys(coarse, storeys, storey, factor, tuple(numbers), tuple(plans), tuple(probabilities))

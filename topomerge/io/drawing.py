@@ -65,6 +65,7 @@ class ParsedDrawing:
 
     Args:
         occupied: (h, w) bool, walls and windows; free: floor and open doors; door, window: (h, w) bool.
+        doorway: (h, w) float32, probability of a door on the floor.
         zoom: pixels of these for each of the picture.
         stairs: (h, w) bool, treads; None: there are none.
     """
@@ -73,6 +74,7 @@ class ParsedDrawing:
     free: Array
     door: Array
     window: Array
+    doorway: Array
     zoom: float
     stairs: Array | None = None
 
@@ -155,7 +157,8 @@ def find_structure(probability: Array, zoom: float, scale: float | None) -> Pars
     doors, _ = ndimage.label(door)
     door &= np.isin(doors, np.unique(doors[ndimage.binary_dilation(rooms, np.ones((3, 3)), 2)]))
     near = ndimage.distance_transform_edt(~(rooms | door)) <= WALL_NEAR * known
-    return ParsedDrawing(occupied & near, rooms | door, door, window & near, zoom)
+    free = rooms | door
+    return ParsedDrawing(occupied & near, free, door, window & near, np.where(free, probability[..., DOOR], 0), zoom)
 
 
 def find_treads(picture: Array, resolution: float) -> Array:

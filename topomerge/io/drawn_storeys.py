@@ -34,11 +34,13 @@ HIGHEST = 100
 
 @dataclass(frozen=True, eq=False)
 class DrawnStorey:
-    """A plan of a sheet: walls, floor and treads, (h, w) bool of the sheet's pixels, and where its lower left corner is, m."""
+    """A plan of a sheet: walls, floor and treads, (h, w) bool of the sheet's pixels, how probably each shows a door, and where
+    its lower left corner is, m."""
 
     occupied: Array
     free: Array
     stairs: Array | None
+    doorway: Array
     corner: tuple[float, float] = (0.0, 0.0)
 
 
@@ -69,7 +71,7 @@ def find_storeys(path: Path, traced: TracedDrawing, number: int | None) -> tuple
     placed = place_storeys([plans[k] for k in order], traced.resolution, COMMON / 2 if titled else COMMON)
     one = "--page 1 reads the first alone"
     if placed is None:
-        whole = DrawnStorey(drawing.occupied, drawing.free, drawing.stairs)
+        whole = DrawnStorey(drawing.occupied, drawing.free, drawing.stairs, drawing.doorway)
         return [whole], (f"{path.name}: holds {count} plans that do not fit over each other, read side by side; {one}",)
     how = "by their titles" if titled else "in the order in which they stand"
     return placed, (f"{path.name}: holds {count} plans, read as storeys over each other, {how}; {one}",)
@@ -103,7 +105,7 @@ def find_plans(drawing: ParsedDrawing, resolution: float) -> tuple[Array, int]:
 
 def _select_plan(drawing: ParsedDrawing, mask: Array) -> DrawnStorey:
     stairs = None if drawing.stairs is None else drawing.stairs & mask
-    return DrawnStorey(drawing.occupied & mask, drawing.free & mask, stairs)
+    return DrawnStorey(drawing.occupied & mask, drawing.free & mask, stairs, np.where(mask, drawing.doorway, 0))
 
 
 def find_titles(label: Array, count: int, traced: TracedDrawing) -> list[list[PictureText]]:

@@ -17,7 +17,7 @@ from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError
 from topomerge.io.drawing import NAME_HEIGHT, TracedDrawing, build_name_landmarks, build_stairs_landmarks, trace_drawing
 from topomerge.io.drawn_page import find_page
-from topomerge.io.drawn_storeys import find_storeys
+from topomerge.io.drawn_storeys import DrawnStorey, find_storeys
 from topomerge.io.grey_levels import GreyLevels, find_grey_levels, find_washed_walls, is_clear_cut, is_unknown_grey
 from topomerge.io.piece import (
     BLOCK_POINTS,
@@ -35,6 +35,7 @@ OUTSIDE_SHARE = 1 / 3  # of the floor: more outside of every wall is suspicious;
 FEW_WALLS = 4  # of 8 directions in which a place outside of the walls meets one, at most
 PIXELS_LOOKED_AT = 4_000_000  # of a larger picture every second, third ... pixel
 BODY_RADIUS = 0.25  # m; floor where no body fits is no floor but the lines of walls
+LEAST_DOORWAY, DOOR_STEP = 0.05, 0.06  # probability of a door; m between places of it, at most
 SLAB = 0.3  # m between the walls of a drawn storey and the next floor
 NARROW, WIDE = 0.1, 0.3  # of the pixels of walls, at most, and of floor, at least, that lie deeper than that in what is like them
 
@@ -165,19 +166,35 @@ def build_drawn_pieces(path: Path, traced: TracedDrawing, options: ReadOptions, 
     """
     storeys, warnings = find_storeys(path, traced, number)
     height = (options.extrude + SLAB) / options.factor
-    parts, grids = [], []
+    parts, grids, doors = [], [], []
     for level, storey in enumerate(storeys):
         plan = Plan(path, traced.resolution, (*storey.corner, 0.0))
         at = storey.corner, NAME_HEIGHT / options.factor + level * height, path.name
         parts.append(build_name_landmarks(traced.texts, storey.free, plan.resolution, *at))
         parts.append(build_stairs_landmarks(storey.stairs, plan.resolution, *at))
         grids.append(plan)
-    yield Piece(np.empty((0, 3)), warnings=(*traced.warnings, *warnings), done=0.1, landmarks=join_landmarks(parts))
+        doors.append(list_drawn_doors(storey, plan, level * height, options.factor))
+    about = Piece(np.empty((0, 3)), warnings=(*traced.warnings, *warnings), done=0.1)
+    yield replace(about, landmarks=join_landmarks(parts), drawn_doors=np.concatenate(doors))
     closed = options if len(storeys) == 1 else replace(options, ceiling=True)  # else the next floor is the ceiling
     for level, (storey, plan) in enumerate(zip(storeys, grids, strict=True)):
         for piece in extrude(path, storey.occupied, storey.free, plan, closed):
             raised = piece.points + [0.0, 0.0, level * height] if level else piece.points
             yield replace(piece, points=raised, done=0.1 + 0.9 * (level + piece.done) / len(storeys))
+
+
+def list_drawn_doors(storey: DrawnStorey, plan: Plan, floor: float, factor: float) -> Array:
+    """List (k, 4) places that may show a door, so close that none of a plan's columns is left out, and how probably they do.
+
+    Args:
+        floor: height of the floor; factor: m of the plan's unit.
+    """
+    count = int(np.ceil(plan.resolution / (DOOR_STEP / factor)))  # places along a pixel
+    rows, columns = np.nonzero(storey.doorway >= LEAST_DOORWAY)
+    i, j = (np.indices((count, count)).reshape(2, -1, 1) + 0.5) / count
+    x = plan.origin[0] + (columns + j) * plan.resolution
+    y = plan.origin[1] + (len(storey.doorway) - rows - i) * plan.resolution
+    return np.stack(np.broadcast_arrays(x, y, floor, storey.doorway[rows, columns]), axis=-1).reshape(-1, 4)
 
 
 def read_picture(path: Path) -> Array:

@@ -198,6 +198,7 @@ class PointCloud:
         intensities: (N,) float32, how much of its light came back, in whatever the file counts in.
         upright: z is known to be up, so that nobody needs to level it: of a plan, a building model, a simulated scan.
         landmarks: signs, tags, radio, pressure, objects and names in the file's frame, m; of portions the last one has them.
+        drawn_doors: (k, 4) floor on which a drawing shows doors: place, m, and how probably; likewise.
 
     Raises:
         ValueError: arrays of other shapes, or points that are no array of numbers.
@@ -216,6 +217,7 @@ class PointCloud:
     intensities: Array | None = None
     upright: bool = False
     landmarks: Landmarks | None = None
+    drawn_doors: Array | None = None
 
     def __post_init__(self) -> None:
         numbers = isinstance(self.points, np.ndarray) and self.points.dtype.kind in "biuf"

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES, INSIDE_CLASS, StoreyPlan
+from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES, DOORWAY_CLASS, INSIDE_CLASS, StoreyPlan
 from topomerge.kernels import run_side_by_side
 from topomerge.networks.network import Network, Run, Signature, Tensor, load_network, load_shipped_network
 from topomerge.types import Array
@@ -29,6 +29,7 @@ SIZE_CHANNEL = EVIDENCE_CHANNELS - 1  # the last one, which is the same everywhe
 LOOKS = 4  # at a plan, each a quarter turned
 NETWORK_REACH = 4  # strides: the network sees 60 columns to each side
 WORTH_PARTING = 0.8  # of a plan's area: its parts are looked at one by one where their boxes have less
+SAME_STOREY = 1.2  # m between a drawn door and the floor of its storey
 FURNITURE_CHANCE = 0.6, 0.95  # of the inside of a room, from which on what looked like wall is none: without and with a ceiling
 
 
@@ -123,6 +124,27 @@ def _split_parts(known: Array) -> list[tuple[tuple[slice, slice], Array]] | None
         parts.append((columns, mask.repeat(step, 0).repeat(step, 1)))
         size += mask.size
     return parts if size < WORTH_PARTING * seen.size else None
+
+
+def add_drawn_doors(plan: StoreyPlan, probability: Array, doors: Array) -> Array:
+    """Return the probabilities with the doors that a drawing shows: of a doorway the greater of both (docs/adr/0048).
+
+    Args:
+        probability: (nx, ny, 5) of each of `COLUMN_CLASSES`.
+        doors: (k, 4) places on the floor, m, and how probably the drawing shows a door there.
+    """
+    at = np.floor((doors[:, :2] - plan.origin) / plan.edge).astype(np.int64)
+    here = np.flatnonzero(((at >= 0) & (at < plan.wall.shape)).all(axis=1))
+    here = here[np.abs(doors[here, 2] - plan.floor[tuple(at[here].T)]) < SAME_STOREY]
+    column = np.ravel_multi_index(tuple(at[here].T), plan.wall.shape)
+    count = np.bincount(column, minlength=plan.wall.size)
+    drawn = np.bincount(column, doors[here, 3], plan.wall.size) / np.maximum(count, 1)
+    drawn = drawn.astype(np.float32).reshape(plan.wall.shape)
+    before = probability[..., DOORWAY_CLASS]
+    doorway = np.maximum(before, drawn)
+    out = probability * ((1 - doorway) / np.maximum(1 - before, np.float32(1e-6)))[..., None]
+    out[..., DOORWAY_CLASS] = doorway
+    return out
 
 
 def remove_furniture(plan: StoreyPlan, probability: Array) -> StoreyPlan:
