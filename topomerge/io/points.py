@@ -21,7 +21,6 @@ import numpy as np
 from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError, is_memory_short
 from topomerge.io import frame
-from topomerge.io.frame import get_axis_rotation
 from topomerge.io.landmarks import read_tables_beside
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_options
 from topomerge.io.sightings import ObjectFinder
@@ -77,7 +76,8 @@ def warn_about(points: Array, up: str | None) -> list[str]:
     if up is None:
         return _check_unit(high - low, ())
     units = (("mm", 0.001), ("cm", 0.01))
-    return _check_degrees(low, high) or _check_unit(high - low, units) or _check_up_axis(points, low, high, up)
+    rounded = frame.describe_rounding(points)
+    return rounded or _check_degrees(low, high) or _check_unit(high - low, units) or _check_up_axis(points, low, high, up)
 
 
 def _check_degrees(low: Array, high: Array) -> list[str]:
@@ -119,7 +119,7 @@ def _check_up_axis(points: Array, low: Array, high: Array, up: str) -> list[str]
         return [f"{tall:.1f} m tall, but only {narrow:.1f} m wide: if another axis than {up} is up in this file, give --up"]
     if best == 2 or not clear or tall < STOREY_HEIGHT:
         return []
-    axis = "xyz"[int(np.abs(get_axis_rotation(up)[best]).argmax())]
+    axis = "xyz"[int(np.abs(frame.get_axis_rotation(up)[best]).argmax())]
     return [
         f"floors and ceilings seem to lie across {axis}, not {up} ({scores[best]:.0%} of the surface lies flat in "
         f"{axis}, {scores[2]:.0%} in {up}): if {axis} is up in this file, give --up {axis}"
@@ -190,7 +190,7 @@ class Gatherer:
 
     def __init__(self, source: str, up: str | None, factor: float, chunk: int, warnings: list[str]) -> None:
         self.source, self.up, self.factor, self.chunk = source, up, factor, chunk
-        self.rotation = frame.get_axis_rotation(up or "z")
+        self.rotation = frame.frame.get_axis_rotation(up or "z")
         self.shift: Array | None = None
         self.warnings = list(warnings)
         self.sample = PointSample()
