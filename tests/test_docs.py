@@ -95,11 +95,18 @@ def test_examples(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, r
     run_page(page, tmp_path)
 
 
+def find_fault(example: Example, page: Path) -> str:
+    """What of an example's Python cannot be read, or nothing."""
+    try:
+        compile(example.text, f"{page.name}:{example.line}", "exec")
+    except SyntaxError as error:
+        return f"{page.name}:{example.line}: {error}"
+    return ""
+
+
 @pytest.mark.parametrize("page", [pytest.param(p, id=p.name) for p in pages()])
 def test_python_examples_can_be_read(page: Path) -> None:
-    for example in examples(page):
-        if example.kind == "python":
-            compile(example.text, f"{page.name}:{example.line}", "exec")
+    assert not [fault for example in examples(page) if example.kind == "python" and (fault := find_fault(example, page))]
 
 
 def test_every_command_in_the_docs_exists() -> None:

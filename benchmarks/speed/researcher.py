@@ -45,7 +45,8 @@ def build_transformer(settings, channels):
 @LOSSES.register("alignment")
 def score_alignment(settings, batch):
     alike, same = batch.embedding @ batch.embedding.T, batch.truth.same
-    return 1 - (alike * same).sum(dim=1) / same.sum(dim=1).clamp(min=1) + 0.5 * alike.mean(dim=1), same.any(dim=1)
+    partner = (alike * same).sum(dim=1) / same.sum(dim=1).clamp(min=1)
+    return 1 - partner + settings.options["spread"] * alike.mean(dim=1), same.any(dim=1)
 
 
 @DATASETS.register("twins")
@@ -56,7 +57,7 @@ def list_twins(folder: Path) -> dict:
 '''
 OWN_CONFIGS = {
     "node/transformer.yaml": "# @package network.node\nkind: transformer\nlayers: 1\nedges: true\n",
-    "loss/alignment.yaml": "kind: alignment\n",
+    "loss/alignment.yaml": "kind: alignment\noptions: {spread: 0.5}\n",
     "data/twins.yaml": "name: twins\n",
 }
 FROM_MERGES = "dataset from-merges"

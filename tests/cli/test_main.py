@@ -178,6 +178,7 @@ def test_values_may_start_with_a_dash(run: Run, stages: dict[str, Any], words: l
 def test_a_second_scan_is_for_merge(run: Run) -> None:
     status, _, err = run("extract", "a.ply", "b.ply", "-o", "a.tmap")
     assert status == 1 and "unrecognized arguments: b.ply: extract takes one scan; `topomerge merge` takes several" in err
+    assert err.startswith("topomerge extract: ") and err.endswith("(see topomerge extract --help)\n")
     assert "merge`" not in run("extract", "a.ply", "-o", "a.tmap", "--figures", "a.png")[2]
 
 

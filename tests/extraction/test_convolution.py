@@ -17,7 +17,6 @@ KERNELS = {
     "moore": conv.build_moore(with_origin=True),
     "sphere": conv.build_sphere(0.2, 0.1),
     "circle": conv.build_circle(0.3, 0.1, with_origin=False),
-    "cylinder": conv.build_cylinder(0.15, 0.5, 0.1),
     "stick": conv.build_stick(0.25, 0.3, 1.75, 0.1),
     "aside": Kernel(np.array([[0, 0, 0], [0, 0, 1], [0, 0, 2], [9, 0, 12]]), np.array([2, 2, -1, 3]), np.array([4, -2, 3])),
 }
@@ -138,7 +137,6 @@ def test_round_kernels(k):
         assert offsets_of(conv.build_circle(k * edge, edge)) == disc
         assert offsets_of(conv.build_sphere(k * edge, edge)) == ball
         assert offsets_of(conv.build_sphere(k * edge, edge, with_origin=False)) == ball - {(0, 0, 0)}
-        assert offsets_of(conv.build_cylinder(k * edge, 2 * edge, edge)) == disc | {(x, y, 1) for x, y, _ in disc}
 
 
 def test_stick_of_the_thesis():
@@ -194,7 +192,6 @@ def test_wrong_arguments():
         (lambda: convolve(grid, minus, "most_common", labels), "votes"),
         (lambda: conv.build_sphere(-0.1, 0.1), "radius"),
         (lambda: conv.build_circle(0.1, 0.0), "edge"),
-        (lambda: conv.build_cylinder(0.1, 0.0, 0.1), "above 0"),
         (lambda: conv.build_stick(0.2, 0.3, np.nan, 0.1), "above 0"),
         (lambda: Kernel(np.zeros((0, 3)), np.zeros(0), np.zeros(3)), "k > 0"),
         (lambda: Kernel(np.zeros((2, 3)), np.ones(2), np.zeros(3)), "unique"),

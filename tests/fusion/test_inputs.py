@@ -44,10 +44,21 @@ def test_the_span_that_is_told_is_the_diagonal_from_above():
     assert f"spans {1000 * spans:,.0f} m, building.ply {spans:,.0f} m" in str(error.value)
 
 
+def is_refused(check, *inputs):
+    try:
+        check(*inputs)
+    except InputError:
+        return True
+    return False
+
+
 def test_large_buildings_are_no_other_unit():
-    check_units(building(1), scaled(building(1), 25.0))  # 350 m beside 14 m
-    check_units(scaled(building(1), 0.1), scaled(building(1), 10.0))  # 140 m beside 1.4 m
-    check_pair(building(1), scaled(building(2), 100.0), "free")  # the scale is looked for
+    house = building(1)
+    assert is_refused(check_units, house, scaled(house, 100.0))
+    assert not is_refused(check_units, house, scaled(house, 25.0))  # 350 m beside 14 m
+    assert not is_refused(check_units, scaled(house, 0.1), scaled(house, 10.0))  # 140 m beside 1.4 m
+    pair = house, scaled(building(2), 100.0)
+    assert is_refused(check_pair, *pair, "fixed") and not is_refused(check_pair, *pair, "free")  # the scale is looked for
 
 
 def test_one_map_is_not_merged_with_itself():

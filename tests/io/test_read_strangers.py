@@ -97,6 +97,16 @@ def test_metres_and_models_are_no_degrees(tmp_path: Path, scale: tuple[float, ..
     assert not any("degrees" in w for w in read_points(tmp_path / "a.npy").warnings)
 
 
+@pytest.mark.parametrize(("shift", "said"), [((512345.6, 5812345.7, 34.5), "y is rounded to 0.5 m"), ((600.0, 5000.0, 3.0), "")])
+def test_digits_that_floats_lost_are_told(tmp_path: Path, shift: tuple[float, ...], said: str) -> None:
+    points = np.concatenate([room(np.random.default_rng(0)), np.random.default_rng(1).uniform(0, 1, (4000, 3)) * (8, 9, 2.6)])
+    np.save(tmp_path / "a.npy", (points + shift).astype(np.float32))
+    np.save(tmp_path / "b.npy", np.round(points / 0.1) * 0.1)  # voxels
+    told = [w for w in read_points(tmp_path / "a.npy").warnings if "rounded" in w]
+    assert len(told) == bool(said) and all(w.startswith(said) for w in told)
+    assert not [w for w in read_points(tmp_path / "b.npy").warnings if "rounded" in w]
+
+
 @pytest.mark.parametrize("version", ["1.2", "1.1", "3.0"])
 def test_bags_of_another_format(tmp_path: Path, version: str) -> None:
     pytest.importorskip("rosbags")

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.speed.researcher import OWN_CONFIGS, OWN_PARTS
 from tests.graphs import write_set
 from tests.scenes_map import building
 from topomerge.config import find_plugins
@@ -24,22 +25,9 @@ from topomerge.registry import DATASETS, LOSSES, NODES, Registry
 from topomerge.training.tasks import compose_settings
 
 ROOT = Path(__file__).parent.parent.parent
-EMBEDDER = '''
+OPTIMIZER = """
 import torch
-from torch_geometric.nn import TransformerConv
-from topomerge.registry import LOSSES, NODES, OPTIMIZERS, SCHEDULES
-
-@NODES.register("transformer")
-def build_transformer(settings, channels):
-    return TransformerConv(channels, channels // settings.heads, settings.heads, edge_dim=settings.width)
-
-@LOSSES.register("alignment")
-def score_alignment(settings, batch):
-    """1 - cosine of partners, and how alike rooms are on average."""
-    alike = batch.embedding @ batch.embedding.T
-    has = batch.truth.same.any(dim=1)
-    partner = (alike * batch.truth.same).sum(dim=1) / batch.truth.same.sum(dim=1).clamp(min=1)
-    return 1 - partner + settings.options["spread"] * alike.mean(dim=1), has
+from topomerge.registry import OPTIMIZERS, SCHEDULES
 
 @OPTIMIZERS.register("sign")
 class SignDescent(torch.optim.Optimizer):
@@ -58,7 +46,7 @@ class SignDescent(torch.optim.Optimizer):
 @SCHEDULES.register("steps")
 def fall_in_steps(done, warmup):
     return 0.5 ** int(4 * done)
-'''
+"""
 TASK = '''
 from dataclasses import dataclass
 
@@ -130,9 +118,9 @@ def run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.longer
 def test_encoder_loss_optimizer_and_schedule_train_export_load_and_merge(tmp_path: Path) -> None:
-    (tmp_path / "mine.py").write_text(EMBEDDER)
+    (tmp_path / "mine.py").write_text(OWN_PARTS + OPTIMIZER)
     (tmp_path / "configs" / "loss").mkdir(parents=True)
-    (tmp_path / "configs" / "loss" / "alignment.yaml").write_text("kind: alignment\noptions: {spread: 0.5}\n")
+    (tmp_path / "configs" / "loss" / "alignment.yaml").write_text(OWN_CONFIGS["loss/alignment.yaml"])
     write_set(tmp_path / "cache", "some", 8)
     words = ["plugins=[mine]", "loss=alignment", "network.node.kind=transformer", "optimizer=sign", "schedule=steps"]
     words += ["optimizer_options.momentum=0.5", "rate=0.001", "data=procedural", "validation=", "epochs=2", "batch=2"]

@@ -149,7 +149,7 @@ def run_find(args: argparse.Namespace) -> int:
     """`topomerge find`: landmarks of maps and atlases. Status 2: there is none."""
     given = {kind: getattr(args, kind) for kind in MARKED_KINDS if hasattr(args, kind)}
     if not given:
-        raise InputError("find: say what to look for: give --text, --tag, --name or --object")
+        raise InputError("--text, --tag, --name or --object: give one; say what to look for")
     check_inputs(args.inputs)
     maps = [path for item in args.inputs for path in list_map_files(Path(item))]
     found = [entry for path in maps for entry in _iter_found(path, given)]

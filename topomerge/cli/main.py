@@ -174,7 +174,7 @@ def build_parser() -> argparse.ArgumentParser:
         allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"topomerge {__version__}")
-    parser.set_defaults(run=None, paths=(), one_input="", commands=COMMANDS)
+    parser.set_defaults(run=None, paths=(), one_input="", commands=COMMANDS, prog=parser.prog)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     for command in COMMANDS:
         _add(commands, command)
@@ -193,7 +193,7 @@ def _add(commands: Any, command: Command) -> None:
     for flags, settings in command.arguments:
         parser.add_argument(*flags, **settings)
     parser.add_argument("-v", "--verbose", action="count", default=0, help="print more; twice: also tracebacks")
-    parser.set_defaults(run=command.run, paths=command.paths, one_input=command.one_input)
+    parser.set_defaults(run=command.run, paths=command.paths, one_input=command.one_input, prog=parser.prog)
 
 
 def _collect_paths(args: argparse.Namespace) -> tuple[list[str], list[str]]:
@@ -284,6 +284,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         args, unknown = parser.parse_known_args(_join_signed_values(sys.argv[1:] if argv is None else argv))
         if unknown:
             one_input = "" if unknown[0].startswith("-") or not args.one_input else f": {args.one_input}"
+            parser.prog = args.prog  # so that the help of the command is named
             parser.error(f"unrecognized arguments: {' '.join(unknown)}{one_input}")
         if empty := _find_empty_name(args):
             parser.error(f"the name given for {empty} is empty; give the name of a file or folder")

@@ -128,13 +128,6 @@ def build_circle(radius: float, edge: float, with_origin: bool = True) -> Kernel
     return _build_ball(radius, 2, edge, with_origin)
 
 
-def build_cylinder(radius: float, height: float, edge: float) -> Kernel:
-    """Return an upright cylinder, `height` m rounded up to cells; the origin is the centre of its lowest layer, weight 1."""
-    disc = build_circle(radius, edge).offsets
-    up = np.arange(_count_layers(height, edge))[:, None, None] * (0, 0, 1)
-    return Kernel.from_offsets(disc + up)
-
-
 def build_stick(stem_height: float, body_width: float, body_height: float, edge: float) -> Kernel:
     """Return the room that somebody needs who stands on the origin (seeds 2.3.1; Gorte et al. 2019).
 

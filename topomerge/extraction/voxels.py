@@ -194,7 +194,8 @@ def voxelise(
     base, shape = _compute_box(cells)
     if (shape > voxels.AXIS_LIMIT).any() or compute_box_volume(cells) / 512 > voxels.MAX_BRICKS:
         extent = " x ".join(f"{s * edge:.0f}" for s in shape)
-        raise InputError(f"the points span {extent} m: too large for {edge:g} m voxels; check --unit, or crop the file")
+        check = "check --unit, --scale or --resolution, or crop the file"
+        raise InputError(f"the points span {extent} m: too large for {edge:g} m voxels; {check}")
     size = (int(shape[0]), int(shape[1]), int(shape[2]))
     offset = (sums + counts[:, None] // 2) // counts[:, None]
     return VoxelGrid.from_cells(cells - base, base * edge, edge, size, {"count": counts, "offset": offset.astype(np.uint8)})

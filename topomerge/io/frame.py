@@ -8,6 +8,8 @@ from topomerge.types import Array, TrueRoom, VoxelGrid
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "in": 0.0254}
 FLOAT32_REACH = 1e4  # m from the origin from where float32 would lose millimetres
+COARSE_STEP, FINER, FEWEST_STEPS = 0.1, 4.0, 8  # m; times as fine is another axis; so many are no walls along an axis
+ROUNDING_SAMPLE = 20_000  # points in which roundings are looked for
 
 # Right-handed turns that bring the named axis of the file up. Rows are the new axes in terms of the old ones.
 TURNS = {
@@ -70,3 +72,31 @@ def choose_shift(points: Array) -> Array:
     if not len(points) or float(np.abs(points).max()) <= FLOAT32_REACH:
         return np.zeros(3)
     return np.round(np.median(points, axis=0) / 100.0) * 100.0
+
+
+def describe_rounding(points: Array) -> list[str]:
+    """Warn of an axis whose coordinates are rounded, as 32-bit floats are far from the origin: half a metre at 5,000 km.
+
+    Voxels are as coarse along all axes. What is rounded along one alone has lost its digits.
+
+    Args:
+        points: (n, 3), m.
+    """
+    steps = [_measure_step(values) for values in points[:: len(points) // ROUNDING_SAMPLE + 1].T]
+    worst = int(np.argmax(steps[:2]))
+    if steps[worst] < COARSE_STEP or steps[worst] < FINER * min(steps):
+        return []
+    return [
+        f"{'xy'[worst]} is rounded to {steps[worst]:.3g} m, as 32-bit floats are far from the origin: export the points again as "
+        "64-bit floats, as text with all digits, or nearer to the origin"
+    ]
+
+
+def _measure_step(values: Array) -> float:
+    """Measure the step, m, of which all values are multiples apart; 0: there is none, or too few of them."""
+    levels = np.unique(values)
+    if len(levels) < FEWEST_STEPS:
+        return 0.0
+    gaps = np.diff(levels)
+    counts = gaps / gaps.min()
+    return float(gaps.min()) if np.abs(counts - np.round(counts)).max() < 0.01 else 0.0

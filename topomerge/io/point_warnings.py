@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from topomerge.io.frame import get_axis_rotation
+from topomerge.io.frame import describe_rounding, get_axis_rotation
 from topomerge.types import Array
 
 LARGE, HIGH = 2000.0, 100.0  # m, extents beyond what is scanned as one building
@@ -28,7 +28,8 @@ def warn_about(points: Array, up: str | None) -> list[str]:
     if up is None:
         return _check_unit(high - low, ())
     units = (("mm", 0.001), ("cm", 0.01))
-    return _check_degrees(low, high) or _check_unit(high - low, units) or _check_up_axis(points, low, high, up)
+    rounded = describe_rounding(points)
+    return rounded or _check_degrees(low, high) or _check_unit(high - low, units) or _check_up_axis(points, low, high, up)
 
 
 def _check_degrees(low: Array, high: Array) -> list[str]:

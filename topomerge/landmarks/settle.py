@@ -20,7 +20,6 @@ from topomerge.landmarks.sightings import build_sightings
 from topomerge.landmarks.text import quote_text
 from topomerge.types import Array, Sim3, TopometricMap
 
-ACTIONS = ("read", "read both", "visit")
 COSTS = {"read": 1.0, "read both": 2.0, "visit": 2.0}  # and a metre of way to a room that is not in the map yet:
 COST_PER_METRE = 0.1
 READ = 0.95  # probability that a sign is read as it stands, if somebody goes there for it
