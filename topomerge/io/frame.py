@@ -8,6 +8,7 @@ from topomerge.types import Array, TrueRoom, VoxelGrid
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "in": 0.0254}
 FLOAT32_REACH = 1e4  # m from the origin from where float32 would lose millimetres
+FLOAT_STEPS = 2.0**22  # of a 32-bit float lie between 0 and a value, at least
 COARSE_STEP, FINER, FEWEST_STEPS = 0.1, 4.0, 8  # m; times as fine is another axis; so many are no walls along an axis
 ROUNDING_SAMPLE = 20_000  # points in which roundings are looked for
 
@@ -85,6 +86,8 @@ def describe_rounding(points: Array) -> list[str]:
     steps = [_measure_step(values) for values in points[:: len(points) // ROUNDING_SAMPLE + 1].T]
     worst = int(np.argmax(steps[:2]))
     if steps[worst] < COARSE_STEP or steps[worst] < FINER * min(steps):
+        return []
+    if np.abs(points[:, worst]).max() < FLOAT_STEPS * steps[worst]:  # a raster of the scanner's own
         return []
     return [
         f"{'xy'[worst]} is rounded to {steps[worst]:.3g} m, as 32-bit floats are far from the origin: export the points again as "
