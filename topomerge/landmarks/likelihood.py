@@ -69,6 +69,9 @@ class Kind:
         most: times that one landmark may count.
         surest: m, sigma up to which a place is sure enough that another landmark at it contradicts.
         words: one of them, in words.
+        least: log odds that all may cost.
+        most_missed: log odds that those may cost which one map has and the other one, which saw the place, has not. Doors bear
+            signs at every place that looks alike, so that a missing sign says nothing; tags hang anywhere.
     """
 
     kinds: tuple[str, ...]
@@ -77,7 +80,8 @@ class Kind:
     most: float
     surest: float
     words: str
-    least: float = -np.inf  # log odds that all may cost
+    least: float = -np.inf
+    most_missed: float = 0.0
 
 
 def _repeats(elsewhere: float, storey: float, half: float, wing: float, building: float, outside: float) -> dict[str, float]:
@@ -86,7 +90,7 @@ def _repeats(elsewhere: float, storey: float, half: float, wing: float, building
 
 KINDS = {
     "text": Kind(("text", "name"), 0.02, _repeats(0.005, 0.02, 0.01, 0.02, 0.02, 0.005), 50.0, 1.5, "sign"),
-    "tag": Kind(("tag",), 0.02, _repeats(0.002, 0.003, 0.003, 0.003, 0.02, 0.003), 500.0, 1.5, "tag"),
+    "tag": Kind(("tag",), 0.02, _repeats(0.002, 0.003, 0.003, 0.003, 0.02, 0.003), 500.0, 1.5, "tag", most_missed=6.0),
     "name": Kind(("name",), 0.2, _repeats(0.02, 0.1, 0.1, 0.1, 0.05, 0.02), 8.0, 4.0, "room name", -2.0),
     "object": Kind(("object",), 0.5, _repeats(0.1, 0.2, 0.2, 0.2, 0.1, 0.1), 3.0, 1.0, "object", -2.0),
 }
