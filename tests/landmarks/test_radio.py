@@ -109,11 +109,6 @@ def test_right_poses_are_told_from_wrong_ones():
     assert all(abs(v) <= MOST_RATIO for s in (right, score_radio(a, other, truth)) for v in s.values())
 
 
-def test_a_storey_from_which_nothing_is_heard_is_a_storey():
-    silent = score_radio(build(hear(2, 45)), build(hear(25, 68, session=1, seed=4), FRAME), FRAME.inverse())
-    assert silent["storey"] > 1.5  # the next storey would hear something, those beyond do not
-
-
 def test_scores_do_not_change_with_the_frame_and_are_symmetric():
     """Maps of which each has but a few scans, so that no score is at its limit."""
     a, b = build(hear(20, 26)), build(hear(23, 29, session=1))

@@ -381,7 +381,7 @@ def _compare_alternatives(
     moved = [choose(*(at(distance) for distance in directions)) for directions in shifted]
     out = {
         "elsewhere": choose(add(usual[k]), own, *moved),
-        "storey": choose(*(at(apart[0][near], table) for table in law.floors[1:]), other),  # or so far up that nothing is heard
+        "storey": choose(at(apart[0][near], law.floors[1])),
         "half": choose(at(half[near])),
         "wing": choose(add(law.mix_between(*WING)[k]), own, *moved[1:]),
         "building": other,
