@@ -134,7 +134,7 @@ def test_a_rare_string_far_away_speaks_for_another_pose():
     at = places(6, 3.0)
     a, b = with_signs(NUMBERS, at), with_signs(NUMBERS, at + (20.0, 0, 0))
     evidence = score_landmarks(a, b, Sim3())
-    assert lead(evidence)["elsewhere"] < 0.9 * -MOST_FAR and lead(evidence)["storey"] > 0  # they begin alike
+    assert lead(evidence)["elsewhere"] <= -MOST_FAR and lead(evidence)["storey"] > 0  # they begin alike
     assert {w.verdict for w in evidence.witnesses} == {"elsewhere"}
     assert min(lead(score_landmarks(a, b, Sim3(translation=(-20.0, 0, 0)))).values()) > 3.0
 

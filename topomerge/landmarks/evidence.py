@@ -4,6 +4,7 @@ Where both maps read something at one place, `likelihood` weighs it. Besides:
 
 - A rare string that both maps read at two places far from each other under the pose speaks for another pose, unless it points
   there (`POINTS_THERE`).
+- A sign that the other map could have seen and did not read says little (`READS`): doors that look alike bear some, too.
 - A tag that one map has and the other one, which saw the place, has not speaks for another place (`score_missed`).
 """
 
@@ -105,9 +106,10 @@ def _pair_places(a: Array, b: Array) -> tuple[Array, float]:
     return second[:, 3] - first[:, 3] - FALL * height, gap
 
 
-RATES = np.sqrt(
-    (np.arange(10) + 0.5) / 10
-)  # of the tags in sight that a map has, alike likely: one of most is likelier than of few
+READS = 0.6  # probability that a map that reads as many signs as the other one reads a sign that it could have seen
+MOST_UNREAD = 1.0  # log odds that unread signs may cost in all
+# Shares of the tags in sight that a map may have, alike likely: so a reader that finds most is likelier than one that finds few.
+RATES = np.sqrt((np.arange(10) + 0.5) / 10)
 POINTS_THERE = 0.1  # probability that a rare string far from its place points there, or was put in a wrong place
 FAR, MOST_FAR = 6.0, 6.0  # m beyond which two places are two, and log odds that such strings may give in all
 RARE = 0.01  # share of the signs, below which a string names one place
@@ -253,6 +255,7 @@ class LandmarkScorer:
         return {
             kind: (_find_cells_around(a, self.trees[0]), _find_cells_around(b, self.trees[1]))
             for kind, (a, b) in self.sightings.items()
+            if KINDS[kind].most_missed
         }
 
     def measure_seen(self, kind: str, side: int, at: Array, pose: Sim3) -> Array:
@@ -260,9 +263,11 @@ class LandmarkScorer:
         cells = self.around[kind][side]
         known = np.isfinite(cells[:, :, 0])
         rows, _ = np.nonzero(known)
-        turned = cells[known] if side == 0 else pose.apply(cells[known]) - pose.apply(np.zeros((1, 3)))
-        places = at[rows] + turned
-        near = self.trees[1 - side].query(places if side else pose.inverse().apply(places))[0] * (1.0 if side else pose.scale)
+        if side == 0:
+            places, metre = pose.inverse().apply(at[rows] + cells[known]), pose.scale
+        else:
+            places, metre = at[rows] + pose.apply(cells[known]) - pose.apply(np.zeros((1, 3))), 1.0
+        near = self.trees[1 - side].query(places)[0] * metre
         met = np.bincount(rows[near <= SEEN_WITHIN], minlength=len(cells))
         return np.asarray(met / np.maximum(known.sum(axis=1), 1))
 
@@ -320,6 +325,9 @@ def score_sightings(scorer: LandmarkScorer, pose: Sim3, bends: Bends, kind: str)
         factors = {name: v + prefixes[name] for name, v in factors.items()}
     far = find_far_partners(a, b, at, met, kind)
     factors["elsewhere"] += min(len(far) * float(-np.log(POINTS_THERE)), MOST_FAR)
+    unread = count_unread(scorer, at, met, pose, (a, b)) if kind == "text" else 0.0
+    for name in ("elsewhere", "building", "outside"):
+        factors[name] += unread
     if rules.most_missed:
         missed = score_missed(scorer, at, met, pose, kind)
         factors = {name: v + missed * (name != "here") for name, v in factors.items()}
@@ -346,6 +354,25 @@ def find_far_partners(a: Sightings, b: Sightings, at: Sequence[Array], met: Asso
         if i not in used[0] and j not in used[1] and away > FAR + GATE * (a.sigma[i] + b.sigma[j]):
             far.append((i, j))
     return far
+
+
+def count_unread(
+    scorer: LandmarkScorer, at: Sequence[Array], met: Associated, pose: Sim3, sightings: tuple[Sightings, Sightings]
+) -> float:
+    """Return the log odds for a place that has nothing to do with this one of signs that one map read and the other one could
+    have seen and did not, as `READS` has it of maps that read equally many signs on equally large a map."""
+    density = [len(s) / max(len(m.grid), 1) for s, m in zip(sightings, (scorer.a, scorer.b), strict=True)]
+    back, total = pose.inverse(), 0.0
+    for side in (0, 1):
+        own, other = sightings[side], 1 - side
+        free = np.setdiff1d(np.flatnonzero((own.sigma <= 1.0) & ~own.named & np.isfinite(at[side][:, 2])), met.pairs[:, side])
+        if not len(free):
+            continue
+        places = at[side][free] if other == 0 else back.apply(at[side][free])
+        seen = float((scorer.trees[other].query(places)[0] <= SEEN_WITHIN).sum())
+        reads = READS * min(density[other] / density[side], 1.0)
+        total += seen * float(np.log((1 - reads / 3) / (1 - reads)))
+    return min(total, MOST_UNREAD)
 
 
 def score_missed(scorer: LandmarkScorer, at: Sequence[Array], met: Associated, pose: Sim3, kind: str) -> float:

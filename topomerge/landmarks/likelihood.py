@@ -70,8 +70,8 @@ class Kind:
         surest: m, sigma up to which a place is sure enough that another landmark at it contradicts.
         words: one of them, in words.
         least: log odds that all may cost.
-        most_missed: log odds that those may cost which one map has and the other one, which saw the place, has not. Doors bear
-            signs at every place that looks alike, so that a missing sign says nothing; tags hang anywhere.
+        most_missed: log odds that those may cost which one map has and the other one, which saw the place, has not. Tags hang
+            anywhere; doors bear signs at every place that looks alike.
     """
 
     kinds: tuple[str, ...]
