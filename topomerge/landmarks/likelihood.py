@@ -9,6 +9,8 @@ Generative assumptions. Each is a number below, stated and not fitted.
   (`text.estimate_share`), or a number near the other one. As a whole, the other place repeats all strings of this one with
   `Kind.repeats` (wings that are numbered alike, tags printed from one sheet), or all of its numbers differ by one shift, as
   storeys and wings do.
+- A tag that the other map saw the place of and does not have was missed by its reader, if the pose is right; how many tags of
+  those in sight each reader finds is not known (`evidence.RATES`).
 - How well the readers read is not known, and shared by all signs of the pair: `READERS`.
 
 So that no single landmark carries a merge, one agreeing landmark counts `Kind.most` times at most, and all together no more than
