@@ -309,7 +309,7 @@ class _Processes:
         self._local = threading.local()
         self._started: list[tuple[BaseProcess, Connection[Any, Any]]] = []
         self._count, self._numbers = count, itertools.count()
-        self._working: Any = None  # shared: 1 of each process that extracts, the first one's at last
+        self._working: Any = bytearray(count + 1)  # 1 of each process that extracts, this one last; shared once they start
         self._threads = ThreadPoolExecutor(count, "extract")
 
     def __enter__(self) -> _Processes:
