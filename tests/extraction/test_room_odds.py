@@ -19,6 +19,8 @@ from topomerge.extraction.room_odds import (
     POSE_FEATURES,
     ROOM_FEATURES,
     ROOM_ODDS_FILE,
+    _iter_storey_floors,
+    _measure_outline,
     add_room_probabilities,
     compute_pose_features,
     compute_room_features,
@@ -265,3 +267,14 @@ def test_a_garden_seen_from_a_house_is_outside(rough: float, plants: int) -> Non
     garden = ~indoors & (rooms["area"] > 10)
     assert garden.any() and (rooms["outside"][garden] > 0.5).all()
     assert (rooms["outside"][indoors & (rooms["area"] > 5)] < 0.3).all()
+
+
+def test_an_outline_is_the_same_in_the_box_of_its_room_and_in_the_whole_raster(points: Array) -> None:
+    storey = next(_iter_storey_floors(extract(points, name="two")))
+    told = []
+    for pad in ((0, 0), (7, 3), (40, 40)):
+        room, wall = np.pad(storey.room, pad, constant_values=-1), np.pad(storey.wall, pad)
+        told.append(_measure_outline(replace(storey, room=room, wall=wall), 0, (slice(None), slice(None))))
+    assert told[0]["contact"] > 0 and told[0]["walls_hidden"] > 0
+    for name in ("thin", "contact", "log_width", "open_outline"):
+        assert len({one[name] for one in told}) == 1

@@ -19,7 +19,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -182,7 +182,8 @@ class InputMaps:
             while not begun[k].done():
                 here = next((n for n in sorted(begun) if begun[n].cancel()), None)  # the first that no process has taken
                 if here is not None:
-                    begun[here] = _load_future(self._paths[here], self._args, others.name_bars(self._paths[here]))
+                    with others.share_cores():
+                        begun[here] = _load_future(self._paths[here], self._args, others.name_bars(self._paths[here]))
                 elif self._ahead:
                     import_module(self._ahead.pop(0))
                 else:
@@ -303,17 +304,21 @@ class _Processes:
     """
 
     def __init__(self, count: int, args: argparse.Namespace, bars: ProgressBars) -> None:
-        self._options = argparse.Namespace(**{"verbose": 0, **collect_given(args, *WORKER_OPTIONS)}, cores=count + 1)
+        self._options = argparse.Namespace(**{"verbose": 0, **collect_given(args, *WORKER_OPTIONS)})
         self._bars = bars
         self._local = threading.local()
         self._started: list[tuple[BaseProcess, Connection[Any, Any]]] = []
         self._count, self._numbers = count, itertools.count()
+        self._working: Any = bytearray(count + 1)  # 1 of each process that extracts, this one last; shared once they start
         self._threads = ThreadPoolExecutor(count, "extract")
 
     def __enter__(self) -> _Processes:
         method = choose_start()
         if method == "fork":
             _load_extraction(getattr(self._options, "prepares", False))
+        from multiprocessing import get_context
+
+        self._working = get_context(method).RawArray("B", self._count + 1)
         with _hold_interrupts(method), warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # of forks beside threads: those of BLAS, which ends them before
             for _ in range(self._count):
@@ -325,7 +330,7 @@ class _Processes:
 
         ours, theirs = get_context(method).Pipe()
         inherited = [ours, *(other for _, other in self._started)] if method == "fork" else []
-        about = (theirs, inherited, self._options, self._bars.enabled)
+        about = (theirs, inherited, self._options, self._bars.enabled, self._working, len(self._started))
         process: BaseProcess = get_context(method).Process(target=_work, args=about, daemon=True)  # type: ignore[attr-defined]
         process.start()
         theirs.close()  # so that its end is seen
@@ -343,6 +348,10 @@ class _Processes:
     def submit(self, path: str) -> Future[LoadedMap]:
         """Return the map of an input to come; cancelled is what this process takes before another one does."""
         return self._threads.submit(self._load, path)
+
+    def share_cores(self) -> AbstractContextManager[None]:
+        """Share the cores with the others that extract, while this process does."""
+        return _share_cores(self._working, self._count)
 
     def name_bars(self, path: str) -> Starter:
         """Return what starts the bars of an input, whose texts name it."""
@@ -423,12 +432,18 @@ def _load_extraction(prepares: bool = False) -> None:
 
 
 def _work(
-    connection: Connection[Any, Any], inherited: Sequence[Connection[Any, Any]], options: argparse.Namespace, shows_progress: bool
+    connection: Connection[Any, Any],
+    inherited: Sequence[Connection[Any, Any]],
+    options: argparse.Namespace,
+    shows_progress: bool,
+    working: Any,
+    number: int,
 ) -> None:
     """Load the maps of the paths that come, until none comes. Back go tuples of progress, then the map or a line of error.
 
     Args:
         inherited: ends of the other process, closed here, so that its end is seen.
+        working, number: as of `_share_cores`.
     """
     for other in inherited:
         other.close()
@@ -437,7 +452,6 @@ def _work(
     show_log(options.verbose, debug)
     for name in EXTRACTION_MODULES:  # before there is work
         import_module(name)
-    _share_cores(options.cores)
 
     def start_task(title: str) -> Report | None:
         def report(fraction: float, text: str = "") -> None:
@@ -449,7 +463,8 @@ def _work(
         while True:
             path = connection.recv()
             try:
-                outcome: LoadedMap | str = _load_map(path, options, start_task)
+                with _share_cores(working, number):
+                    outcome: LoadedMap | str = _load_map(path, options, start_task)
             except BrokenPipeError:
                 raise
             except Exception as error:
@@ -459,8 +474,20 @@ def _work(
             connection.send(outcome)
 
 
-def _share_cores(processes: int) -> None:
-    """Leave the compiled loops of each process its share of the cores."""
-    from topomerge.kernels import count_threads, set_thread_count
+@contextmanager
+def _share_cores(working: Any, number: int) -> Iterator[None]:
+    """Leave the other processes that extract their shares of the cores; what the first of them to end leaves is the others'.
 
-    set_thread_count(count_threads() // processes)
+    Args:
+        working: shared, 1 of each process that extracts.
+        number: of this process in it.
+    """
+    from topomerge.kernels import share_threads
+
+    working[number] = 1
+    share_threads(working)
+    try:
+        yield
+    finally:
+        working[number] = 0
+        share_threads(None)

@@ -111,7 +111,7 @@ def compute_room_features(map: TopometricMap, names: Sequence[str] = ROOM_FEATUR
             table["floor_seen"][room] = storey.standing[window][own].mean()
             table["floor_step"][room] = abs(np.median(storey.height[window][own]))
             table["between"][room] = hulls.measure_share_between(room)
-            for name, value in _measure_outline(storey, own, window).items():
+            for name, value in _measure_outline(storey, room, window).items():
                 table[name][room] = value
     columns = np.maximum(covered[1], 1)
     cells = np.maximum(rooms["cells"], 1) / columns
@@ -199,21 +199,23 @@ def _iter_windows(storey: _StoreyFloor) -> Iterator[tuple[int, tuple[slice, slic
             yield room, (x, y)
 
 
-def _measure_outline(storey: _StoreyFloor, own: Array, window: tuple[slice, slice]) -> dict[str, float]:
+def _measure_outline(storey: _StoreyFloor, room: int, window: tuple[slice, slice]) -> dict[str, float]:
     """What the outline of a room tells.
 
     Args:
-        own: columns of the room, in the window.
+        window: the part of the raster from where others look into it; the outline itself is looked for in the room's own box.
     """
-    free = storey.room[window] >= 0
-    beyond = free & ~own
+    label = storey.room[window]
+    free = label >= 0
     reach = max(round(WALL_BESIDE / storey.edge), 1)
-    near = ndimage.binary_dilation(storey.wall[window], np.ones((2 * reach + 1, 2 * reach + 1)))
+    box, corner = _find_box(label == room, reach)
+    own = label[box] == room
+    near = ndimage.binary_dilation(storey.wall[window][box], np.ones((2 * reach + 1, 2 * reach + 1)))
     end = own & ndimage.binary_dilation(~own, border_value=1)
-    contact = end & ndimage.binary_dilation(beyond)
+    contact = end & ndimage.binary_dilation(free[box] & ~own)
     step = max(round(VIEW_STEP / storey.edge), 1)
-    views = np.argwhere(beyond[::step, ::step]) * step
-    walls = np.argwhere(end & ~contact & near)
+    views = np.argwhere((free & (label != room))[::step, ::step]) * step
+    walls = np.argwhere(end & ~contact & near) + corner
     hidden = ~is_seen_from(free, np.ascontiguousarray(walls), np.ascontiguousarray(views), SIGHT_REACH / storey.edge)
     around = max(int(end.sum()), 1)
     return {
@@ -224,6 +226,13 @@ def _measure_outline(storey: _StoreyFloor, own: Array, window: tuple[slice, slic
         "open_outline": float((end & ~contact & ~near).sum() / around),
         "thin": measure_thin_share(own, storey.edge),
     }
+
+
+def _find_box(mask: Array, margin: int) -> tuple[tuple[slice, slice], Array]:
+    """The box around a mask (nx, ny) bool that has any, with a margin where there is room for it, and its corner (2,)."""
+    x, y = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    low = np.maximum([x[0] - margin, y[0] - margin], 0)
+    return (slice(low[0], x[-1] + margin + 1), slice(low[1], y[-1] + margin + 1)), low
 
 
 def measure_thin_share(own: Array, edge: float) -> float:

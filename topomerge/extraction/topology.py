@@ -219,7 +219,8 @@ def _split_at_pass(clearance: Array, first: int, second: int) -> tuple[Array, Ar
         parts, _ = ndimage.label(clearance >= levels[k], np.ones((3, 3)))
         return parts, int(parts.flat[first]), int(parts.flat[second])
 
-    low, high = 0, len(levels)  # the first level at which they are joined is one of low..high
+    shared = min(float(clearance.flat[first]), float(clearance.flat[second]))  # above it, one of them is not there
+    low, high = int((levels > shared).sum()), len(levels)  # the first level at which they are joined is one of low..high
     while low < high:
         middle = (low + high) // 2
         _, a, b = parts_at(middle)

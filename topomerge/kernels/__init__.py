@@ -28,11 +28,23 @@ T = TypeVar("T")
 R = TypeVar("R")
 SLICES_A_THREAD = 4  # so that threads end at about the same time
 _threads = {"count": int(config.NUMBA_NUM_THREADS)}  # type: ignore[attr-defined]
+_working: list[Sequence[int]] = []  # of processes that share the cores, which of them work (`share_threads`)
 
 
 def count_threads() -> int:
-    """Return how many threads share a loop: as many as cores, unless `set_thread_count` says otherwise."""
-    return _threads["count"]
+    """Return how many threads share a loop: as many as cores, unless `set_thread_count` says otherwise; of processes that share
+    the cores, the part of each that works at the moment."""
+    sharing = sum(_working[0]) if _working else 1
+    return max(_threads["count"] // max(sharing, 1), 1)
+
+
+def share_threads(working: Sequence[int] | None) -> None:
+    """Share the threads with other processes from now on; None: with none.
+
+    Args:
+        working: in memory of all of them, 1 of each that works; each writes its own, so that no lock is needed.
+    """
+    _working[:] = [] if working is None else [working]
 
 
 def set_thread_count(count: int) -> None:

@@ -161,13 +161,15 @@ def _find_touched_tiles(frames: Floats, along: Floats, across: float, low: Float
     than a square is wide."""
     d = np.linspace(0, across, int(np.ceil(4 * across / tile)) + 2)
     aside = tile / 4 * np.array([(u, v) for u in (-1, 0, 1) for v in (-1, 0, 1)])
-    parts = []
-    for line, frame in enumerate(frames):
-        t = np.linspace(0, along[line], int(np.ceil(4 * along[line] / tile)) + 2)
-        places = frame[:2] + t[:, None, None] * frame[2:4] + d[:, None] * frame[4:6]
-        near = np.floor(((places.reshape(-1, 1, 2) + aside).reshape(-1, 2) - low) / tile).astype(np.int64)
-        near = near[((near >= 0) & (near < columns)).all(axis=1)]
-        square = np.unique(near[:, 0] * columns[1] + near[:, 1])
-        parts.append(np.column_stack([square, np.full(len(square), line)]))
-    table = np.concatenate(parts)
-    return np.asarray(table[np.lexsort((table[:, 1], table[:, 0]))])
+    steps = np.ceil(4 * along / tile).astype(np.int64) + 2
+    t = np.concatenate([np.linspace(0, long, step) for long, step in zip(along, steps, strict=True)])
+    line = np.repeat(np.arange(len(frames)), steps)
+    frame = frames[line]
+    places = (frame[:, None, :2] + t[:, None, None] * frame[:, None, 2:4]) + d[:, None] * frame[:, None, 4:6]
+    found = []
+    for offset in aside:
+        near = np.floor(((places + offset) - low) / tile).astype(np.int64)
+        inside = ((near >= 0) & (near < columns)).all(axis=2)
+        square = near[..., 0] * columns[1] + near[..., 1]
+        found.append(np.unique((square * len(frames) + line[:, None])[inside]))
+    return np.column_stack(np.divmod(np.unique(np.concatenate(found)), len(frames)))

@@ -72,7 +72,9 @@ def detect_lines(points: Array, weights: Array, main: float | None = None) -> li
         weight = float(weights[left[own]].sum())
         if weight >= max(DENSE * line.length, LEAST_LINE / 2):
             lines.append(replace(line, weight=weight))
-        left = np.delete(left, np.union1d(own, rows))
+        kept = np.ones(len(left), bool)
+        kept[own] = kept[rows] = False
+        left = left[kept]
     return lines
 
 
@@ -91,12 +93,14 @@ def estimate_main_direction(lines: list[Line]) -> float | None:
 def _find_strongest_run(points: Array, weights: Array, angles: Array) -> Array:
     """Rows of the points of the run that holds most: of a direction and an offset across it."""
     middle = points.mean(axis=0)
-    angle, offset = find_strongest_line(points - middle, weights, angles, HOUGH_BIN)
-    across = (points - middle) @ (-np.sin(angle), np.cos(angle))
+    local = points - middle
+    angle, offset = find_strongest_line(local, weights, angles, HOUGH_BIN)
+    across = local @ (-np.sin(angle), np.cos(angle))
     rows = np.flatnonzero(np.abs(across - offset) <= LINE_REACH)
-    order = rows[np.argsort((points[rows] - middle) @ (np.cos(angle), np.sin(angle)), kind="stable")]
-    t = (points[order] - middle) @ (np.cos(angle), np.sin(angle))
-    runs = np.split(order, np.flatnonzero(np.diff(t) > LINE_GAP) + 1)
+    t = local[rows] @ (np.cos(angle), np.sin(angle))
+    order = np.argsort(t, kind="stable")
+    gaps = np.flatnonzero(np.diff(t[order]) > LINE_GAP)
+    runs = np.split(rows[order], gaps + 1) if len(gaps) else [rows[order]]
     return max(runs, key=lambda run: float(weights[run].sum()))
 
 
@@ -129,5 +133,6 @@ def _fit_least_squares(points: Array, weights: Array, along: Array | None = None
 
 
 def _find_near_points(points: Array, line: Line) -> Array:
-    t, off = (points - line.middle) @ line.along, (points - line.middle) @ line.across
+    local = points - line.middle
+    t, off = local @ line.along, local @ line.across
     return np.flatnonzero((np.abs(off) < LINE_REACH) & (t > line.start - LINE_REACH) & (t < line.end + LINE_REACH))
