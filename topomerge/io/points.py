@@ -190,7 +190,7 @@ class Gatherer:
 
     def __init__(self, source: str, up: str | None, factor: float, chunk: int, warnings: list[str]) -> None:
         self.source, self.up, self.factor, self.chunk = source, up, factor, chunk
-        self.rotation = frame.frame.get_axis_rotation(up or "z")
+        self.rotation = frame.get_axis_rotation(up or "z")
         self.shift: Array | None = None
         self.warnings = list(warnings)
         self.sample = PointSample()
