@@ -316,7 +316,7 @@ def _sample_directions(count: int) -> Array:
 
 # The navigable volume: where a body can walk (seeds 2.3).
 CLOUD_ADVICE = "check --up and --unit, or take larger voxels if the points are sparse"
-PLAN_ADVICE = "check the map's resolution, its thresholds and negate, and that its free floor is white; of a slice check --unit"
+PLAN_ADVICE = "check the map's resolution, its thresholds and negate, and that its free floor is white"
 
 
 def compute_navigable_volume(scan: Scan, p: SharedParameters) -> tuple[Scan, VoxelGrid]:

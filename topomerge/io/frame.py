@@ -78,14 +78,14 @@ def choose_shift(points: Array) -> Array:
 def describe_rounding(points: Array) -> list[str]:
     """Warn of an axis whose coordinates are rounded, as 32-bit floats are far from the origin: half a metre at 5,000 km.
 
-    Voxels are as coarse along all axes. What is rounded along one alone has lost its digits.
+    Their steps are powers of two. Voxels are as coarse along all axes; what is rounded along one alone has lost its digits.
 
     Args:
         points: (n, 3), m.
     """
     steps = [_measure_step(values) for values in points[:: len(points) // ROUNDING_SAMPLE + 1].T]
     worst = int(np.argmax(steps[:2]))
-    if steps[worst] < COARSE_STEP or steps[worst] < FINER * min(steps):
+    if steps[worst] < COARSE_STEP or steps[worst] < FINER * min(steps) or abs(np.log2(steps[worst]) % 1 - 0.5) < 0.499:
         return []
     if np.abs(points[:, worst]).max() < FLOAT_STEPS * steps[worst]:  # a raster of the scanner's own
         return []
