@@ -309,3 +309,17 @@ def test_zero_log_odds_are_occupied(tmp_path: Path) -> None:
     (tmp_path / "a.ot").write_bytes(FULL_OCTOMAP_HEADER + full_node(0, 1) * 15 + full_node(0, 0b10111) + leaves)
     cloud = read_points(tmp_path / "a.ot")
     assert len(cloud) == 3 and cloud.free is not None and len(cloud.free) == 1
+
+
+@pytest.mark.parametrize(("orientation", "turns"), [(1, 0), (3, 2), (6, 3), (8, 1)])
+@pytest.mark.parametrize("suffix", ["jpg", "png"])
+def test_a_photograph_is_read_as_its_camera_was_held(tmp_path: Path, suffix: str, orientation: int, turns: int) -> None:
+    picture = np.full((64, 96, 3), 255, np.uint8)
+    picture[8:24, 16:80] = 0
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(picture).save(tmp_path / f"a.{suffix}", exif=exif)
+    upright = np.rot90(picture, turns)
+    seen, (bright, _) = grid.read_picture(tmp_path / f"a.{suffix}"), grid.read_image(tmp_path / f"a.{suffix}")
+    assert seen.shape == upright.shape and ((seen > 127) == (upright > 127)).all()
+    assert ((bright > 0.5) == (upright[..., 0] > 127)).all()

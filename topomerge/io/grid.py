@@ -203,10 +203,11 @@ def read_picture(path: Path) -> Array:
     Raises:
         InputError: as `read_image`.
     """
-    from PIL import Image
+    from PIL import Image, ImageOps
 
     bright, clear = read_image(path)
-    with Image.open(path, formats=IMAGE_FORMATS) as image:
+    with Image.open(path, formats=IMAGE_FORMATS) as opened:
+        image = ImageOps.exif_transpose(opened)  # cameras store how they were held
         if image.mode.startswith(("I", "F")):
             grey = np.round(np.nan_to_num(bright.clip(0, 1)) * 255).astype(np.uint8)
             return np.repeat(grey[..., None], 3, axis=2)
@@ -305,17 +306,18 @@ def read_image(path: Path) -> tuple[Array, Array]:
     Raises:
         InputError: not an image, or a huge one.
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image, ImageOps, UnidentifiedImageError
 
     refuse_pointer(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # our own limit is stricter than the library's warning
-            with Image.open(path, formats=IMAGE_FORMATS) as image:
-                width, height = image.size
+            with Image.open(path, formats=IMAGE_FORMATS) as opened:
+                width, height = opened.size
                 if width * height > PIXELS:
                     limit = f"the limit is {PIXELS // 10**6} megapixels"
                     raise InputError(f"{path}: has {width} x {height} pixels and {limit}; crop it or make it smaller")
+                image = ImageOps.exif_transpose(opened)
                 if image.mode.startswith(("I", "F")):
                     values = np.array(image, np.float32)
                     values[~np.isfinite(values)] = np.nan

@@ -261,9 +261,14 @@ def compute_chances(a: Sightings, b: Sightings, pairs: Array, keys: Sequence[tup
 
 
 def _count_shifts(keys: Sequence[tuple[str, str]], numbers: Array, most: int = 3) -> list[Shift]:
-    """The shifts that turn most numbers of a into those of b."""
+    """The shifts that turn most numbers of a into those of b: `most`, and one that is as good as the last of them backwards."""
     count: dict[Shift, int] = {}
     for (one, other), number in zip(keys, numbers.tolist(), strict=True):
         for shift in find_shifts(one, other) if number else ():
             count[shift] = count.get(shift, 0) + 1
-    return sorted(count, key=lambda s: (-count[s], s[0], abs(s[1]), sorted(s[2])))[:most]
+
+    def rank(shift: Shift) -> tuple[int, str, int, list[str]]:
+        return -count[shift], shift[0], abs(shift[1]), sorted(shift[2])  # the same for both orders of the maps
+
+    ranked = sorted(count, key=rank)
+    return [shift for shift in ranked if rank(shift) <= rank(ranked[min(most, len(ranked)) - 1])]
