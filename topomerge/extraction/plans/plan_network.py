@@ -138,8 +138,8 @@ def add_drawn_doors(plan: StoreyPlan, probability: Array, doors: Array) -> Array
     here = here[np.abs(doors[here, 2] - plan.floor[tuple(at[here].T)]) < SAME_STOREY]
     column = np.ravel_multi_index(tuple(at[here].T), plan.wall.shape)
     count = np.bincount(column, minlength=plan.wall.size)
-    drawn = np.bincount(column, doors[here, 3], plan.wall.size) / np.maximum(count, 1)
-    drawn = drawn.astype(np.float32).reshape(plan.wall.shape)
+    mean = np.bincount(column, doors[here, 3], plan.wall.size) / np.maximum(count, 1)
+    drawn = mean.astype(np.float32).reshape(plan.wall.shape)
     before = probability[..., DOORWAY_CLASS]
     doorway = np.maximum(before, drawn)
     out = probability * ((1 - doorway) / np.maximum(1 - before, np.float32(1e-6)))[..., None]
