@@ -10,6 +10,7 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "in": 0.0254}
 FLOAT32_REACH = 1e4  # m from the origin from where float32 would lose millimetres
 FLOAT_STEPS = 2.0**22  # of a 32-bit float lie between 0 and a value, at least
 COARSE_STEP, FINER, FEWEST_STEPS = 0.1, 4.0, 8  # m; times as fine is another axis; so many are no walls along an axis
+MOST_STEPS = 1e6  # between neighbouring values
 ROUNDING_SAMPLE = 20_000  # points in which roundings are looked for
 
 # Right-handed turns that bring the named axis of the file up. Rows are the new axes in terms of the old ones.
@@ -101,5 +102,7 @@ def _measure_step(values: Array) -> float:
     if len(levels) < FEWEST_STEPS:
         return 0.0
     gaps = np.diff(levels)
+    if gaps.max() > MOST_STEPS * gaps.min():
+        return 0.0
     counts = gaps / gaps.min()
     return float(gaps.min()) if np.abs(counts - np.round(counts)).max() < 0.01 else 0.0
