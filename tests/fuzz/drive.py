@@ -21,7 +21,7 @@ from tests.fuzz.corpus import write_corpus
 
 ROOT = Path(__file__).parent.parent.parent
 PATIENCE = 60.0  # s for one input, by the clock: others may want the processor, too
-SLOW = 9.0  # s of the processor that are a fault: a drawn page, which is looked at twice, takes 4 to 6 on a busy machine
+SLOW = 6.0  # s of the processor that are a fault
 
 
 class Worker:
