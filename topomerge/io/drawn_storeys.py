@@ -148,7 +148,7 @@ def place_storeys(plans: Sequence[DrawnStorey], resolution: float, common: float
     for below, above in pairwise(plans):
         floors = [reduce_mask(ndimage.binary_fill_holes(p.free | p.occupied), step) for p in (below, above)]
         walls = [ndimage.binary_dilation(reduce_mask(p.occupied, step)) for p in (below, above)]
-        score = sum(correlate_masks(a, b) for a, b in (floors, walls))
+        score = correlate_masks(*floors) + correlate_masks(*walls)
         move = np.array(np.unravel_index(int(np.argmax(score)), score.shape)) - np.array(floors[1].shape) + 1
         both = count_common(floors[0], floors[1], move)
         if both < common * (floors[0].sum() + floors[1].sum() - both):

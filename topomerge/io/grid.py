@@ -213,7 +213,7 @@ def count_pages(path: Path) -> int:
         with Image.open(path, formats=("TIFF",)) as opened:
             for number in range(min(getattr(opened, "n_frames", 1), MOST_PAGES)):
                 opened.seek(number)
-                pages += not int(opened.tag_v2.get(reduced, 0)) & 1
+                pages += not int(getattr(opened, "tag_v2", {}).get(reduced, 0)) & 1
     except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError):
         return 1  # `read_image` tells what is wrong
     return max(pages, 1)
