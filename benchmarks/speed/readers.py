@@ -37,8 +37,9 @@ from topomerge.types import build_landmarks
 
 COMMAND = "python -m benchmarks.speed.readers"
 MODULES = ("topomerge.io.points", "topomerge.io.pictures", "topomerge.io.bag_landmarks", "topomerge.landmarks.evidence")
-PICTURES = 28  # of the corridor of signs
+PICTURES = 14  # of the corridor of signs
 ROWS = 100_000  # of a table
+LAPS = 3  # of the walk through a house
 POINTS = 1_000_000  # of a labelled cloud
 PACKAGES = ("rapidocr_onnxruntime", "pupil_apriltags", "cv2", "rosbags")
 READ = """
@@ -118,8 +119,8 @@ def write_bag_readings(folder: Path, told: bool) -> Path:
 def repeat_walk() -> Walk:
     """Return the walk through the house several times."""
     walk = house_walk()
-    times = walk.times[0] + (walk.times[1] - walk.times[0]) * np.arange(10 * len(walk.scans))
-    return Walk(walk.scans * 10, np.tile(walk.poses, (10, 1, 1)), times)
+    times = walk.times[0] + (walk.times[1] - walk.times[0]) * np.arange(LAPS * len(walk.scans))
+    return Walk(walk.scans * LAPS, np.tile(walk.poses, (LAPS, 1, 1)), times)
 
 
 def write_node_readings(folder: Path, told: bool) -> Path:
@@ -235,7 +236,7 @@ def measure_merges() -> str:
     return write_table([*heads, "ms in these", "s of processor in all"], lines)
 
 
-def main(page: str = "", most: int = len(RECORDINGS), repeat: int = 3) -> None:
+def main(page: str = "", most: int = len(RECORDINGS), repeat: int = 2) -> None:
     """Print the tables, of the first `most` recordings; write them into a page."""
     blocks = {"readers": measure_readers(RECORDINGS[:most], repeat), "without": measure_merges()}
     print("\n\n".join(blocks.values()))
