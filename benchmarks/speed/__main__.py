@@ -32,6 +32,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "training": {"batches": (2,), "steps": 1},
     "researcher": {"most": 1},
     "studio": {"rooms": [10]},
+    "readers": {"most": 0, "repeat": 1},
     "bags": {"gigabytes": [0.02], "spacing": 0.1},
 }
 # Of so few points the thesis' preset finds no room: extract_floor compares nothing in its small form.

@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tests.scenes_map import building
-from topomerge.landmarks.evidence import MOST_FAR, LandmarkEvidence, score_landmarks
+from topomerge.landmarks.evidence import MOST_FAR, RATES, SEEN_CELLS, LandmarkEvidence, LandmarkScorer, score_landmarks
 from topomerge.landmarks.likelihood import ALTERNATIVES, KINDS, NEAR, READERS, RENEWED, SIDE_BY_SIDE
 from topomerge.landmarks.sightings import MOST_SIGHTINGS, build_sightings
 from topomerge.registration.posterior import POSTERIOR
@@ -159,6 +159,33 @@ def test_tags_nearly_settle_it():
     assert lead(score(tags, ["tag36h11:13", "tag36h11:98"], kind="tag"))["wing"] < -3.0
     turned = score_landmarks(with_signs(tags, kind="tag", number=0.0), with_signs(tags, kind="tag", number=3.0), Sim3())
     assert min(lead(turned).values()) < 0.0
+
+
+def test_a_tag_that_the_other_map_lacks_speaks_for_another_place_by_hand():
+    first, second = places(4, 3.0)[:2], places(4, 3.0)[2:]
+    a, b = with_signs(["tag:1", "tag:2"], first, "tag"), with_signs(["tag:8", "tag:9"], second, "tag")
+    leads = lead(score_landmarks(a, b, Sim3()))
+    one, other = RATES[:, None], RATES[None]
+    alone = (one + other) / (one + other - one * other)  # of a tag that one map has: by chance both would be alike likely
+    by_hand = np.log(np.mean(((1 - one) * alone) ** 2 * ((1 - other) * alone) ** 2))
+    assert leads["wing"] == pytest.approx(by_hand, rel=0.3) and leads["storey"] == pytest.approx(
+        leads["wing"]
+    )  # as far as both saw
+    assert leads["wing"] < -1.0
+    far = score_landmarks(a, with_signs(["tag:8", "tag:9"], second, "tag"), Sim3(translation=(300.0, 0, 0)))
+    assert not far.factors  # nobody saw these places
+    assert not score_landmarks(a, HALL, Sim3()).factors  # a map whose camera reads no tags says nothing
+    found = score_landmarks(with_signs(["tag:1", "tag:2", "tag:3"], places(4, 3.0)[:3], "tag"), a, Sim3())
+    assert min(lead(found).values()) > 2.5  # one of three is missing
+
+
+def test_a_million_tags_are_bounded_work():
+    rng = np.random.default_rng(0)
+    at = rng.uniform(*HALL.grid.bounds, (2000, 3))
+    many = with_signs([f"tag:{k}" for k in range(2000)], at, "tag")
+    other = with_signs([f"tag:{k}" for k in range(5000, 7000)], at[::-1], "tag")
+    assert LandmarkScorer(many, other).around["tag"][0].shape == (MOST_SIGHTINGS, SEEN_CELLS, 3)
+    assert score_landmarks(many, other, Sim3()).compute_likelihoods()["wing"] > 3.0
 
 
 def test_names_and_objects_say_little():

@@ -40,6 +40,7 @@ from topomerge.landmarks.radio import (
     score_radio,
 )
 from topomerge.landmarks.radio_search import build_radio_index, propose_radio_poses, rank_maps
+from topomerge.statistics import compute_exact_interval
 from topomerge.training.radio_law import count_pairs, draw_cases, fit_left_out, measure_log_loss, read_storeys, score_cases
 from topomerge.types import Landmarks, LogFn, Sim3
 
@@ -174,11 +175,62 @@ def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
         return {"radio-storeys": tabulate_buildings(rows)}
     whole = [row for row in rows if row["walks"] == 0]
     return {
+        "radio-aims": tabulate_aims(rows),
+        "radio-left-out": tabulate_left_out(rows),
         "radio-law": tabulate_law(),
         "radio-poses": tabulate_poses(rows),
         "radio-ranks": tabulate_ranks(whole),
         "radio-verdicts": tabulate_verdicts(whole),
     }
+
+
+def tabulate_aims(rows: Sequence[Row]) -> str:
+    """Tabulate what is aimed at: errors, poses beyond `FAR` that are told as sure, and storeys found by all scans."""
+    lines = []
+    for walks in WALKS:
+        some = [row for row in rows if row["walks"] == walks]
+        trials = np.array([t for row in some for t in row["trials"]], float)
+        error, sure = trials[:, 0], trials[:, 3] > 0
+        medians = [float(np.median([t[0] for t in row["trials"]])) for row in some]
+        wrong = int((sure & (error > FAR)).sum())
+        right, asked = sum(row["ranked"]["all scans"] for row in some if walks == 0), len(trials) if walks == 0 else 0
+        low, high = compute_exact_interval(right, asked) if asked else (0.0, 1.0)
+        found = [f"{right} of {asked}", f"{100 * low:.1f} to {100 * high:.1f} %"] if asked else ["–", "–"]
+        median = f"{np.median(error):.2f}"
+        errors = [median, f"{min(medians):.2f} to {max(medians):.2f}", f"{error.max():.1f}", int((error > FAR).sum())]
+        lines.append([walks or "half of all", len(trials), *errors, int(sure.sum()), wrong, *found])
+    head = [
+        "walks a map",
+        "trials",
+        "median m",
+        "of a storey",
+        "worst m",
+        f"beyond {FAR:g} m",
+        "told as sure",
+        f"sure and beyond {FAR:g} m",
+    ]
+    return write_table([*head, "storey right", "95 %"], lines)
+
+
+def tabulate_left_out(rows: Sequence[Row]) -> str:
+    """Tabulate for each storey how well what the law of the others tells is calibrated: verdicts, probabilities and sigmas."""
+    lines = []
+    for name in WIFI_STOREYS:
+        of = {row["walks"]: row for row in rows if row["storey"] == name}
+        if not of:
+            continue
+        values = np.concatenate([np.array(v, float).reshape(-1, 2) for v in of[0]["verdicts"].values()])
+        told = 1 / (1 + np.exp(-values[:, 0]))
+        cells = [len(values), f"{measure_log_loss({'all': values}):.3f}", f"{told.mean():.2f}", f"{values[:, 1].mean():.2f}"]
+        for walks in WALKS[:2]:
+            trials = np.array(of[walks]["trials"], float)
+            z = np.sqrt(np.mean(trials[:, 0] ** 2 / trials[:, 2] ** 2))
+            cells += [f"{trials[:, 1].mean():.2f}", f"{(trials[:, 0] <= FAR).mean():.2f}", f"{z:.2f}"]
+        lines.append([name, *cells])
+    head = ["storey left out", "verdicts", "log loss", "other place: told", "was"]
+    for words in ("half of all walks", f"{WALKS[1]} walks"):
+        head += [f"{words}: pose told right", f"within {FAR:g} m", "error over sigma"]
+    return write_table(head, lines)
 
 
 def tabulate_law() -> str:

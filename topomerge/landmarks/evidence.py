@@ -4,7 +4,8 @@ Where both maps read something at one place, `likelihood` weighs it. Besides:
 
 - A rare string that both maps read at two places far from each other under the pose speaks for another pose, unless it points
   there (`POINTS_THERE`).
-- A sign that the other map could have seen and did not read says little (`READS`).
+- A sign that the other map could have seen and did not read says little (`READS`): doors that look alike bear some, too.
+- A tag that one map has and the other one, which saw the place, has not speaks for another place (`score_missed`).
 """
 
 from __future__ import annotations
@@ -106,11 +107,14 @@ def _pair_places(a: Array, b: Array) -> tuple[Array, float]:
 
 
 READS = 0.6  # probability that a map that reads as many signs as the other one reads a sign that it could have seen
-MOST_MISSED = 1.0  # log odds that unread signs may cost in all
+MOST_UNREAD = 1.0  # log odds that unread signs may cost in all
+# Shares of the tags in sight that a map may have, alike likely: so a reader that finds most is likelier than one that finds few.
+RATES = np.sqrt((np.arange(10) + 0.5) / 10)
 POINTS_THERE = 0.1  # probability that a rare string far from its place points there, or was put in a wrong place
 FAR, MOST_FAR = 6.0, 6.0  # m beyond which two places are two, and log odds that such strings may give in all
 RARE = 0.01  # share of the signs, below which a string names one place
-SEEN_WITHIN = 0.6  # m from an occupied cell of the other map: the place is seen
+SEEN_AROUND, SEEN_WITHIN = 1.5, 0.6  # m around a landmark of its own map's cells, and of those of the other map from these
+SEEN_CELLS, MOST_ASKED = 32, 200  # cells around a landmark, and landmarks of a map, that are asked for
 Bends = tuple[Deformation | None, Deformation | None]
 
 
@@ -245,6 +249,28 @@ class LandmarkScorer:
         grids = [m.grid.compute_centroids() for m in (self.a, self.b)]
         return tuple(cKDTree(c[:: max(len(c) // 100_000, 1)]) for c in grids)  # type: ignore[return-value]
 
+    @cached_property
+    def around(self) -> dict[str, tuple[Array, Array]]:
+        """Of each kind and map (n, SEEN_CELLS, 3) m, the cells around its landmarks, from these; nan: fewer."""
+        return {
+            kind: (_find_cells_around(a, self.trees[0]), _find_cells_around(b, self.trees[1]))
+            for kind, (a, b) in self.sightings.items()
+            if KINDS[kind].most_missed
+        }
+
+    def measure_seen(self, kind: str, side: int, at: Array, pose: Sim3) -> Array:
+        """Measure (n,) the share of the cells around the landmarks of a map, at places of map a, that the other map has, too."""
+        cells = self.around[kind][side]
+        known = np.isfinite(cells[:, :, 0])
+        rows, _ = np.nonzero(known)
+        if side == 0:
+            places, metre = pose.inverse().apply(at[rows] + cells[known]), pose.scale
+        else:
+            places, metre = at[rows] + pose.apply(cells[known]) - pose.apply(np.zeros((1, 3))), 1.0
+        near = self.trees[1 - side].query(places)[0] * metre
+        met = np.bincount(rows[near <= SEEN_WITHIN], minlength=len(cells))
+        return np.asarray(met / np.maximum(known.sum(axis=1), 1))
+
     def score(self, pose: Sim3, bends: Bends = (None, None)) -> LandmarkEvidence:
         """Return what landmarks say of T_ab, of maps that are bent first."""
         factors, witnesses = {}, []
@@ -254,6 +280,17 @@ class LandmarkScorer:
                 factors[kind] = factor
                 witnesses += seen
         return LandmarkEvidence(factors, tuple(witnesses))
+
+
+def _find_cells_around(sightings: Sightings, tree: cKDTree) -> Array:
+    """(n, SEEN_CELLS, 3) m, cells of a map around its landmarks, from these; nan where there are fewer."""
+    out = np.full((len(sightings), SEEN_CELLS, 3), np.nan)
+    placed = (sightings.sigma <= 1.0) & ~sightings.named & np.isfinite(sightings.position[:, 2])
+    for k in np.flatnonzero(placed)[:MOST_ASKED].tolist():
+        cells = tree.data[sorted(tree.query_ball_point(sightings.position[k], SEEN_AROUND))]
+        cells = cells[np.linspace(0, len(cells) - 1, min(len(cells), SEEN_CELLS)).astype(int)]
+        out[k, : len(cells)] = cells - sightings.position[k]
+    return out
 
 
 def score_landmarks(
@@ -288,9 +325,12 @@ def score_sightings(scorer: LandmarkScorer, pose: Sim3, bends: Bends, kind: str)
         factors = {name: v + prefixes[name] for name, v in factors.items()}
     far = find_far_partners(a, b, at, met, kind)
     factors["elsewhere"] += min(len(far) * float(-np.log(POINTS_THERE)), MOST_FAR)
-    missed = count_missed(scorer, at, met, pose, (a, b)) if kind == "text" else 0.0
+    unread = count_unread(scorer, at, met, pose, (a, b)) if kind == "text" else 0.0
     for name in ("elsewhere", "building", "outside"):
-        factors[name] += missed
+        factors[name] += unread
+    if rules.most_missed:
+        missed = score_missed(scorer, at, met, pose, kind)
+        factors = {name: v + missed * (name != "here") for name, v in factors.items()}
     if rules.least > -np.inf:
         factors["here"] = max(factors["here"], rules.least)
     return factors, _list_witnesses(a, b, met, far, rules, kind)
@@ -316,7 +356,7 @@ def find_far_partners(a: Sightings, b: Sightings, at: Sequence[Array], met: Asso
     return far
 
 
-def count_missed(
+def count_unread(
     scorer: LandmarkScorer, at: Sequence[Array], met: Associated, pose: Sim3, sightings: tuple[Sightings, Sightings]
 ) -> float:
     """Return the log odds for a place that has nothing to do with this one of signs that one map read and the other one could
@@ -332,7 +372,26 @@ def count_missed(
         seen = float((scorer.trees[other].query(places)[0] <= SEEN_WITHIN).sum())
         reads = READS * min(density[other] / density[side], 1.0)
         total += seen * float(np.log((1 - reads / 3) / (1 - reads)))
-    return min(total, MOST_MISSED)
+    return min(total, MOST_UNREAD)
+
+
+def score_missed(scorer: LandmarkScorer, at: Sequence[Array], met: Associated, pose: Sim3, kind: str) -> float:
+    """Return the log odds for another place of landmarks that one map has and the other one does not, though it saw the place.
+
+    A landmark that both maps could read was read by the one, the other, or both. How many each reads of those in sight is not
+    known (`RATES`), and told by those that both read. At another place the landmarks of each map have nothing to do with each
+    other.
+    """
+    first, second = RATES[:, None], RATES[None]
+    both = first + second - first * second  # probability that a landmark is in a map at all
+    usual = len(met.pairs) * np.log(first * second / both)
+    missed = np.zeros_like(usual)
+    for side, misses in enumerate((1 - second, 1 - first)):
+        seen = scorer.measure_seen(kind, side, at[side], pose)
+        alone = np.setdiff1d(np.flatnonzero(seen > 0), met.pairs[:, side])
+        missed += np.log1p(seen[alone, None, None] * (misses * (first + second) / both - 1)).sum(axis=0)
+    total = np.logaddexp.reduce(usual, axis=None) - np.logaddexp.reduce(usual + missed, axis=None)
+    return float(np.clip(total, 0.0, KINDS[kind].most_missed))
 
 
 def _list_witnesses(

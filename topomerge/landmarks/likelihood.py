@@ -9,6 +9,8 @@ Generative assumptions. Each is a number below, stated and not fitted.
   (`text.estimate_share`), or a number near the other one. As a whole, the other place repeats all strings of this one with
   `Kind.repeats` (wings that are numbered alike, tags printed from one sheet), or all of its numbers differ by one shift, as
   storeys and wings do.
+- A tag that the other map saw the place of and does not have was missed by its reader, if the pose is right; how many tags of
+  those in sight each reader finds is not known (`evidence.RATES`).
 - How well the readers read is not known, and shared by all signs of the pair: `READERS`.
 
 So that no single landmark carries a merge, one agreeing landmark counts `Kind.most` times at most, and all together no more than
@@ -69,6 +71,9 @@ class Kind:
         most: times that one landmark may count.
         surest: m, sigma up to which a place is sure enough that another landmark at it contradicts.
         words: one of them, in words.
+        least: log odds that all may cost.
+        most_missed: log odds that those may cost which one map has and the other one, which saw the place, has not. Tags hang
+            anywhere; doors bear signs at every place that looks alike.
     """
 
     kinds: tuple[str, ...]
@@ -77,7 +82,8 @@ class Kind:
     most: float
     surest: float
     words: str
-    least: float = -np.inf  # log odds that all may cost
+    least: float = -np.inf
+    most_missed: float = 0.0
 
 
 def _repeats(elsewhere: float, storey: float, half: float, wing: float, building: float, outside: float) -> dict[str, float]:
@@ -86,7 +92,7 @@ def _repeats(elsewhere: float, storey: float, half: float, wing: float, building
 
 KINDS = {
     "text": Kind(("text", "name"), 0.02, _repeats(0.005, 0.02, 0.01, 0.02, 0.02, 0.005), 50.0, 1.5, "sign"),
-    "tag": Kind(("tag",), 0.02, _repeats(0.002, 0.003, 0.003, 0.003, 0.02, 0.003), 500.0, 1.5, "tag"),
+    "tag": Kind(("tag",), 0.02, _repeats(0.002, 0.003, 0.003, 0.003, 0.02, 0.003), 500.0, 1.5, "tag", most_missed=6.0),
     "name": Kind(("name",), 0.2, _repeats(0.02, 0.1, 0.1, 0.1, 0.05, 0.02), 8.0, 4.0, "room name", -2.0),
     "object": Kind(("object",), 0.5, _repeats(0.1, 0.2, 0.2, 0.2, 0.1, 0.1), 3.0, 1.0, "object", -2.0),
 }

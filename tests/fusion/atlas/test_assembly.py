@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.fusion.atlas.votes import LIMIT, TRUE, WRONG, Pair, Votes, between, claim, odds
+from tests.fusion.atlas.votes import LIMIT, PLACE, TRUE, WRONG, Pair, Votes, between, claim, odds
+from topomerge.fusion.atlas import solve
 from topomerge.fusion.atlas.link_evidence import CLOSING_GAIN, Link, place_component
+from topomerge.fusion.atlas.pairs import Check
 from topomerge.fusion.pose_graph import HEAVIEST_WALLS, Assembler, compute_residual
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3
@@ -113,3 +115,34 @@ def test_maps_that_a_link_joins_without_overlap_stay_where_it_puts_them():
     link = Link((0, 1), claim(0, 1, 0.99)[0], 4.0)
     solved, edges = Assembler(2, {}, Votes(), LIMIT).settle(poses, [link])  # type: ignore[arg-type]
     assert len(edges) == 1 and is_right(solved)
+
+
+class Remembering(Votes):
+    """Votes that judge poses near each other once, as `Checks` does."""
+
+    def __call__(self, i: int, j: int, pose: Sim3) -> Check:
+        if j < i:
+            turned = self(j, i, pose.inverse())
+            return Check(turned.pose.inverse(), turned.log_odds, turned.overlap, turned.features)
+        near = self.measured.get((i, j), Sim3())
+        if not np.allclose(pose.apply(PLACE), near.apply(PLACE), atol=0.08):
+            self.measured[i, j] = pose
+        return super().__call__(i, j, pose)
+
+
+def test_what_was_registered_first_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An atlas was written anew where its links were registered before: poses near each other are judged at the first one."""
+    monkeypatch.setattr(solve, "Checks", lambda *of: Remembering(dict.fromkeys([(0, 1), (0, 2), (1, 2)], 1.0)))
+    monkeypatch.setattr(solve, "find_partners", lambda *of: ([[1, 2], [0, 2], [1, 0]], True))
+    keys = ("a", "b", "c")
+    off = {(0, 1): 0.0, (1, 2): 0.06, (0, 2): 0.0}
+    registrations = {(keys[i], keys[j]): claim(i, j, 0.7, Sim3(0.0, (m, 0.0, 0.0))) for (i, j), m in off.items()}
+    found = []
+    for linked in ((), (("a", "b"), ("a", "c")), (("b", "c"),)):
+        maps = type("Maps", (), {"keys": keys, "__len__": lambda self: 3})()
+        explorer = solve._Explorer(maps, solve.AtlasSettings(), 0.5, registrations, dict.fromkeys(linked, Sim3()))
+        assembly = explorer.explore()
+        assert len(explorer.tried) == 3 and len(assembly.components) == 1
+        poses, edges = explorer.assembler.settle(assembly.components[0], assembly.links)
+        found.append([poses[k].matrix.tobytes() for k in range(3)] + [e.pose.matrix.tobytes() for e in edges])
+    assert found[0] == found[1] == found[2]

@@ -191,15 +191,25 @@ class _Explorer:
         self, maps: Maps, settings: AtlasSettings, threshold: float, registrations: RegistrationsByPair, proposed: Proposed
     ) -> None:
         self.maps, self.scale, self.same, self.embedder = maps, settings.scale, settings.same, settings.embedder
-        self.registrations, scaled = registrations, settings.scale == "free"
+        self.registrations, self.threshold = registrations, threshold
         self.proposed = {**proposed, **{(j, i): pose.inverse() for (i, j), pose in proposed.items()}}
         self.tried: dict[tuple[int, int], tuple[PoseHypothesis, ...]] = {}
         self.complete = True
-        self.checks = Checks(maps, scaled)
-        self.assembler = Assembler(len(maps), self.tried, self.checks, threshold, scaled)
+        self._start_assembler()
         place = {key: k for k, key in enumerate(maps.keys)}
         self.linked = sorted((min(place[a], place[b]), max(place[a], place[b])) for a, b in proposed if {a, b} <= set(place))
         self.partners: list[list[int]] = []
+
+    def _start_assembler(self) -> None:
+        """Forget all that was judged, so that what is assembled depends on the registered pairs alone.
+
+        Poses near each other are judged once, at the first one, and which that is depends on what was registered first.
+        """
+        scaled = self.scale == "free"
+        self.tried = dict(sorted(self.tried.items()))
+        self.checks = Checks(self.maps, scaled)
+        self.assembler = Assembler(len(self.maps), self.tried, self.checks, self.threshold, scaled)
+        self.rounds = 0  # of assembling since then
 
     def explore(self, end: float = np.inf, workers: Workers | None = None) -> Assembly:
         """The assembly that more registrations would not change; after the end of the time that of those that were made."""
@@ -207,8 +217,12 @@ class _Explorer:
         self.tried.update({pair: self._register(*pair) for pair in self.linked if self._is_registered(*pair)})
         while True:
             assembly = self.assembler.build()
+            self.rounds += bool(self.tried)
             counts = np.bincount([k for pair in self.tried for k in pair], minlength=len(self.maps))
             pairs = set(self._iter_next_pairs(assembly, counts, time.perf_counter() >= end))
+            if not pairs and self.rounds > 1:
+                self._start_assembler()
+                continue
             if not pairs:
                 self.complete = examined and not any(self._iter_next_pairs(assembly, counts))
                 return assembly
