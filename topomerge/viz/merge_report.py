@@ -27,7 +27,6 @@ from topomerge.io.rooms_ply import save_rooms_ply
 from topomerge.registration.evidence.places import MOST_ODDS, PARTS, Places
 from topomerge.registration.pipeline import Registration
 from topomerge.types import Array, Placement, Sim3, TopometricMap
-from topomerge.viz.atlas_report import render_atlas_html
 from topomerge.viz.merge_plan import Drawn, lay_out_pair, render_blend_view, render_deformation_table, render_lines
 from topomerge.viz.plan import build_scene_data, get_room_colours
 from topomerge.viz.report import (
@@ -208,6 +207,8 @@ def _write(text: str, path: Path) -> None:
 def render_merge_html(result: MergeResult) -> str:
     """Return the report as HTML. A result that is not believed shows its best hypothesis, and says so."""
     if result.atlas is not None:
+        from topomerge.viz.atlas_report import render_atlas_html
+
         names = " + ".join(m.title for m in result.maps)
         joined = {} if result.map is None else {result.atlas.find_component(0): result.map}
         atlas = replace(result.atlas, warnings=result.warnings)
