@@ -125,6 +125,12 @@ class VoxelGrid:
 
         return stencil.build_columns(self.cells, *self._bricks)
 
+    @cached_property
+    def _lowest_of_column(self) -> Array:
+        rows = np.flatnonzero(~self.contains(self.cells.astype(np.int64) - (0, 0, 1)))
+        rows.flags.writeable = False  # all who ask share it
+        return rows
+
     @property
     def bounds(self) -> tuple[Array, Array]:
         """V_min and V_max, m."""
@@ -298,5 +304,6 @@ class Sim3:
 
 
 def select_lowest_of_column(navigable: VoxelGrid) -> Array:
-    """Ascending rows of the cells that have no cell right below them: the floor proper, without its upward dilation."""
-    return np.flatnonzero(~navigable.contains(navigable.cells.astype(np.int64) - (0, 0, 1)))
+    """Ascending rows of the cells that have no cell right below them: the floor proper, without its upward dilation. They are
+    found once; who asks again gets the same array."""
+    return navigable._lowest_of_column
