@@ -13,18 +13,25 @@ import pytest
 from tests.cli.processes import process
 from tests.scenes import two_rooms
 from topomerge.cli.main import main
-from topomerge.extraction import walls
+from topomerge.extraction import cleaning, walls
+from topomerge.extraction.convolution import Kernel, convolve
 from topomerge.extraction.elevations.doorways import classify_places
 from topomerge.extraction.elevations.elevation import WALL_NETWORK_FILE, Elevations
 from topomerge.extraction.extract import extract
 from topomerge.extraction.plans.plan_network import LOOKS, PLAN_NETWORK_FILE
 from topomerge.io import piece, ply
 from topomerge.io.points import read_chunks
+from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.kernels import voxels
 from topomerge.networks.network import Network
-from topomerge.types import PointCloud
+from topomerge.types import PointCloud, VoxelGrid
 
-MOST_MODULES = {"import topomerge": 120, "import topomerge.kernels": 620, "import topomerge.extraction.extract": 1020}
+MOST_MODULES = {
+    "import topomerge": 120,
+    "import topomerge.io.points": 290,
+    "import topomerge.kernels": 620,
+    "import topomerge.extraction.extract": 1020,
+}
 
 
 def write_cloud(path: Path, points: np.ndarray) -> None:
@@ -91,6 +98,29 @@ def test_each_point_is_laid_into_cells_once(monkeypatch: pytest.MonkeyPatch) -> 
     points = two_rooms().points().astype(np.float32)
     extract(PointCloud(part) for part in np.array_split(points, 3))
     assert laid == {0.05: len(points)}
+
+
+def test_what_is_asked_for_again_is_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neighbours of the occupied cells, the floor proper of a volume, and the colours of rooms."""
+    counted: list[int] = []
+    found: list[tuple[int, ...]] = []
+
+    def count(grid: VoxelGrid, kernel: Kernel) -> np.ndarray:
+        counted.append(len(grid))
+        return convolve(grid, kernel)
+
+    def find(self: VoxelGrid, cells: np.ndarray) -> np.ndarray:
+        if len(cells) == len(self) and (cells == self.cells - (0, 0, 1)).all():
+            found.append((len(cells), *self.cells.sum(axis=0).tolist()))
+        return contains(self, cells)
+
+    contains = VoxelGrid.contains
+    monkeypatch.setattr(cleaning, "convolve", count)
+    monkeypatch.setattr(VoxelGrid, "contains", find)
+    map = extract(two_rooms().points().astype(np.float32))
+    assert len(counted) == 1
+    assert 0 < len(found) == len(set(found))
+    assert assign_room_colours(map) is assign_room_colours(map)
 
 
 def test_networks_run_once_a_look_and_once_a_strip(runs: Counter[str], monkeypatch: pytest.MonkeyPatch) -> None:

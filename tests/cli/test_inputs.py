@@ -254,7 +254,7 @@ def test_size_of_an_input(tmp_path: Path) -> None:
 
 def test_signs_may_be_left_out_or_demanded(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`--text` fails without the package, before anything is read; `--no-text` reaches the reader, of `merge`, too."""
-    from topomerge.cli.inputs import collect_reading_options
+    from topomerge.cli.options import collect_reading_options
     from topomerge.io import pictures
 
     monkeypatch.setattr(pictures, "load_text_reader", lambda: None)

@@ -18,8 +18,8 @@ import topomerge
 from tests.cli.processes import Run, process
 from tests.scenes import two_rooms
 from tests.scenes_map import building, same
-from topomerge.cli.inputs import check_cloud_options
 from topomerge.cli.main import COMMANDS
+from topomerge.cli.options import check_cloud_options
 from topomerge.errors import InputError
 from topomerge.io.maps import load_map
 
@@ -58,6 +58,43 @@ sys.exit(f"imported {heavy}" if heavy else 0)
 """
     done = process(code=code)
     assert done.returncode == 0, done.stderr
+
+
+def test_files_are_opened_before_anything_heavy_is_imported(tmp_path: Path) -> None:
+    """What is wrong with a name or a file is told before numba compiles and SciPy is imported."""
+    (tmp_path / "damaged.tmap").write_text("no map")
+    (tmp_path / "empty.ply").touch()
+    (tmp_path / "one.ply").write_text("ply")
+    code = """
+import sys
+from topomerge.cli.main import main
+for words in (
+    "extract none.ply -o a.tmap", "extract empty.ply -o a.tmap", "info none.tmap", "info damaged.tmap",
+    "embed damaged.tmap -o a.npy",
+    "merge none.ply one.ply -o m", "merge one.ply empty.ply -o m", "merge damaged.tmap one.ply -o m", "match none.tmap one.ply",
+    "match damaged.tmap one.ply", "diff damaged.tmap one.ply", "atlas add atlas none.tmap", "atlas find atlas damaged.tmap",
+    "locate none.tmap atlas", "export none.tmap --to geojson -o a.geojson", "edit none.tmap --list",
+):
+    assert main(words.split()) == 1, words
+    heavy = {"numba", "scipy", "shapely", "onnxruntime", "matplotlib", "topomerge.kernels"} & set(sys.modules)
+    assert not heavy, (words, heavy)
+"""
+    done = process(code=code, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
+def test_what_scipy_imports_and_nobody_uses_does_not_run() -> None:
+    code = """
+import sys
+from topomerge.cli.console import postpone_imports
+postpone_imports()
+import scipy.ndimage, scipy.sparse
+assert "numpy.f2py" in sys.modules and not {"numpy.f2py.crackfortran", "unittest"} & set(sys.modules)
+import numpy.f2py, numpy.testing
+numpy.testing.assert_allclose(1.0, 1.0)
+assert callable(numpy.f2py.run_main) and "unittest" in sys.modules
+"""
+    assert process(code=code).returncode == 0
 
 
 NEVER_FOR_ONE_MAP = (

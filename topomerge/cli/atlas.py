@@ -25,7 +25,7 @@ from topomerge.cli.console import (
     warn,
     write_out,
 )
-from topomerge.cli.inputs import check_cloud_options, iter_input_maps, load_input_map
+from topomerge.cli.inputs import iter_input_maps, load_input_map
 from topomerge.cli.options import (
     ATLAS_OPTIONS,
     CLOUD_OPTIONS,
@@ -33,6 +33,7 @@ from topomerge.cli.options import (
     build_json_option,
     build_output_option,
     build_quiet_option,
+    check_cloud_options,
     collect_atlas_options,
     collect_given,
     parse_count,
@@ -65,15 +66,15 @@ def run_atlas(args: argparse.Namespace) -> int:
 
 
 def _add(args: argparse.Namespace) -> int:
+    if not args.items:
+        raise InputError(f"{args.folder}: name the maps or clouds to add: topomerge atlas add {args.folder} MAP ...")
+    check_inputs(args.items)
     from topomerge.fusion.atlas.folder import read_folder
     from topomerge.fusion.atlas.store import add
     from topomerge.viz.atlas_report import render_atlas_html
 
-    if not args.items:
-        raise InputError(f"{args.folder}: name the maps or clouds to add: topomerge atlas add {args.folder} MAP ...")
     read_folder(args.folder)
     choices, workers = collect_atlas_options(args), _build_workers(args)
-    check_inputs(args.items)
     check_cloud_options(args.items, args)
     with closing(iter_input_maps(args.items, args)) as loaded:  # few are in memory at a time
         maps = ((Path(path).stem, replace(one.map, source=path)) for path, one in zip(args.items, loaded, strict=True))
@@ -111,13 +112,14 @@ def _update(args: argparse.Namespace) -> int:
 
 
 def _find(args: argparse.Namespace) -> int:
-    from topomerge.fusion.atlas.find import find
-
     if len(args.items) != 1:
         raise InputError(f"{args.folder}: name the one map or cloud to look for: topomerge atlas find {args.folder} MAP")
     check_inputs(args.items)
     check_cloud_options(args.items, args)
-    sightings = find(args.folder, load_input_map(args.items[0], args), args.first)
+    scan = load_input_map(args.items[0], args)
+    from topomerge.fusion.atlas.find import find
+
+    sightings = find(args.folder, scan, args.first)
     if args.json:
         write_out(json.dumps([asdict(s) for s in sightings], indent=1, ensure_ascii=False) + "\n")
         return 0

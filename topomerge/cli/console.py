@@ -12,8 +12,9 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
-from types import FrameType
+from types import FrameType, ModuleType
 from typing import TYPE_CHECKING, Any, TextIO
 
 from topomerge.errors import InputError, is_memory_short, make_printable
@@ -323,6 +324,29 @@ def write_all(outputs: Sequence[tuple[str | Path, Callable[[Path], None]]]) -> N
         if len(outputs) > 1:  # a kill between two renames must not leave one file of this run beside one of an earlier run
             for path, _ in outputs:
                 _resolve_path(path).unlink(missing_ok=True)
+
+
+NEVER_USED = ("numpy.f2py", "numpy.testing")  # but imported by SciPy, with all that they import: a tenth of its import
+
+
+class _LateFinder:
+    """Lets modules run when something of them is used, not when they are imported."""
+
+    @staticmethod
+    def find_spec(name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
+        if name not in NEVER_USED:
+            return None
+        from importlib.util import LazyLoader
+
+        spec = PathFinder.find_spec(name, path, target)
+        if spec is not None and spec.loader is not None:
+            spec.loader = LazyLoader(spec.loader)
+        return spec
+
+
+def postpone_imports() -> None:
+    """Let this process run `NEVER_USED` when something of them is used."""
+    sys.meta_path.insert(0, _LateFinder)
 
 
 COMPILER = f"{os.sep}llvmlite{os.sep}"

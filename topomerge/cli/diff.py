@@ -24,13 +24,14 @@ from topomerge.cli.console import (
     write_all,
     write_out,
 )
-from topomerge.cli.inputs import check_cloud_options, iter_input_maps
+from topomerge.cli.inputs import iter_input_maps
 from topomerge.cli.options import (
     BELIEF_OPTIONS,
     CLOUD_OPTIONS,
     JOBS,
     build_json_option,
     build_quiet_option,
+    check_cloud_options,
     collect_belief_options,
     collect_given,
     parse_share,

@@ -23,7 +23,7 @@ from topomerge.cli.console import (
     write_all,
     write_out,
 )
-from topomerge.cli.inputs import check_cloud_options, load_input_map, load_stored_map
+from topomerge.cli.inputs import load_input_map, load_stored_map
 from topomerge.cli.options import (
     CLOUD_OPTIONS,
     CONTEXT_STEPS,
@@ -36,6 +36,7 @@ from topomerge.cli.options import (
     build_json_option,
     build_output_option,
     build_quiet_option,
+    check_cloud_options,
     check_descriptor,
     collect_given,
     parse_count,
@@ -57,13 +58,14 @@ def run_extract(args: argparse.Namespace) -> int:
     if Path(args.output).suffix.lower() != ".tmap":  # no other command would take it for a map
         raise InputError(f"{args.output}: -o names the map; end its name with .tmap (for other files there are {OTHER_OUTPUTS})")
     with ProgressBars(enabled=not args.quiet) as bars:
-        from topomerge.extraction.extract import extract
         from topomerge.io.points import read_chunks
 
         lengths = ("scale", "resolution", "extrude", "spacing", "tag_size")
         others = ("up", "unit", "drawing", "ceiling", "doors", "poses", "topic", "one_frame", "text", "page")
         reading = collect_given(args, *lengths, *others)
         chunks = read_chunks(args.input, **reading, progress=bars.start_task("read"))
+        from topomerge.extraction.extract import extract  # after the file was opened: what is wrong with it is told at once
+
         choices = collect_given(args, "voxel_size", "preset")
         extracted = extract(chunks, **choices, name=args.input, progress=bars.start_task("extract"))
         topomap = _replay_journal(extracted, args)
@@ -161,9 +163,9 @@ EXTRACT = Command(
 
 def run_info(args: argparse.Namespace) -> int:
     """`topomerge info`: print the rooms, storeys, doors and times of a map, as tables or as JSON."""
+    topomap = load_stored_map(args.input, args)
     from topomerge.io.listing import convert_map_to_json, format_json, format_map
 
-    topomap = load_stored_map(args.input, args)
     warn(topomap.warnings)
     if args.json:
         write_out(format_json(convert_map_to_json(topomap)))
@@ -189,11 +191,12 @@ def run_embed(args: argparse.Namespace) -> int:
     check_suffix("-o", args.output, (".npy",))
     check_cloud_options([args.input], args)
     check_descriptor(args)
+    topomap = load_input_map(args.input, args)
     from topomerge.embedding.learned import build_embedder
     from topomerge.embedding.quarter_turns import get_rows
 
     describe = build_embedder(args.descriptor, args.k)
-    rows = get_rows(describe(load_input_map(args.input, args)))
+    rows = get_rows(describe(topomap))
     import numpy as np
 
     def save(path: Path) -> None:

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from topomerge.cli.console import ProgressBars, Report, exit_on_signals, format_failure, show_log, warn
-from topomerge.cli.options import collect_given
+from topomerge.cli.options import collect_given, collect_reading_options, is_map
 from topomerge.errors import InputError
 
 if TYPE_CHECKING:
@@ -57,30 +57,6 @@ class LoadedMap:
     read_seconds: float
     extract_seconds: float = 0.0
     parts: Mapping[str, Any] | None = None
-
-
-def check_cloud_options(paths: Sequence[str], args: argparse.Namespace) -> None:
-    """Refuse `CLOUD_OPTIONS` where no input is a cloud.
-
-    Raises:
-        InputError: names the first of them; or the files of one frame, where no input is a folder.
-    """
-    useless = collect_given(args, "voxel_size", "up", "unit", "sensor")
-    if useless and all(is_map(path) for path in paths):
-        name = next(iter(useless)).replace("_", "-")
-        raise InputError(f"--{name}: is for clouds, of no use to a .tmap; give the scan that it was made of, or leave it out")
-    if collect_given(args, "one_frame") and not any(Path(path).is_dir() for path in paths):
-        raise InputError("--one-frame: is for folders of files; give such a folder, or leave it out")
-
-
-def collect_reading_options(path: str, args: argparse.Namespace) -> dict[str, Any]:
-    """Collect the `CLOUD_OPTIONS` of reading one input, of which some are for folders only."""
-    return collect_given(args, "up", "unit", "text", "tag_size", *(["one_frame"] if Path(path).is_dir() else []))
-
-
-def is_map(path: str) -> bool:
-    """Return whether an input is a .tmap."""
-    return Path(path).suffix.lower() == ".tmap"
 
 
 def load_stored_map(path: str | Path, args: argparse.Namespace) -> TopometricMap:
@@ -126,12 +102,17 @@ class InputMaps:
         args: of the command.
         ahead: modules that the command needs afterwards; they are imported while another process works.
         prepares: let each process draw what registration needs of the map that it extracted (`LoadedMap.parts`).
+
+    Raises:
+        InputError: a cloud can't be opened.
     """
 
     def __init__(self, paths: Sequence[str], args: argparse.Namespace, ahead: Sequence[str] = (), prepares: bool = False) -> None:
         self._paths, self._ahead = list(paths), list(ahead)
         self._args = argparse.Namespace(**{**vars(args), "prepares": prepares})
-        sizes = {path: measure_input(path) for path in paths if not is_map(path)}
+        clouds = [path for path in paths if not is_map(path)]
+        _open_clouds(clouds)
+        sizes = {path: measure_input(path) for path in clouds}
         self._large = {path for path, size in sizes.items() if size >= LEAST_SIZE[choose_start()]}
         large = [sizes[path] for path in self._large]
         self._processes = count_processes(large, getattr(args, "jobs", None)) if len(large) > 1 else 1
@@ -191,6 +172,19 @@ class InputMaps:
             yield begun.pop(k).result()
 
 
+def _open_clouds(paths: Sequence[str]) -> None:
+    """Open each cloud, before anything heavy is imported or compiled.
+
+    Raises:
+        InputError: one can't be opened, or its suffix is that of no format.
+    """
+    if paths:
+        from topomerge.io.points import detect_format
+
+        for path in paths:
+            detect_format(Path(path))
+
+
 def _load_future(path: str, args: argparse.Namespace, start_task: Starter) -> Future[LoadedMap]:
     """Load a map here and now; an error is kept until its turn, so that the first input that is wrong is named."""
     done: Future[LoadedMap] = Future()
@@ -210,9 +204,7 @@ def _load_map(path: str, args: argparse.Namespace, start_task: Starter) -> Loade
     began = time.perf_counter()
     try:
         if is_map(path):
-            from topomerge.edits.apply import load_corrected_map
-
-            topomap = load_corrected_map(path, getattr(args, "edits", None))
+            topomap = _load_corrected_map(path, getattr(args, "edits", None))
         else:
             from topomerge.extraction.extract import extract
             from topomerge.io.points import read_chunks
@@ -231,6 +223,19 @@ def _load_map(path: str, args: argparse.Namespace, start_task: Starter) -> Loade
     if not is_map(path):
         extracting = min(sum(s for step, s in topomap.seconds.items() if not step.startswith("read")), seconds)
     return LoadedMap(topomap, seconds - extracting, extracting + preparing, parts)
+
+
+def _load_corrected_map(path: str, lines: int | None) -> TopometricMap:
+    """A stored map with what lies beside it; where nothing does, nothing of the extraction is imported."""
+    from topomerge.edits.journal import find_journal
+    from topomerge.io.landmarks import find_landmark_file
+    from topomerge.io.maps import load_map
+
+    if find_landmark_file(Path(path)) is None and (lines == 0 or not find_journal(path).exists()):
+        return load_map(path)
+    from topomerge.edits.apply import load_corrected_map
+
+    return load_corrected_map(path, lines)
 
 
 def _prepare_map(topomap: TopometricMap) -> Mapping[str, Any] | None:

@@ -18,13 +18,15 @@ from topomerge.cli.console import (
     print_text,
     write_out,
 )
-from topomerge.cli.inputs import check_cloud_options, collect_reading_options, is_map
 from topomerge.cli.options import (
     CLOUD_OPTIONS,
     build_json_option,
     build_output_option,
     build_quiet_option,
+    check_cloud_options,
     collect_given,
+    collect_reading_options,
+    is_map,
     parse_positive,
     parse_share,
     parse_whole_number,

@@ -27,6 +27,7 @@ from topomerge.cli.console import (
     format_failure,
     guard_printing,
     open_output_folder,
+    postpone_imports,
     print_line,
     show_log,
     write_all,
@@ -275,6 +276,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     if argv is None:
         exit_on_signals()
+        postpone_imports()
     _open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):

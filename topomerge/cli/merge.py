@@ -26,7 +26,7 @@ from topomerge.cli.console import (
     warn,
     write_out,
 )
-from topomerge.cli.inputs import InputMaps, check_cloud_options, collect_reading_options, is_map, iter_input_maps
+from topomerge.cli.inputs import InputMaps, iter_input_maps
 from topomerge.cli.move import plan_merge, save_plan
 from topomerge.cli.options import (
     BELIEF_OPTIONS,
@@ -38,9 +38,12 @@ from topomerge.cli.options import (
     build_json_option,
     build_output_option,
     build_quiet_option,
+    check_cloud_options,
     check_descriptor,
     collect_belief_options,
     collect_given,
+    collect_reading_options,
+    is_map,
     name_option_in_errors,
 )
 from topomerge.errors import InputError
@@ -199,11 +202,12 @@ def _read_decisions(
 ) -> Mapping[tuple[int, int], Sim3 | None]:
     """What somebody decided of an earlier merge into the folder; lines that do not apply are told."""
     from topomerge.edits.journal import find_journal, read_journal
-    from topomerge.fusion.decisions import find_decisions
 
     journal = read_journal(find_journal(folder))
     if getattr(args, "edits", None) == 0 or not journal.edits:
         return {}
+    from topomerge.fusion.decisions import find_decisions
+
     if args.poses != "search":
         reason = f"{journal.path} says what was decided by hand; leave --poses out, or give --no-edits"
         raise InputError(f"--poses {args.poses}: {reason}")
@@ -218,11 +222,13 @@ def _check_choices(args: argparse.Namespace) -> None:
     Raises:
         InputError: the line begins with the option.
     """
+    check_cloud_options(args.inputs, args)
+    check_descriptor(args)
+    if args.poses == "search":
+        return
     from topomerge.fusion.inputs import check_poses
     from topomerge.registration.surfaces import check_open3d
 
-    check_cloud_options(args.inputs, args)
-    check_descriptor(args)
     with name_option_in_errors("--poses"):
         check_poses(args.poses, len(args.inputs), args.scale_of_b)
         if args.poses == "surfaces":
@@ -283,10 +289,6 @@ MERGE = Command(
 
 def run_match(args: argparse.Namespace) -> int:
     """`topomerge match`: print the matches of rooms with their probabilities, as tables or as JSON."""
-    from topomerge.fusion.match_belief import update_match_probabilities
-    from topomerge.io.listing import format_json
-    from topomerge.matching.match import check, format_matching, match, serialise_matching
-
     check_inputs([args.a, args.b])
     check_cloud_options([args.a, args.b], args)
     if args.method != "thesis":  # which has a descriptor and a context of its own
@@ -297,6 +299,10 @@ def run_match(args: argparse.Namespace) -> int:
         check_outputs([args.report], [args.a, args.b])
         check_suffix("--report", args.report, PAGE_SUFFIXES)
     a, b = (loaded.map for loaded in iter_input_maps([args.a, args.b], args))
+    from topomerge.fusion.match_belief import update_match_probabilities
+    from topomerge.io.listing import format_json
+    from topomerge.matching.match import check, format_matching, match, serialise_matching
+
     check(a, b)
     alone = [path for path, topomap in ((args.a, a), (args.b, b)) if len(topomap.rooms) == 1]
     warn(f"{path}: has one room: only its shape and doors can be compared" for path in alone)

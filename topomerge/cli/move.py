@@ -16,8 +16,7 @@ from topomerge.cli.console import (
     print_line,
     warn,
 )
-from topomerge.cli.inputs import collect_reading_options
-from topomerge.cli.options import build_output_option, build_quiet_option
+from topomerge.cli.options import build_output_option, build_quiet_option, collect_reading_options
 from topomerge.errors import InputError
 
 if TYPE_CHECKING:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from topomerge.cli.console import Argument, build_option
@@ -65,10 +66,12 @@ def check_descriptor(args: argparse.Namespace) -> None:
     Raises:
         InputError: no.
     """
-    from topomerge.embedding.learned import DEFAULT, build_embedder
+    if args.descriptor == DEFAULT_DESCRIPTOR and not getattr(args, "k", 0):
+        return
+    from topomerge.embedding.learned import build_embedder
 
     with name_option_in_errors("--descriptor"):
-        if args.descriptor != DEFAULT:  # which ships, and of two maps is asked for only where walls are not believed
+        if args.descriptor != DEFAULT_DESCRIPTOR:  # which ships, and of two maps is asked for only where walls are not believed
             build_embedder(args.descriptor)
     with name_option_in_errors("--k"):
         steps = getattr(args, "k", 0)
@@ -76,6 +79,30 @@ def check_descriptor(args: argparse.Namespace) -> None:
             raise InputError("steps of context are for descriptors of single rooms; learned sees what is around: leave it out")
         if steps:
             build_embedder(args.descriptor, steps)
+
+
+def check_cloud_options(paths: Sequence[str], args: argparse.Namespace) -> None:
+    """Refuse `CLOUD_OPTIONS` where no input is a cloud.
+
+    Raises:
+        InputError: names the first of them; or the files of one frame, where no input is a folder.
+    """
+    useless = collect_given(args, "voxel_size", "up", "unit", "sensor")
+    if useless and all(is_map(path) for path in paths):
+        name = next(iter(useless)).replace("_", "-")
+        raise InputError(f"--{name}: is for clouds, of no use to a .tmap; give the scan that it was made of, or leave it out")
+    if collect_given(args, "one_frame") and not any(Path(path).is_dir() for path in paths):
+        raise InputError("--one-frame: is for folders of files; give such a folder, or leave it out")
+
+
+def collect_reading_options(path: str, args: argparse.Namespace) -> dict[str, Any]:
+    """Collect the `CLOUD_OPTIONS` of reading one input, of which some are for folders only."""
+    return collect_given(args, "up", "unit", "text", "tag_size", *(["one_frame"] if Path(path).is_dir() else []))
+
+
+def is_map(path: str) -> bool:
+    """Return whether an input is a .tmap."""
+    return Path(path).suffix.lower() == ".tmap"
 
 
 def collect_belief_options(args: argparse.Namespace) -> dict[str, Any]:
@@ -132,9 +159,10 @@ ONE_FRAME = build_option(
     action="store_true",
     help="read all files of a folder as one cloud: tiles, or registered stations, of one frame",
 )
+DEFAULT_DESCRIPTOR = "learned"  # `topomerge.embedding.learned.DEFAULT`, which is not imported for the help
 DESCRIPTOR = build_option(
     "--descriptor",
-    default="learned",
+    default=DEFAULT_DESCRIPTOR,
     metavar="NAME",
     help="learned (default; the embedder that ships), engineered, shapedna, feather, or the folder of a trained embedder",
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from weakref import WeakKeyDictionary
+
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -24,7 +26,12 @@ def compute_cell_means(grid: VoxelGrid) -> Array:
     offset = grid.properties.get("offset")
     if offset is None:
         return grid.compute_centroids()
-    out: Array = grid.origin + (grid.cells + (offset.astype(np.float64) + 0.5) / OFFSET_STEPS) * grid.edge
+    out: Array = offset.astype(np.float64)  # then in place: it has three numbers a cell
+    out += 0.5
+    out /= OFFSET_STEPS
+    out += grid.cells
+    out *= grid.edge
+    out += grid.origin
     return out
 
 
@@ -178,6 +185,16 @@ def _describe_place(cells: Array, share: float, edge: float) -> str:
 COARSEST_CELL = 0.3  # m: in larger ones no door is seen
 
 
+_neighbours: WeakKeyDictionary[VoxelGrid, Array] = WeakKeyDictionary()
+
+
+def _count_neighbours(grid: VoxelGrid) -> Array:
+    """(n,) occupied ones of the 26 cells around each; the count is kept for whoever asks next."""
+    if grid not in _neighbours:
+        _neighbours[grid] = convolve(grid, build_moore())
+    return _neighbours[grid]
+
+
 def coarsen_until_dense(grid: VoxelGrid, neighbours: float, warnings: list[str]) -> VoxelGrid:
     """The grid with cells so large that surfaces hold together: doubled until the median cell has as many neighbours (of 26).
 
@@ -186,7 +203,7 @@ def coarsen_until_dense(grid: VoxelGrid, neighbours: float, warnings: list[str])
     Args:
         warnings: what the user should know is appended here.
     """
-    while len(grid) and 2 * grid.edge <= COARSEST_CELL and float(np.median(convolve(grid, build_moore()))) < neighbours:
+    while len(grid) and 2 * grid.edge <= COARSEST_CELL and float(np.median(_count_neighbours(grid))) < neighbours:
         fine, grid = grid, grid.coarsen(2)
         if "offset" in fine.properties:
             grid = add_means(grid, compute_cell_means(fine), fine.properties.get("count"))
@@ -208,5 +225,6 @@ def remove_flying_cells(grid: VoxelGrid, share: float) -> VoxelGrid:
     The limit follows the map: where points are sparse, surfaces have few neighbours, too, and only lonely cells go. In plans
     whose walls are solid most cells have all 26, and the floor 8: there the limit is that of a surface.
     """
-    neighbours = convolve(grid, build_moore())
+    neighbours = _count_neighbours(grid)
+    _neighbours.pop(grid)  # nobody asks a third time
     return grid.select_cells(neighbours >= share * min(float(np.median(neighbours)), THICK_SURFACE))

@@ -129,7 +129,7 @@ def has_floor(grid: VoxelGrid, navigable: VoxelGrid, body_height: float) -> bool
     """Was a floor seen? Without one, what one could stand on is the upper side of the ceiling: it has nothing above, and walls
     hang from it, or most columns begin high over the lowest ones around."""
     lowest = select_lowest_of_column(navigable)
-    covered = (measure_floor_to_ceiling(grid, navigable, body_height)[lowest] > 0).mean()
+    covered = (measure_floor_to_ceiling(grid, navigable, body_height, lowest) > 0).mean()
     if covered > FLOOR_COVERED_SHARE:
         return True
     above = _measure_above_floor(grid, navigable.cells[lowest])

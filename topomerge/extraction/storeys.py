@@ -94,11 +94,12 @@ def _assign_storeys(
     return storeys, storey, level
 
 
-def measure_floor_to_ceiling(grid: VoxelGrid, navigable: VoxelGrid, body_height: float) -> Array:
-    """(m,) m of empty space between each navigable cell and the first occupied one above it; 0 where there is none."""
+def measure_floor_to_ceiling(grid: VoxelGrid, navigable: VoxelGrid, body_height: float, rows: Array | None = None) -> Array:
+    """(m,) m of empty space between each navigable cell, or those of some rows, and the first occupied one above; 0: none is."""
     start = max(int(body_height / grid.edge), 1)
     limit = int(HIGHEST_CEILING / grid.edge)
-    return find_first_occupied(*grid._bricks, navigable.cells.astype(np.int64), start, 1, limit) * grid.edge
+    cells = navigable.cells if rows is None else navigable.cells[rows]
+    return find_first_occupied(*grid._bricks, cells.astype(np.int64), start, 1, limit) * grid.edge
 
 
 def estimate_ceiling_height(above: Array) -> float:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
@@ -122,10 +123,8 @@ def iter_coarse_records(path: Path, octree: Octree, options: ReadOptions) -> Ite
             data = stream.read(length)
             check_chunk(path, data, length, layers, size)
             out = np.zeros(count * size, np.uint8)
-            lazrs.decompress_points_with_chunk_table(data, record, out, [(count, length)])
-            packed = laspy.PackedPointRecord.from_buffer(out, header.point_format)
-            rows = laspy.ScaleAwarePointRecord(packed.array, header.point_format, header.scales, header.offsets)
-            yield header, rows, seen / header.point_count
+            lazrs.decompress_points_with_chunk_table(data, record, out, [(count, length)], _select_fields().to_lazrs())
+            yield header, _build_rows(out, header), seen / header.point_count
 
 
 def _iter_nodes(path: Path, stream: IO[bytes], octree: Octree, deepest: int) -> Iterator[tuple[int, int, int]]:
@@ -161,6 +160,9 @@ def _iter_nodes(path: Path, stream: IO[bytes], octree: Octree, deepest: int) -> 
 
 LAST_STANDARD_CLASS = 22  # of ASPRS, LAS 1.4 R15: temporal exclusion; users define their own from 64 on
 LASZIP = b"laszip encoded"
+CHUNKED = (2, 3)  # kinds of compression whose chunks do not depend on each other: point by point, and in layers
+_unpacking: dict[str, int] = {}  # the process whose chunks the decoder's threads unpack
+LEAST_UNPACKED = 1 << 16  # points of a file, below which threads are not worth it
 LARGEST_HEAD = 64 << 20  # bytes searched for the record of the compression
 MOST_POINTS_A_BYTE = 200  # of a packed file: equal points pack that well, and no scan does
 SMALLEST_CHUNK = 20  # bytes: a compressed chunk starts with one point as it is
@@ -171,7 +173,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     octree = None if options.spacing is None else read_octree(path)
     if octree is not None:
         _check_head(path)
-    for header, rows, done in records(path) if octree is None else iter_coarse_records(path, octree, options):
+    blocks = records(path, _select_fields()) if octree is None else iter_coarse_records(path, octree, options)
+    for header, rows, done in blocks:
         colored = {"red", "green", "blue"} <= set(header.point_format.dimension_names)
         bright = np.asarray(rows.intensity, np.float32)
         colors, classes = _convert_colors(rows) if colored else None, _convert_classes(rows)
@@ -198,16 +201,38 @@ def read_las_node(path: Path, promised: int, options: ReadOptions) -> Iterator[P
         raise build_truncation_error(path, count, promised)
 
 
-def records(path: Path) -> Iterator[tuple[Any, Any, float]]:
-    """Yield the header, a block of records with all their dimensions, and the share of the file that is read with it."""
+def _select_fields() -> Any:
+    """What a cloud is made of; other layers of a packed file are not unpacked, where it has layers."""
+    from laspy import DecompressionSelection
+
+    return DecompressionSelection.base().decompress_z().decompress_classification().decompress_intensity().decompress_rgb()
+
+
+def _build_rows(data: Array, header: Any) -> Any:
+    """The records of unpacked bytes."""
+    import laspy
+
+    packed = laspy.PackedPointRecord.from_buffer(data, header.point_format)
+    return laspy.ScaleAwarePointRecord(packed.array, header.point_format, header.scales, header.offsets)
+
+
+def records(path: Path, fields: Any = None) -> Iterator[tuple[Any, Any, float]]:
+    """Yield the header, a block of records, and the share of the file that is read with it.
+
+    Args:
+        path: of the file.
+        fields: a `laspy.DecompressionSelection` of those that are unpacked, where the others can be passed over; None: all.
+    """
     import laspy
 
     logging.getLogger("laspy").setLevel(logging.CRITICAL)  # it logs what it also raises
     _check_head(path)
     done = 0
-    # The parallel decoder believes the table of chunks and ends the process where a damaged one asks for too much memory.
+    fields = laspy.DecompressionSelection.all() if fields is None else fields
+    # laspy's parallel decoder believes the table of chunks and ends the process where a damaged one asks for too much memory.
     # Records behind the points may be promised by the thousand million; nothing in them is needed.
-    with laspy.open(path, laz_backend=[laspy.LazBackend.Lazrs], read_evlrs=False) as reader:
+    backend = [laspy.LazBackend.Lazrs]
+    with laspy.open(path, laz_backend=backend, read_evlrs=False, decompression_selection=fields) as reader:
         header = reader.header
         promised, size = header.point_count, header.point_format.size
         room = path.stat().st_size - header.offset_to_point_data
@@ -215,13 +240,69 @@ def records(path: Path) -> Iterator[tuple[Any, Any, float]]:
             raise build_truncation_error(path, max(room, 0) // size, promised)
         if promised > MOST_POINTS_A_BYTE * max(room, 0):
             raise build_damage_error(path, "a LAZ file", f"it promises {promised:,} points in {max(room, 0):,} bytes")
-        for rows in reader.chunk_iterator(BLOCK_POINTS):
+        chunks = _list_chunks(path, header) if header.are_points_compressed else []
+        for rows in _iter_unpacked(path, header, chunks, fields) if chunks else reader.chunk_iterator(BLOCK_POINTS):
             if not len(rows):
                 break
             done += len(rows)
             yield header, rows, done / promised
     if done < promised:
         raise build_truncation_error(path, done, promised)
+
+
+def _list_chunks(path: Path, header: Any) -> list[tuple[int, int]]:
+    """Points and bytes of each chunk, one behind the other in the file; none where they do not add up, or cannot be unpacked
+    side by side: then they are unpacked one by one, as far as they are whole."""
+    import lazrs
+
+    record = header.vlrs.get("LasZipVlr")[0].record_data_bytes()
+    (kind,) = struct.unpack_from("<H", record)
+    if kind not in CHUNKED or header.point_count <= LEAST_UNPACKED:
+        return []
+    with path.open("rb") as stream:
+        stream.seek(header.offset_to_point_data)
+        chunks = [(count, length) for count, length in lazrs.read_chunk_table(stream, lazrs.LazVlr(record)) if length]
+    if not chunks:
+        return []
+    most, length = chunks[-1]  # of chunks of one size, the table promises too much of the last
+    last = header.point_count - sum(count for count, _ in chunks[:-1])
+    chunks[-1] = (last, length)
+    fits = last <= most and header.offset_to_point_data + 8 + sum(length for _, length in chunks) <= path.stat().st_size
+    return chunks if fits and all(0 < count <= BLOCK_POINTS for count, _ in chunks) else []
+
+
+def _iter_unpacked(path: Path, header: Any, chunks: Sequence[tuple[int, int]], fields: Any) -> Iterator[Any]:
+    """Blocks of records, of `BLOCK_POINTS` each as from one decoder, of which the chunks are unpacked side by side."""
+    import lazrs
+
+    record, size = header.vlrs.get("LasZipVlr")[0].record_data_bytes(), header.point_format.size
+    rest = np.empty(0, np.uint8)
+    with path.open("rb") as stream:
+        stream.seek(header.offset_to_point_data + 8)
+        for batch in _group_chunks(chunks):
+            data = stream.read(sum(length for _, length in batch))
+            out = np.zeros(sum(count for count, _ in batch) * size, np.uint8)
+            lazrs.decompress_points_with_chunk_table(data, record, out, batch, fields.to_lazrs())
+            rest = np.concatenate([rest, out])
+            while len(rest) >= BLOCK_POINTS * size:
+                yield _build_rows(rest[: BLOCK_POINTS * size], header)
+                rest = rest[BLOCK_POINTS * size :]
+    if len(rest):
+        yield _build_rows(rest, header)
+
+
+def _group_chunks(chunks: Sequence[tuple[int, int]]) -> Iterator[list[tuple[int, int]]]:
+    """As many chunks at a time as a block has points, or one: the decoder's threads do not survive a fork, and one chunk is
+    unpacked without them."""
+    _unpacking.setdefault("process", os.getpid())
+    together = BLOCK_POINTS if _unpacking["process"] == os.getpid() else 0
+    batch: list[tuple[int, int]] = []
+    for chunk in chunks:
+        if batch and sum(count for count, _ in batch) + chunk[0] > together:
+            yield batch
+            batch = []
+        batch.append(chunk)
+    yield batch
 
 
 def get_coordinates(rows: Any) -> Array:

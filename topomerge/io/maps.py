@@ -15,7 +15,6 @@ from topomerge.archive import ArrayHeader, convert_to_plain
 from topomerge.errors import InputError
 from topomerge.io.listing import convert_map_to_json, save_json
 from topomerge.io.rooms_ply import save_rooms_ply
-from topomerge.kernels import voxels
 from topomerge.types import (
     AREA_DTYPE,
     EDGE_DTYPE,
@@ -241,6 +240,8 @@ def _unpack(arrays: dict[str, Array], name: str) -> VoxelGrid:
     if offset is not None and (offset.dtype != np.uint8 or offset.shape != (len(codes), 3)):
         raise ValueError(f"the points of the cells of {name} have no proper offsets")
     x, y, z = shape.tolist()
+    from topomerge.kernels import voxels  # here: a file that is no map is told without numba
+
     return VoxelGrid(voxels.decode(codes), frame[:3].copy(), float(frame[3]), (x, y, z), properties)
 
 

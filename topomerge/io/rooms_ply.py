@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 from pathlib import Path
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -75,9 +76,15 @@ def assign_colour_numbers(rooms: int, pairs: Array) -> Array:
     return number
 
 
+_colours: WeakKeyDictionary[TopometricMap, Array] = WeakKeyDictionary()
+
+
 def assign_room_colours(map: TopometricMap) -> Array:
-    """Return (R, 3) uint8 red, green, blue of each room. The same map gives the same colours."""
-    return PALETTE[assign_colour_numbers(len(map.rooms), find_adjacent_rooms(map))].reshape(-1, 3)
+    """Return (R, 3) uint8 red, green, blue of each room, found once for a map. The same map gives the same colours."""
+    if map not in _colours:
+        _colours[map] = PALETTE[assign_colour_numbers(len(map.rooms), find_adjacent_rooms(map))].reshape(-1, 3)
+        _colours[map].flags.writeable = False  # all who ask share it
+    return _colours[map]
 
 
 FLOAT32_FAR = 1e4  # m: beyond, float32 rounds by a millimetre and, soon after, by centimetres

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage, sparse
-from scipy.optimize import minimize
 
 from topomerge.landmarks.radio import (
     FINE,
@@ -198,6 +197,8 @@ class _Search:
         return at, self._build_score(at, COARSE, rows, 0.0)(at)
 
     def _climb(self, at: Array, reach: float, rows: tuple[Array, ...], step: float) -> Array:
+        from scipy.optimize import minimize  # here: a hundred modules, of which maps without readings need none
+
         score = self._build_score(at, reach, rows, 2 * step)
         unit = np.array([1.0, 1.0, 1 / self.reach])
         corners = step * np.array([[0.5, 0.5, 0.5], [-0.5, 0.5, -0.5], [0.5, -0.5, -0.5], [-0.5, -0.5, 0.5]])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
 from topomerge.embedding.quarter_turns import Rows, TurnedRows, compute_similarity, find_neighbours
@@ -23,6 +22,8 @@ def assign(cost: Array, largest: float = np.inf) -> Array:
     n, m = cost.shape
     if not n or not m:
         return np.zeros((0, 2), np.int64)
+    from scipy.optimize import linear_sum_assignment  # here: a hundred modules, of which maps that do not fit need none
+
     if np.isinf(largest):
         i, j = linear_sum_assignment(cost)
         return np.stack([i, j], axis=1).astype(np.int64)

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from topomerge.kernels import stencil, voxels
-
 if TYPE_CHECKING:
     from topomerge.types.landmarks import Landmarks
 
 Array = NDArray[Any]
 LogFn = Callable[[str], None]  # is called with a line of progress
+AXIS_LIMIT = 1 << 21  # cells along an axis: what the codes of `topomerge.kernels.voxels` hold
 
 
 def require(condition: bool, message: str, *values: object) -> None:
@@ -69,8 +68,8 @@ class VoxelGrid:
         require(whole, "origin must be (3,), not {}", self.origin)
         require(self.cells.ndim == 2 and self.cells.shape[1] == 3, "cells must be (n, 3), not {}", self.cells.shape)
         require(self.cells.dtype == np.int32, "cells must be int32, not {}", self.cells.dtype)
-        fits = all(0 < s <= voxels.AXIS_LIMIT for s in self.shape)
-        require(fits, "grid shape {} is outside 1..{}", self.shape, voxels.AXIS_LIMIT)
+        fits = all(0 < s <= AXIS_LIMIT for s in self.shape)
+        require(fits, "grid shape {} is outside 1..{}", self.shape, AXIS_LIMIT)
         if len(self.cells):
             low, high = _compute_extent(self.cells)
             require(bool((low >= 0).all() and (high < self.shape).all()), "cells {}..{} outside {}", low, high, self.shape)
@@ -91,8 +90,10 @@ class VoxelGrid:
         if len(cells):  # before the codes: they hold 21 bits an axis, and a cell beyond would take the place of another
             require(np.issubdtype(cells.dtype, np.integer), "cells must be integers, not {}", cells.dtype)
             low, high = _compute_extent(cells)
-            inside = bool((low >= 0).all() and (high < voxels.AXIS_LIMIT).all())
-            require(inside, "cells {}..{} not in 0..{}", low, high, voxels.AXIS_LIMIT)
+            inside = bool((low >= 0).all() and (high < AXIS_LIMIT).all())
+            require(inside, "cells {}..{} not in 0..{}", low, high, AXIS_LIMIT)
+        from topomerge.kernels import voxels  # here: numba takes a fifth of a second, and files are opened before
+
         cells = np.ascontiguousarray(cells, np.int32)
         first = voxels.find_unique_rows(voxels.encode(cells))
         unique_cells = np.ascontiguousarray(cells[first])
@@ -108,15 +109,27 @@ class VoxelGrid:
     @cached_property
     def codes(self) -> Array:
         """(n,) uint64 Morton codes, ascending."""
+        from topomerge.kernels import voxels
+
         return voxels.encode(self.cells)
 
     @cached_property
     def _bricks(self) -> tuple[Array, Array]:
+        from topomerge.kernels import voxels
+
         return voxels.build(self.cells, self.shape)
 
     @cached_property
     def _columns(self) -> Array:
+        from topomerge.kernels import stencil
+
         return stencil.build_columns(self.cells, *self._bricks)
+
+    @cached_property
+    def _lowest_of_column(self) -> Array:
+        rows = np.flatnonzero(~self.contains(self.cells.astype(np.int64) - (0, 0, 1)))
+        rows.flags.writeable = False  # all who ask share it
+        return rows
 
     @property
     def bounds(self) -> tuple[Array, Array]:
@@ -138,6 +151,8 @@ class VoxelGrid:
 
     def find_rows(self, cells: Array) -> Array:
         """Return (m,) int64 row of each given cell, -1 where it is not occupied."""
+        from topomerge.kernels import voxels
+
         return voxels.find_rows(*self._bricks, np.ascontiguousarray(cells, np.int64).reshape(-1, 3))
 
     def contains(self, cells: Array) -> Array:
@@ -289,5 +304,6 @@ class Sim3:
 
 
 def select_lowest_of_column(navigable: VoxelGrid) -> Array:
-    """Ascending rows of the cells that have no cell right below them: the floor proper, without its upward dilation."""
-    return np.flatnonzero(~navigable.contains(navigable.cells.astype(np.int64) - (0, 0, 1)))
+    """Ascending rows of the cells that have no cell right below them: the floor proper, without its upward dilation. They are
+    found once; who asks again gets the same array."""
+    return navigable._lowest_of_column

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.kernels.bend import blend_moves, interpolate_nodes
 from topomerge.types.grid import Array, Sim3
 
 INVERSE_ROUNDS = 30
@@ -39,6 +38,8 @@ class ShiftField:
 
     def at(self, points: Array) -> Array:
         """(n, 2) m by which the points (n, 2) are moved."""
+        from topomerge.kernels.bend import interpolate_nodes
+
         out: Array = interpolate_nodes(
             np.ascontiguousarray(points, np.float64), self.origin, self.step, np.ascontiguousarray(self.shifts, np.float64)
         )
@@ -213,6 +214,8 @@ def blended(points: Array, anchors: Array, moves: Array, reach: float) -> Array:
     """(n, 2) m: shifts of points (n, 2) by the moves (k, 4) of pieces about their anchors (k, 2), weighed by their nearness."""
     many = min(BLENDED_PIECES, len(anchors))
     from scipy.spatial import cKDTree  # here: SciPy takes a quarter of a second, and only bent maps need it
+
+    from topomerge.kernels.bend import blend_moves
 
     distance, nearest = cKDTree(anchors).query(points, many)
     distance, nearest = distance.reshape(len(points), many), nearest.reshape(len(points), many)

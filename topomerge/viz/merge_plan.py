@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from topomerge.fusion.result import RoomMatch
+from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.types import Array, Deformation, Placement, Sim3, TopometricMap
-from topomerge.viz.plan import StoreyPlan, find_label_places, format_hex_colour, get_room_colours
+from topomerge.viz.plan import StoreyPlan, find_label_places, format_hex_colour
 from topomerge.viz.report import render_zoom_buttons
 from topomerge.viz.svg import Sheet, lay_out, render_drawing, trace_rooms, trace_walls
 from topomerge.viz.tables import Markup, build_element, join, render_room_link
@@ -391,7 +392,7 @@ def render_lines(
 
 
 def _render_storey(map: TopometricMap, sheet: Sheet, plan: StoreyPlan, colours: Array | None) -> list[Markup]:
-    shades = get_room_colours(map) if colours is None else colours
+    shades = assign_room_colours(map) if colours is None else colours
     rooms = [
         build_element(
             "path", class_="room", d=d, fill=format_hex_colour(shades[i]), fill_rule="evenodd", data_room=sheet.format_room_id(i)

@@ -23,13 +23,12 @@ from topomerge.fusion.result import MergeResult, build_placements, serialise_mer
 from topomerge.fusion.transfer import transform_floor
 from topomerge.io.listing import format_json
 from topomerge.io.maps import save_map
-from topomerge.io.rooms_ply import save_rooms_ply
+from topomerge.io.rooms_ply import assign_room_colours, save_rooms_ply
 from topomerge.registration.evidence.places import MOST_ODDS, PARTS, Places
 from topomerge.registration.pipeline import Registration
 from topomerge.types import Array, Placement, Sim3, TopometricMap
-from topomerge.viz.atlas_report import render_atlas_html
 from topomerge.viz.merge_plan import Drawn, lay_out_pair, render_blend_view, render_deformation_table, render_lines
-from topomerge.viz.plan import build_scene_data, get_room_colours
+from topomerge.viz.plan import build_scene_data
 from topomerge.viz.report import (
     render_page,
     render_plan_view,
@@ -183,6 +182,7 @@ def save_merge(result: MergeResult, folder: str | Path) -> None:
     ]
     if result.map is not None:
         writers += [("merged.ply", partial(save_rooms_ply, result.map)), ("map.tmap", partial(save_map, result.map))]
+        assign_room_colours(result.map)  # once: the page and the file beside it need the same
     try:
         with ExitStack() as stack, ThreadPoolExecutor(1) as pool:  # all are whole before the first is renamed
             places = [stack.enter_context(replace_on_success(folder / name)) for name, _ in writers]
@@ -208,6 +208,8 @@ def _write(text: str, path: Path) -> None:
 def render_merge_html(result: MergeResult) -> str:
     """Return the report as HTML. A result that is not believed shows its best hypothesis, and says so."""
     if result.atlas is not None:
+        from topomerge.viz.atlas_report import render_atlas_html
+
         names = " + ".join(m.title for m in result.maps)
         joined = {} if result.map is None else {result.atlas.find_component(0): result.map}
         atlas = replace(result.atlas, warnings=result.warnings)
@@ -321,7 +323,7 @@ def _render_maps(result: MergeResult, drawn: tuple[Drawn, Drawn], within: tuple[
 def _compute_colours(result: MergeResult, within: tuple[Array, Array]) -> tuple[Array, Array]:
     """(R, 3) uint8 of the rooms of both maps: matched ones have the colour of the joined map's room in which they lie."""
     assert result.map is not None
-    palette = get_room_colours(result.map)
+    palette = assign_room_colours(result.map)
     of_maps = []
     for k, (m, room) in enumerate(zip(result.maps, within, strict=True)):
         colour = np.tile(np.array(ALONE, np.uint8), (len(m.rooms), 1))

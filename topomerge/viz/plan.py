@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import edt
 import numpy as np
@@ -20,16 +19,6 @@ CUT = (1.0, 1.9)  # m above the floor: what fills this band is drawn as wall, as
 WALL_SHARE = 0.5  # share of the band that must be occupied
 DRAWN_AGAIN = 8  # plans of which is kept what is drawn: a report draws those of two maps several times
 MAX_PIXELS = 1500  # along an axis; cells of larger buildings are drawn together
-
-
-_colours: WeakKeyDictionary[TopometricMap, Array] = WeakKeyDictionary()
-
-
-def get_room_colours(map: TopometricMap) -> Array:
-    """Return `assign_room_colours` of a map, which a report asks for several times."""
-    if map not in _colours:
-        _colours[map] = assign_room_colours(map)
-    return _colours[map]
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +217,7 @@ def build_scene_data(
     starts = np.concatenate([[0], np.cumsum(groups[:, 3])[:-1]]).astype(np.int64)
     steps = np.diff(number[order], prepend=0)
     steps[starts[groups[:, 3] > 0]] = number[order][starts[groups[:, 3] > 0]]  # each group starts anew
-    palette = np.concatenate([get_room_colours(map), np.array([NO_ROOM], np.uint8)])
+    palette = np.concatenate([assign_room_colours(map), np.array([NO_ROOM], np.uint8)])
     floors = map.storeys["floor"] if len(map.storeys) else [map.grid.origin[2] + low[2] * map.grid.edge]
     return {
         "edge": round(map.grid.edge * factor, 6),

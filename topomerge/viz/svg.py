@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.structure.directions import estimate_wall_directions
 from topomerge.types import LANDMARK_KINDS, Array, TopometricMap, find_room_names
 from topomerge.viz.plan import (
@@ -21,7 +22,6 @@ from topomerge.viz.plan import (
     compute_frame,
     find_label_places,
     format_hex_colour,
-    get_room_colours,
     rasterize_storeys,
 )
 from topomerge.viz.tables import (
@@ -257,7 +257,7 @@ def render_plan_svgs(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPla
         `<svg class="plan" data-storey=…>` elements. Rooms, their labels and their nodes in the graph carry `data-room`, and all
         that is not certain `data-sure`.
     """
-    colours = get_room_colours(map) if colours is None else colours
+    colours = assign_room_colours(map) if colours is None else colours
     named = [find_label_places(plan, sheet.frame) for plan in plans]
     names = find_room_names(map.landmarks, len(map.rooms))
     everywhere = {room: place for of_storey in named for room, place in of_storey.items()}

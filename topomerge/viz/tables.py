@@ -13,8 +13,9 @@ import numpy as np
 
 from topomerge.archive import convert_to_plain
 from topomerge.io.listing import describe_landmarks, describe_room
+from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.types import LANDMARK_KINDS, TopometricMap, classify_door_state, find_room_names
-from topomerge.viz.plan import format_hex_colour, get_room_colours
+from topomerge.viz.plan import format_hex_colour
 
 CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")  # no text on a page needs them, and names of files may hold them
 SPECIAL = re.compile(r"""[&<>"']|""" + CONTROL.pattern)
@@ -188,7 +189,7 @@ def render_rooms_table(map: TopometricMap, key: str = "", only: Iterable[int] | 
     columns = [("room", "number"), *([("storey", "number")] if several_storeys else [])]
     columns += [("landmarks", "text")] if any(marks) else []
     columns += [*((name, "number") for name in names), ("leads to", "text")]
-    colours = get_room_colours(map)
+    colours = assign_room_colours(map)
     doors = np.bincount(map.edges["rooms"].ravel(), minlength=len(map.rooms))
     rows = []
     neighbours = _list_neighbours(map)

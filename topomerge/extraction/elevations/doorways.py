@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.sparse.csgraph import connected_components
 
 from topomerge.extraction.elevations.elevation import (
@@ -201,6 +200,8 @@ def _merge_faces(rows: Array) -> Array:
     """What several faces show of one doorway as one row, the likeliest first."""
     if len(rows) < 2:
         return rows
+    from scipy.cluster.hierarchy import fcluster, linkage  # here: maps that are only merged need none of it
+
     place = np.column_stack([rows["centre"][:, :2], rows["centre"][:, 2] * (SAME_DOORWAY / DOORWAY_LEVEL)])
     of = fcluster(linkage(place, "average"), SAME_DOORWAY, "distance")
     out = np.array([_merge_rows(rows[of == k]) for k in np.unique(of)], DOORWAY_DTYPE)
