@@ -9,7 +9,7 @@ import pytest
 from tests.changes.flats import TABLE, flat_map
 from tests.viz.chromium import Page
 from topomerge.changes.compare import compare_maps
-from topomerge.viz.changes_report import save_changes_report
+from topomerge.viz.pair_reports import save_changes_report
 
 pytestmark = pytest.mark.longer
 

@@ -18,8 +18,8 @@ from topomerge.cli.main import main as cli
 from topomerge.embedding.surroundings import CROP, CROP_PLANES
 from topomerge.matching.match import Matching
 from topomerge.types import Sim3
-from topomerge.viz.match_report import draw_surroundings, find_aligning_quarters, render_match_html, save_match_report
 from topomerge.viz.merge_report import PIXEL_COLOURS
+from topomerge.viz.pair_reports import draw_surroundings, find_aligning_quarters, render_match_html, save_match_report
 
 FLAT = Scene().shell(0, 0, 13, 9).wall((5, 0), (5, 9), doors=(2.0,)).wall((5, 5), (13, 5), doors=(4.0,))
 

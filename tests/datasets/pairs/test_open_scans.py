@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from topomerge.datasets.buildings.outdoors import add_outdoors, compute_footprint
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.pairs import room_examples
 from topomerge.datasets.pairs.flat_maps import GRID_CELL, count_rays, simulate_robot_grid
-from topomerge.datasets.pairs.room_examples import draw_room_item, is_outdoor_pose, simulate_open_scan
 from topomerge.datasets.simulation.sensors import get_sensor
 
+from topomerge.training import room_odds
+from topomerge.training.room_odds import draw_room_item, is_outdoor_pose, simulate_open_scan
 from topomerge.types import Sim3
 
 
@@ -37,8 +37,8 @@ def test_a_robot_draws_nothing_beyond_what_it_believes(cleared: float) -> None:
 
 @pytest.mark.longer
 def test_a_surveyor_who_steps_out_sees_the_ground(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room_examples, "STEPPED_OUT", 1.0)
-    monkeypatch.setattr(room_examples, "OPEN_SHARE", 1.0)
+    monkeypatch.setattr(room_odds, "STEPPED_OUT", 1.0)
+    monkeypatch.setattr(room_odds, "OPEN_SHARE", 1.0)
     made = simulate_open_scan(draw_room_item(3, {}, surroundings=True), None)
     out = is_outdoor_pose(made.cloud, made.building)
     assert out.any() and not out.all()

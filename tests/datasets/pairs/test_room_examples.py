@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from topomerge.datasets.pairs import room_examples
 from topomerge.datasets.pairs.plan_examples import PlanRecipe, draw_item
-from topomerge.datasets.pairs.room_examples import ANSWERS, build_rooms, draw_room_item
 
+from topomerge.training import room_odds
+from topomerge.training.room_odds import ANSWERS, build_rooms, draw_room_item
 from topomerge.training.settings import TaskSettings
 
 
@@ -20,7 +20,7 @@ def test_files_are_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         made.append(item.name)
         return {"x": np.zeros((2, 3)), "about": np.frombuffer(b"{}", np.uint8), **dict.fromkeys(ANSWERS, np.ones(2))}
 
-    monkeypatch.setattr(room_examples, "build_room_rows", rows)
+    monkeypatch.setattr(room_odds, "build_room_rows", rows)
     recipe, sharing = PlanRecipe("room_scans", scans=3, seed=5), TaskSettings(cache=str(tmp_path))
     paths = build_rooms(recipe, sharing)
     assert [path.stem for path in paths] == made and len(made) == 3
