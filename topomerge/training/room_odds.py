@@ -133,12 +133,6 @@ def _add_outdoor_scans(cloud: PointCloud, building: Building, sensor: Sensor, rn
     )
 
 
-def is_outdoor_pose(cloud: PointCloud, building: Building) -> Array:
-    """Return (k,) bool, which poses of a cloud in the building's frame are outside of its rooms."""
-    assert cloud.poses is not None
-    return ~shapely.contains_xy(compute_footprint(building), cloud.poses[:, :2, 3])
-
-
 ROOM_EXAMPLE_FORMAT = 6  # raise it when the same item gives other bytes: it is part of the files' names
 ANSWERS = ("one", "whole", "entered", "outside")
 
