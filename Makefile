@@ -34,11 +34,11 @@ demo: setup
 	$(BIN)/topomerge merge demo/a.tmap demo/b.ply --descriptor demo/embedder -o demo/merged_learned
 	@echo "The map from above: demo/a.png; the merge and why it is believed: demo/merged/report.html"
 
-test: setup
-	$(BIN)/python -m pytest -rs -m 'not slow and not longer' -n logical --maxprocesses 4 --dist worksteal
-
-test-longer: setup
-	$(BIN)/python -m pytest -rs -m 'longer and not slow' -n logical --maxprocesses 4 --dist worksteal
+# Both at once, which makes what they share once only: make test TESTS='not slow'
+test: TESTS ?= not slow and not longer
+test-longer: TESTS ?= longer and not slow
+test test-longer: setup
+	$(BIN)/python -m pytest -rs -m '$(TESTS)' -n logical --maxprocesses 4 --dist worksteal
 
 test-slow: setup
 	$(BIN)/python -m pytest -m slow

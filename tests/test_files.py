@@ -1,4 +1,7 @@
-"""Files that are written are whole or absent, and only files are replaced."""
+"""Files that are written are whole or absent, and only files are replaced.
+
+Names of the package's face that were renamed are still importable.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import os
 
 import pytest
 
+import topomerge
 from topomerge.archive import replace_on_success
 from topomerge.errors import InputError
 
@@ -43,3 +47,14 @@ def test_what_is_no_file_is_left_alone(tmp_path):
             pass
     with pytest.raises(InputError, match="folder that exists"), replace_on_success(tmp_path / "no" / "a"):
         pass
+
+
+@pytest.mark.parametrize("old", sorted(topomerge._RENAMED))
+def test_an_old_name_gives_what_the_new_one_gives(old):
+    assert getattr(topomerge, old) is getattr(topomerge, topomerge._RENAMED[old])
+    assert old not in topomerge.__all__
+
+
+def test_a_name_that_never_was_is_refused():
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        topomerge.nothing  # noqa: B018

@@ -36,11 +36,11 @@ from topomerge.datasets.buildings.modules import (
     replace_things,
 )
 from topomerge.datasets.buildings.procedural import is_connected, make_building, make_plans
+from topomerge.datasets.buildings.stack import stretch_building
 from topomerge.datasets.core.building import SURFACES, Building, Difficulty, Plan, Point
 from topomerge.datasets.core.solids import triangulate_boxes
 from topomerge.datasets.pairs.parts import CONNECTING
 from topomerge.datasets.simulation.floor_truth import fill
-from topomerge.datasets.simulation.twin_wing import stretch_building
 from topomerge.datasets.simulation.walk import sample_part
 
 from topomerge.types import Array, Sim3

@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from topomerge.datasets.pairs.own_pairs import OWN_FOLDER, extract_captures
-from topomerge.datasets.pairs.own_truth import find_overlap
-from topomerge.datasets.pairs.pairs_file import PAIRS_FILE, Capture, PairsFile, PairTruth, Split, read_pairs_file
+from topomerge.datasets.pairs.pairs_file import PAIRS_FILE, Capture, PairsFile, PairTruth, Split, find_overlap, read_pairs_file
 
 from topomerge.archive import replace_on_success
 from topomerge.errors import InputError

@@ -23,14 +23,16 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from topomerge.datasets.core.builder import BuildRow, build_set, make_item, read_refusal
 from topomerge.datasets.pairs.evaluation_pair import compute_anchor
-from topomerge.datasets.pairs.own_truth import NO_OVERLAP, RoomOverlap, find_overlap
 from topomerge.datasets.pairs.pairs_file import (
+    NO_OVERLAP,
     OWN_DATA,
     PARTS,
     Capture,
     PairsFile,
     PairTruth,
+    RoomOverlap,
     are_on_two_storeys,
+    find_overlap,
     read_pairs_file,
 )
 

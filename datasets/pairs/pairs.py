@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from topomerge.datasets.buildings.procedural import make_building
+from topomerge.datasets.buildings.stack import make_twin_wing
 from topomerge.datasets.core.building import Building, Difficulty
 from topomerge.datasets.pairs.parts import compute_dice, find_twin_rooms, sample_two_parts
 from topomerge.datasets.simulation.scanner import scan_building
 from topomerge.datasets.simulation.session import simulate_session
 from topomerge.datasets.simulation.signs import Reader, draw_numbering, place_signs, read_signs
-from topomerge.datasets.simulation.twin_wing import make_twin_wing
 
 from topomerge.errors import InputError
 from topomerge.types import Array, Landmarks, PointCloud, Sim3

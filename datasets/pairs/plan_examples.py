@@ -16,9 +16,9 @@ from topomerge.datasets.buildings.layouts import BUILDING_KINDS
 from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.core.builder import BuildReport, BuildRow, BuildSettings, build_set, check_sharing, make_item
 from topomerge.datasets.core.building import Building, Difficulty, Plan
+from topomerge.datasets.pairs.drawing import compute_plan_truth, simulate_grid_map
 from topomerge.datasets.pairs.flat_maps import simulate_robot_grid
 from topomerge.datasets.pairs.items import compute_plan_digest
-from topomerge.datasets.pairs.plan_truth import compute_plan_truth, simulate_grid_map
 from topomerge.datasets.plans import splits
 from topomerge.datasets.simulation.scanner import scan_building, transform_cloud
 from topomerge.datasets.simulation.sensors import corrupt_cloud, cut_upper_half, get_sensor, measure_drift, remove_sensor_drift
@@ -207,7 +207,7 @@ class PlanExample:
 
     Args:
         room: (nx, ny) int16 true room, -1 none.
-        truth: (nx, ny) uint8, index into `plan_truth.TRUE_CLASSES`.
+        truth: (nx, ny) uint8, index into `drawing.TRUE_CLASSES`.
         visited: (n,) rooms that the surveyor was in.
         source: sensor/where the building is from.
     """

@@ -18,6 +18,7 @@ from topomerge.datasets.buildings.openings import list_windows
 from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.core.builder import BuildReport, BuildRow, BuildSettings, make_item
 from topomerge.datasets.core.building import Building, Plan
+from topomerge.datasets.pairs.drawing import simulate_grid_map
 from topomerge.datasets.pairs.flat_maps import compute_cells, encode_rows
 from topomerge.datasets.pairs.items import compute_plan_digest, select_points
 from topomerge.datasets.pairs.plan_examples import (
@@ -29,7 +30,6 @@ from topomerge.datasets.pairs.plan_examples import (
     draw_difficulty,
     scan_with_drift,
 )
-from topomerge.datasets.pairs.plan_truth import simulate_grid_map
 from topomerge.datasets.simulation.scanner import scan_building, transform_cloud
 from topomerge.datasets.simulation.sensors import get_sensor, measure_drift, remove_sensor_drift
 from topomerge.datasets.simulation.walk import sample_part

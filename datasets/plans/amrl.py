@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
-from topomerge.datasets.plans.raster import add_contacts, add_rooms, find_contacts, flood, guess_kinds
+from topomerge.datasets.plans.grid import add_contacts, add_rooms, find_contacts, flood, guess_kinds
 from topomerge.datasets.plans.sketch import Sketch, read_limited
 
 from topomerge.errors import InputError

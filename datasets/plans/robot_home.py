@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from topomerge.datasets.plans.raster import add_contacts, add_rooms, find_contacts, flood, guess_kinds
+from topomerge.datasets.plans.grid import add_contacts, add_rooms, find_contacts, flood, guess_kinds
 from topomerge.datasets.plans.sketch import Sketch
 
 from topomerge.errors import InputError

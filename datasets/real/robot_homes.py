@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from topomerge.datasets.plans.raster import NARROW_CONTACT, find_contacts, trace_outline
+from topomerge.datasets.plans.grid import NARROW_CONTACT, find_contacts, trace_outline
 from topomerge.datasets.plans.robot_home import spread_rooms
 from topomerge.datasets.simulation.floor_truth import OUTSIDE_ROOMS, TRUTH_CELL, TRUTH_MARGIN, FloorTruth, mask_unseen
 

@@ -14,7 +14,7 @@ from tests.changes.flats import TABLE, flat_map
 from tests.viz.test_report import EVIL, Page
 from topomerge.changes.compare import Changes, compare_maps
 from topomerge.changes.files import format_changes, save_bcf, save_geojson, save_json, serialise_changes
-from topomerge.viz.changes_report import render_changes_html, save_changes_report
+from topomerge.viz.pair_reports import render_changes_html, save_changes_report
 
 
 @pytest.fixture(scope="module")

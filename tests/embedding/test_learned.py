@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from tests.scenes_map import building
+from topomerge.embedding import learned
 from topomerge.embedding.graph import build_graph_arrays
 from topomerge.embedding.learned import EMBEDDER_FILE, find_embedder, load_embedder, read_embedder_card
 from topomerge.embedding.network import Geometry, Network, Node
@@ -316,6 +317,18 @@ def test_a_pickle_under_another_name_is_not_run(torch, tmp_path):
     values = json.loads(card_of(path).read_text())
     card_of(path).write_text(json.dumps({**values, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}))
     with pytest.raises(InputError, match="is no network that can be run"):
+        load_embedder(tmp_path)
+
+
+def test_a_network_is_opened_once_and_another_in_its_place_is_read(tmp_path, monkeypatch):
+    opened = []
+    original = learned.open_network
+    monkeypatch.setattr(learned, "open_network", lambda *words: opened.append(words[0]) or original(*words))
+    path = shipped(tmp_path)
+    first, second = load_embedder(tmp_path), load_embedder(path)
+    assert opened == [path] and first.run is second.run and first is not second
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(InputError, match="cut off, damaged"):
         load_embedder(tmp_path)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from topomerge.evaluation.merge_tables import (
+from topomerge.evaluation.merge_report import (
     select_last_variant,
     tabulate_descriptor_effect,
     tabulate_independence,

@@ -1,4 +1,7 @@
-"""Parameters of the presets: each has its own, and says so."""
+"""Parameters of the presets: each has its own, and says so.
+
+Steps that follow one another: their seconds and news of them.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from tests import scenes
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS, DefaultParameters, SharedParameters, ThesisParameters, resolve_parameters
+from topomerge.extraction.stopwatch import Stopwatch
 
 
 def test_each_preset_has_only_what_it_uses() -> None:
@@ -48,3 +52,16 @@ def test_a_map_tells_the_parameters_of_its_preset(preset: str) -> None:
         beyond["inflation"] = parameters["inflation"]
         assert parameters["inflation"] in ThesisParameters().inflations
     assert parameters == {**asdict(PRESETS[preset]), "carve": False, **beyond}
+
+
+def test_each_step_ends_where_the_next_begins() -> None:
+    news: list[tuple[float, str]] = []
+    watch = Stopwatch(lambda done, text: news.append((done, text)))
+    watch.begin("first", 0.0)
+    watch.begin("second", 0.5)
+    part = watch.build_part_progress(0.5, 0.9)
+    assert part is not None
+    part(0.5, "within")
+    assert list(watch.seconds) == ["first"] and list(watch.end()) == ["first", "second"]
+    assert news == [(0.0, "first"), (0.5, "second"), (0.7, "within")]
+    assert Stopwatch().build_part_progress(0.0, 1.0) is None and Stopwatch().end() == {}

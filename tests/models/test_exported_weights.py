@@ -18,7 +18,7 @@ from topomerge.training.loop import Exported
 from topomerge.training.scan_settings import DrawingSegmentation
 from topomerge.training.starts import start_from_exported
 
-WIDTHS = [2, 2, 2, 2, 2, 2]
+WIDTHS = [2, 2]  # an export of all levels takes seconds
 
 
 def build(seed: int, widths: list[int] = WIDTHS) -> DrawingProbabilities:
@@ -31,15 +31,22 @@ def build(seed: int, widths: list[int] = WIDTHS) -> DrawingProbabilities:
     return DrawingProbabilities(network).eval()
 
 
-def test_weights_of_a_file_are_those_that_were_exported(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of `build(1)`."""
+    path = tmp_path_factory.mktemp("exported") / "one.onnx"
+    export_network(build(1), DRAWING_SIGNATURE, [torch.rand(2, 3, 96, 64)], path)
+    return path
+
+
+def test_weights_of_a_file_are_those_that_were_exported(exported: Path) -> None:
     first, second = build(1), build(2)
     picture = torch.rand(2, 3, 96, 64)
-    export_network(first, DRAWING_SIGNATURE, [picture], tmp_path / "one.onnx")
     assert not torch.allclose(first(picture), second(picture))
-    load_exported_weights(second, tmp_path / "one.onnx")
+    load_exported_weights(second, exported)
     assert torch.equal(first(picture), second(picture))
     with pytest.raises(InputError, match="is another network than these settings make"):
-        load_exported_weights(build(3, [2, 2, 2, 2, 2, 4]), tmp_path / "one.onnx")
+        load_exported_weights(build(3, [2, 4]), exported)
 
 
 @pytest.mark.parametrize("content", [b"not onnx", b"", None])
@@ -68,10 +75,9 @@ class Job:
         return Exported(self.network, DRAWING_SIGNATURE, [])
 
 
-def test_a_training_starts_from_a_file_and_tells_which(tmp_path: Path) -> None:
+def test_a_training_starts_from_a_file_and_tells_which(exported: Path) -> None:
     first, job = build(1), Job(build(2), {"set": "drawings"})
-    export_network(first, DRAWING_SIGNATURE, [torch.rand(2, 3, 96, 64)], tmp_path / "one.onnx")
-    settings = DrawingSegmentation(init_from=str(tmp_path / "one.onnx"))
+    settings = DrawingSegmentation(init_from=str(exported))
     start_from_exported(job, settings, "drawing_network.onnx")
     assert all(torch.equal(a, b) for a, b in zip(first.parameters(), job.network.parameters(), strict=True))
     assert job.origin["set"] == "drawings" and len(job.origin["init_from"]) == 64

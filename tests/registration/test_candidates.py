@@ -1,18 +1,28 @@
-"""The best few hypotheses, bent and ranked anew: drift that made a right pose look worse than a wrong one is no disadvantage."""
+"""The best few hypotheses, bent and ranked anew: drift that made a right pose look worse than a wrong one is no disadvantage.
+
+Places of strangers' worlds that look alike: none is one place under the pose that is found, and none may be believed.
+
+Turns under which walls are parallel.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.fusion.plans_of import MOVE, grid_of, off, office
+from topomerge.io.maps import load_map
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.registration.judge import Judge
 from topomerge.registration.pipeline import CLOSELY, build_candidate, build_candidates, count_repeats, register, select_rivals
 from topomerge.registration.prepared import prepare
+from topomerge.registration.search import find_yaw_candidates, select_distinct_yaws
 from topomerge.registration.verify import MARGIN_CAP, rank, score_plausibility
+from topomerge.structure.directions import compute_direction_profile
 from topomerge.types import Sim3
 
 
@@ -94,3 +104,30 @@ def test_the_places_of_a_registration_lie_in_the_first_map(points, drifted):
     assert np.allclose(back[:, :2], there.places.crops.middle[:, :2], atol=1e-6)
     assert here.probability == pytest.approx(there.probability) and here.posterior == pytest.approx(there.posterior)
     assert off(here.transform, MOVE.inverse(), tuple(MOVE.apply(np.array([[3.0, 7.0, 1.0]]))[0]))[0] < 0.6
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["storeys_0", "storeys_1", "point_sym_3", "hotel_moved_1", "row_same_over_2"])
+def test_a_look_alike_is_refused(case_dir: Path, name: str) -> None:
+    a, b = (load_map(case_dir / "lookalikes" / f"{name}_{side}.tmap") for side in "ab")
+    seen = register(a, b)
+    assert not seen.accepted
+    if name.startswith(("storeys", "point_sym")):  # told by furniture, and named
+        assert seen.probability < 0.3 and seen.posterior["storey"] + seen.posterior["half"] > 0.6
+
+
+def test_yaw_candidates_of_a_pentagon():
+    angles = 2 * np.pi * np.arange(6) / 5
+    corners = 10 * np.column_stack([np.cos(angles), np.sin(angles)])
+    walls = np.concatenate([p + (q - p) * np.linspace(0, 1, 120)[:, None] for p, q in pairwise(corners)])
+    turn = np.radians(23.0)
+    c, s = np.cos(turn), np.sin(turn)
+    found = find_yaw_candidates(
+        compute_direction_profile(walls @ np.array([[c, s], [-s, c]]), 0.1), compute_direction_profile(walls, 0.1)
+    )
+    assert min(abs(np.degrees(y) - 23.0) for y in found) < 1.0
+
+
+def test_yaws_that_are_nearly_one_are_tried_once():
+    yaws = np.radians([10.0, 190.0, 10.3, -170.4, 100.0, 11.0, 370.1])
+    assert select_distinct_yaws(yaws.tolist()) == pytest.approx(np.radians([10.0, 190.0, 100.0, 11.0]))

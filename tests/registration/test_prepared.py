@@ -69,7 +69,7 @@ def test_a_merge_that_walls_decide_needs_no_descriptor(halves, monkeypatch):
     def refuse(*_: object) -> None:
         raise AssertionError("the embedder was loaded")
 
-    monkeypatch.setattr(learned, "open_network", refuse)
+    monkeypatch.setattr(learned, "load_embedder", refuse)
     assert tm.merge(list(halves)).merged
 
 

@@ -1,4 +1,7 @@
-"""What the belief in merges is fitted to: errors of poses, pairs that nobody can tell, strangers made of two pairs."""
+"""What the belief in merges is fitted to: errors of poses, pairs that nobody can tell, strangers made of two pairs.
+
+The fits of the belief in merges, on made-up features.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,7 @@ from topomerge.training.belief_hypotheses import (
     is_hypothesis_right,
     pair_different_buildings,
 )
+from topomerge.training.merge_belief import compute_spread, fit_logistic
 from topomerge.types import Sim3
 
 TRUTH = Sim3(3.1, (5.0, -2.0, 1.0))
@@ -106,3 +110,12 @@ def test_bins_of_the_area_in_common():
     ]
     assert classify_pair({**ROW, "common": 0.9}) == classify_pair({**ROW, "overlap": 0}) == "none (overlap)"
     assert classify_pair({**ROW, "kind": "strangers"}) == "none (strangers)"
+
+
+def test_a_feature_that_is_always_the_same_divides_nothing_by_zero() -> None:
+    """As of few pairs, none of which has a ceiling; the weights are written with five decimals."""
+    rng = np.random.default_rng(0)
+    x = np.column_stack([rng.normal(0, 2, 40), np.full(40, 0.3), rng.normal(0, 1e-7, 40)])
+    assert compute_spread(x)[1:].tolist() == [1.0, 1.0] and compute_spread(x)[0] == pytest.approx(x[:, 0].std())
+    model = fit_logistic(x, x[:, 0] > 0, ["walls", "ceilings", "hanging"], 1.0)
+    assert min(round(s, 5) for s in model["scale"]) > 0 and model["weight"][0] > 1 and np.isfinite(model["weight"]).all()

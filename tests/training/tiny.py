@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from topomerge.datasets.pairs.passage_examples import PassageExamples
+from topomerge.datasets.pairs.drawing import TRUE_CLASSES
 from topomerge.datasets.pairs.plan_examples import PlanExample, PlanItem, PlanRecipe, build_example_arrays
-from topomerge.datasets.pairs.plan_truth import TRUE_CLASSES
 from topomerge.datasets.pairs.wall_examples import WallExample, WallItem, build_wall_arrays
 
 from topomerge import archive
@@ -28,6 +27,7 @@ from topomerge.training.feature_scale import PairFeatures
 from topomerge.training.match_belief import MatchRows
 from topomerge.training.match_odds import MatchEvidence
 from topomerge.training.packed_pairs import GraphPair
+from topomerge.training.passages import PassageExamples
 from topomerge.training.room_matcher import MatcherExample, MatcherView
 from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, Array, Sim3, TopometricMap, VoxelGrid
 

@@ -127,7 +127,7 @@ def _list_files(
 
     files: list[tuple[str | Path, Callable[[Path], None]]] = []
     if folder is not None:
-        from topomerge.viz.changes_report import save_changes_report
+        from topomerge.viz.pair_reports import save_changes_report
 
         files += [(folder / PAGE, partial(save_changes_report, changes)), (folder / LISTING, partial(save_json, changes))]
     if args.geojson:

@@ -309,7 +309,7 @@ def run_match(args: argparse.Namespace) -> int:
     matching = match(a, b, args.descriptor, args.method, k=args.k, scale_free=args.scale_of_b == "free")
     matching = update_match_probabilities(matching, a, b, args.method)
     if args.report:
-        from topomerge.viz.match_report import save_match_report
+        from topomerge.viz.pair_reports import save_match_report
 
         save_match_report(matching, a, b, args.report)
     write_out(format_json(serialise_matching(matching, a, b)) if args.json else format_matching(matching, a, b) + "\n")

@@ -20,7 +20,7 @@ from topomerge.datasets.pairs.own_pairs import build_own_sets, check_own_path
 from topomerge.datasets.real.maps import build_real_pairs
 from topomerge.errors import InputError
 from topomerge.evaluation.documents import build_stamp, write_headline
-from topomerge.evaluation.merge_tables import (
+from topomerge.evaluation.merge_report import (
     select_last_variant,
     tabulate_descriptor_effect,
     tabulate_independence,

@@ -30,8 +30,7 @@ from topomerge.datasets.core.building import find_physical_building
 from topomerge.datasets.pairs.evaluation_pair import compute_anchor, convert_to_sim3
 from topomerge.datasets.pairs.grid_pairs import GridPair, load_grids
 from topomerge.datasets.pairs.own_pairs import OWN_DATA, OWN_FOLDER, check_own_path, extract_captures
-from topomerge.datasets.pairs.own_truth import find_overlap
-from topomerge.datasets.pairs.pairs_file import PairTruth, are_on_two_storeys, read_pairs_file
+from topomerge.datasets.pairs.pairs_file import PairTruth, are_on_two_storeys, find_overlap, read_pairs_file
 from topomerge.datasets.simulation.box_worlds import BOX_KINDS, is_right, load_pair
 from topomerge.errors import InputError
 from topomerge.evaluation.merge_report import compute_headline, tabulate_merges

@@ -12,8 +12,8 @@ import torch
 from scipy import ndimage
 from torch.nn import functional
 
+from topomerge.datasets.pairs.drawing import TRUE_CLASSES
 from topomerge.datasets.pairs.plan_examples import FLAT_SENSOR_SHARES, PlanExample, PlanRecipe, build_plans, load_examples
-from topomerge.datasets.pairs.plan_truth import TRUE_CLASSES
 from topomerge.errors import InputError
 from topomerge.extraction.plans.plan_network import (
     EVIDENCE_CHANNELS,

@@ -16,14 +16,15 @@ from topomerge.datasets.buildings.stack import (
     SURVEYED_WALLS,
     count_matching_rooms,
     iter_stacks,
+    make_twin_wing,
     register,
     stack_storeys,
+    stretch_building,
     transform_plan,
 )
 from topomerge.datasets.buildings.stairs import fit_flight
 from topomerge.datasets.core.building import Opening, Plan
 from topomerge.datasets.pairs.parts import find_twin_rooms, sample_two_parts
-from topomerge.datasets.simulation.twin_wing import make_twin_wing, stretch_building
 from topomerge.datasets.simulation.walk import plan_walk
 
 from tests.datasets.boxes import BARE, room

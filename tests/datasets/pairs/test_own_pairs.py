@@ -16,8 +16,15 @@ from topomerge.datasets.core.building import find_physical_building
 from topomerge.datasets.pairs import own_pairs
 from topomerge.datasets.pairs.evaluation_pair import load_set
 from topomerge.datasets.pairs.own_pairs import build_own_sets, extract_captures, split_pairs
-from topomerge.datasets.pairs.own_truth import find_overlap
-from topomerge.datasets.pairs.pairs_file import CAPTURE_KEYS, KEYS, PARTS, PairTruth, read_pairs_file, read_transform
+from topomerge.datasets.pairs.pairs_file import (
+    CAPTURE_KEYS,
+    KEYS,
+    PARTS,
+    PairTruth,
+    find_overlap,
+    read_pairs_file,
+    read_transform,
+)
 from topomerge.datasets.pairs.simulate import save_cloud
 
 import topomerge

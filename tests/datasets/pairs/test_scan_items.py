@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from topomerge.datasets.buildings.construction import build_building
+from topomerge.datasets.pairs.drawing import simulate_grid_map
 from topomerge.datasets.pairs.plan_examples import (
     FLAT_SENSOR_SHARES,
     PlanItem,
@@ -17,7 +18,6 @@ from topomerge.datasets.pairs.plan_examples import (
     make_examples,
     simulate_item_scan,
 )
-from topomerge.datasets.pairs.plan_truth import simulate_grid_map
 
 from tests.datasets.boxes import BARE, two_rooms
 from topomerge.errors import InputError

@@ -10,7 +10,7 @@ import shapely
 from topomerge.datasets.buildings.construction import build_building
 from topomerge.datasets.core.building import SURFACES, Difficulty
 from topomerge.datasets.plans.floorplans import read_plans
-from topomerge.datasets.plans.raster import find_contacts, flood, trace_outline
+from topomerge.datasets.plans.grid import find_contacts, flood, trace_outline
 from topomerge.datasets.plans.sketch import build_outline as cut_open
 from topomerge.datasets.plans.sketch import find_side_rooms, place_door
 

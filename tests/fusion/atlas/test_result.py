@@ -1,14 +1,21 @@
-"""What an atlas says of itself: components, the weakest link, and words."""
+"""What an atlas says of itself: components, the weakest link, and words.
+
+Keys tell maps apart; files are read when they are needed.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.fusion.atlas.atlas_scenes import office_map, stranger
 from topomerge.errors import InputError
+from topomerge.fusion.atlas import maps as atlas_maps
 from topomerge.fusion.atlas.link_evidence import Link
+from topomerge.fusion.atlas.maps import hash_map
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3
@@ -67,3 +74,21 @@ def test_words_name_who_belongs_together_who_stands_apart_and_what_was_thrown_ou
 def test_words_of_an_atlas_without_links():
     assert atlas((0,), (1,)).format_summary() == "nothing could be connected: all 2 maps stand apart"
     assert atlas((0,)).format_summary() == "one map, nothing to connect it with yet" and atlas().format_summary() == "no map"
+
+
+@pytest.mark.longer
+def test_keys_tell_maps_by_what_they_hold():
+    maps = [*(office_map(k) for k in range(4)), stranger()]
+    assert hash_map(maps[0]) == hash_map(replace(maps[0], source="other", seconds={"x": 1.0}))
+    moved = replace(maps[0], grid=replace(maps[0].grid, origin=maps[0].grid.origin + 1.0))
+    assert len({hash_map(m) for m in (*maps, moved)}) == 6
+
+
+@pytest.mark.longer
+def test_areas_are_remembered_of_maps_whose_plans_are_not(monkeypatch):
+    prepared, prepare = [], atlas_maps.prepare
+    monkeypatch.setattr(atlas_maps, "PREPARED_AT_ONCE", 1)
+    monkeypatch.setattr(atlas_maps, "prepare", lambda map: prepared.append(map.source) or prepare(map))
+    maps = atlas_maps.Maps([office_map(0), stranger()])
+    areas = [maps.get_area(k) for k in (0, 1, 0, 1)]
+    assert areas[:2] == areas[2:] and min(areas) > 20 and len(prepared) == 2

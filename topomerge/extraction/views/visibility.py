@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import sparse
 
 from topomerge.kernels import octree, rays, voxels
 from topomerge.types import Array, VoxelGrid
@@ -134,13 +133,6 @@ class Visibility:
         """Return (V,) int64 number of cells that each view sees."""
         running = np.concatenate([[0], np.cumsum(np.bitwise_count(self.masks), dtype=np.int64)])
         return np.diff(running[self.indptr])
-
-    def build_matrix(self) -> sparse.csr_array:
-        """Return (V, n) sparse matrix of ones where a view sees a cell."""
-        rows = [self.get_rows(v) for v in range(len(self))]
-        indptr = np.concatenate([[0], np.cumsum([len(r) for r in rows])])
-        indices = np.concatenate(rows) if rows else np.zeros(0, np.int64)
-        return sparse.csr_array((np.ones(len(indices), np.int64), indices, indptr), shape=(len(self), self.cells))
 
 
 def find_visible_cells(

@@ -1,4 +1,4 @@
-"""The report of a matching: crops that stand alike, rooms coloured by their matches, a click that opens both."""
+"""Pages of two maps: what has changed, and a matching."""
 
 from __future__ import annotations
 
@@ -12,14 +12,48 @@ import pytest
 from PIL import Image
 
 import topomerge as tm
+from tests.changes.flats import TABLE, flat_map
 from tests.scenes import Scene
 from tests.viz.chromium import Page
+from topomerge.changes.compare import compare_maps
 from topomerge.cli.main import main as cli
 from topomerge.embedding.surroundings import CROP, CROP_PLANES
 from topomerge.matching.match import Matching
 from topomerge.types import Sim3
-from topomerge.viz.match_report import draw_surroundings, find_aligning_quarters, render_match_html, save_match_report
 from topomerge.viz.merge_report import PIXEL_COLOURS
+from topomerge.viz.pair_reports import (
+    draw_surroundings,
+    find_aligning_quarters,
+    render_match_html,
+    save_changes_report,
+    save_match_report,
+)
+
+SET = "(() => { const s = document.querySelector('input[data-swipe]'); s.value = 0.25; s.dispatchEvent(new Event('input')); })()"
+CUTS = (
+    "(() => { const [a, b] = document.querySelectorAll('clipPath rect'); return [+a.getAttribute('x') + +a.getAttribute('width'),"
+    " +b.getAttribute('x'), document.querySelectorAll('.side-a[clip-path], .side-b[clip-path]').length]; })()"
+)
+WIDE = "Number(document.querySelector('svg.plan').getAttribute('viewBox').split(' ')[2])"
+
+
+@pytest.mark.longer
+def test_swipe_and_zoom(tmp_path: Path) -> None:
+    save_changes_report(compare_maps(flat_map(), flat_map(wall=True, box=TABLE)), tmp_path / "d.html")
+    page = Page(tmp_path / "d.html", tmp_path / "profile")
+    try:
+        page.run(SET)
+        old_until, new_from, cut = page.run(CUTS)
+        assert old_until == pytest.approx(new_from) and cut == 2
+        before = page.run(WIDE)
+        page.run("document.querySelector('tr[data-edge=\"c0\"]').click()")
+        assert page.run(WIDE) < 0.8 * before
+        page.run("document.querySelector('input[data-layer=\"wall\"]').click()")
+        assert page.run("getComputedStyle(document.querySelector('.change.of-wall')).display") == "none"
+        assert not page.console
+    finally:
+        page.close()
+
 
 FLAT = Scene().shell(0, 0, 13, 9).wall((5, 0), (5, 9), doors=(2.0,)).wall((5, 5), (13, 5), doors=(4.0,))
 
