@@ -18,6 +18,7 @@ from topomerge.types import Array, VoxelGrid
 # A grid holds it as its property ``offset``, (n, 3) uint8: of the way through the cell along each axis, in 256 parts. So it stays
 # right when a map is moved to another origin or scaled.
 
+LOCATED = 1 << 18  # points that are located at a time
 MIDDLE = OFFSET_STEPS // 2  # offset of a cell whose points are not known
 
 
@@ -37,15 +38,19 @@ def compute_cell_means(grid: VoxelGrid) -> Array:
 
 def add_means(grid: VoxelGrid, points: Array, counts: Array | None = None) -> VoxelGrid:
     """The grid with the property ``offset`` of points (N, 3), m, that each stand for so many points; others are left out."""
-    rows = grid.find_rows(grid.locate(points))
+    points = np.asarray(points, np.float64)
+    parts = [grid.find_rows(grid.locate(points[k : k + LOCATED])) for k in range(0, len(points), LOCATED)]  # several copies each
+    rows = np.concatenate(parts) if parts else np.zeros(0, np.int64)
     inside = rows >= 0
-    points, rows = np.asarray(points, np.float64)[inside], rows[inside]
-    weights = np.ones(len(rows)) if counts is None else np.asarray(counts, np.float64)[inside]
+    weights = np.ones(len(rows)) if counts is None else np.asarray(counts, np.float64)
+    points, rows, weights = (x if inside.all() else x[inside] for x in (points, rows, weights))
     many = np.bincount(rows, weights, len(grid))
-    within = (points - grid.origin) / grid.edge - grid.cells[rows]
-    total = np.column_stack([np.bincount(rows, weights * within[:, k], len(grid)) for k in range(3)])
-    mean = np.where(many[:, None] > 0, total / np.maximum(many, 1e-9)[:, None], 0.5)
-    return grid.assign_properties(offset=np.clip(mean * OFFSET_STEPS, 0, OFFSET_STEPS - 1).astype(np.uint8))
+    offset = np.empty((len(grid), 3), np.uint8)
+    for k in range(3):  # an axis at a time: a merge is largest here
+        within = (points[:, k] - grid.origin[k]) / grid.edge - grid.cells[rows, k]
+        mean = np.where(many > 0, np.bincount(rows, weights * within, len(grid)) / np.maximum(many, 1e-9), 0.5)
+        offset[:, k] = np.clip(mean * OFFSET_STEPS, 0, OFFSET_STEPS - 1).astype(np.uint8)
+    return grid.assign_properties(offset=offset)
 
 
 # What stands far from the rest of a cloud: stray points, and places that are no part of one building.
