@@ -148,6 +148,11 @@ def write_pictures(folder: Path, told: bool) -> Path:
     return write_corridor(folder / "a", walk_poses(PICTURES))
 
 
+def write_picture(folder: Path, told: bool) -> Path:
+    """Write one picture of them, for which the readers are loaded all the same."""
+    return write_corridor(folder / "a", walk_poses(PICTURES)[:1])
+
+
 def write_node_pictures(folder: Path, told: bool) -> Path:
     """Write them as nodes of RTAB-Map."""
     return write_rtabmap(folder / "a.db", picture_nodes(walk_poses(PICTURES)))
@@ -161,6 +166,7 @@ def write_bag_pictures(folder: Path, told: bool) -> Path:
 WALK = ("picture", PICTURES)
 RECORDINGS = (
     Recording("signs and tags on pictures, RGB-D folder", write_pictures, WALK, True),
+    Recording("the same, one picture: loading the readers", write_picture, ("picture", 1), True),
     Recording("signs and tags on pictures, RTAB-Map", write_node_pictures, WALK, True),
     Recording("signs and tags on pictures, bag", write_bag_pictures, WALK, True),
     Recording("WiFi, BLE and pressure, bag", write_bag_readings, ("scan", 0)),
