@@ -2,7 +2,7 @@
 what maps without landmarks load and call when they are merged; with a page, it writes the blocks `readers` and `without` there.
 
 Each recording is small, so that the costs of one picture, message or row are told. Seconds are of the processor, of all processes
-that read, and the best of some runs; memory is the most that the reading process held. Each measurement is a process of its own.
+that read, and the least of some runs; memory is the most that the reading process held. Each measurement is a process of its own.
 """
 
 from __future__ import annotations
