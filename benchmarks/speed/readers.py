@@ -2,25 +2,23 @@
 what maps without landmarks load and call when they are merged; with a page, it writes the blocks `readers` and `without` there.
 
 Each recording is small, so that the costs of one picture, message or row are told. Seconds are of the processor, of all processes
-that read, and the best of some runs; memory is the most that the reading process held. Each measurement is a process of its own.
+that read, and the least of some runs; memory is the most that the reading process held. Each measurement is a process of its own.
 """
 
 from __future__ import annotations
 
-import cProfile
 import json
-import pstats
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
-from tests.fusion.atlas.atlas_scenes import office_map
+from tests.fusion.atlas.atlas_scenes import office_map, truth
 from tests.io.bags import walk_messages, write_bag
 from tests.io.rtabmap_bases import packed, write_rtabmap
 from tests.io.signs import walk_poses
@@ -54,6 +52,21 @@ began = seconds()
 found = (load_map(path) if path.suffix == ".tmap" else read_points(path, **options)).landmarks
 print(json.dumps([seconds() - began, max(u.ru_maxrss for u in usage()) / 1024, 0 if found is None else len(found)]))
 """
+MERGE = """
+import cProfile, json, pstats, sys, time
+from pathlib import Path
+from topomerge.fusion.pipeline import merge
+from topomerge.io.maps import load_map
+maps = [load_map(Path(sys.argv[1]) / f"{k}.tmap") for k in range(2)]
+profile, began = cProfile.Profile(), time.process_time()
+profile.runcall(merge, maps)
+spent = time.process_time() - began
+ours = [v for key, v in pstats.Stats(profile).stats.items() if "topomerge/landmarks/" in key[0]]
+loaded = sum(name.startswith("topomerge.landmarks") for name in sys.modules)
+packages = [name for name in PACKAGES if name in sys.modules]
+calls, seconds = sum(v[1] for v in ours), sum(v[2] for v in ours)
+print(json.dumps([len(sys.modules), loaded, ", ".join(packages) or "none", calls, f"{1000 * seconds:.1f}", f"{spent:.1f}"]))
+""".replace("PACKAGES", repr(PACKAGES))
 
 
 @dataclass(frozen=True)
@@ -148,6 +161,11 @@ def write_pictures(folder: Path, told: bool) -> Path:
     return write_corridor(folder / "a", walk_poses(PICTURES))
 
 
+def write_picture(folder: Path, told: bool) -> Path:
+    """Write one picture of them, for which the readers are loaded all the same."""
+    return write_corridor(folder / "a", walk_poses(PICTURES)[:1])
+
+
 def write_node_pictures(folder: Path, told: bool) -> Path:
     """Write them as nodes of RTAB-Map."""
     return write_rtabmap(folder / "a.db", picture_nodes(walk_poses(PICTURES)))
@@ -161,6 +179,7 @@ def write_bag_pictures(folder: Path, told: bool) -> Path:
 WALK = ("picture", PICTURES)
 RECORDINGS = (
     Recording("signs and tags on pictures, RGB-D folder", write_pictures, WALK, True),
+    Recording("the same, one picture: loading the readers", write_picture, ("picture", 1), True),
     Recording("signs and tags on pictures, RTAB-Map", write_node_pictures, WALK, True),
     Recording("signs and tags on pictures, bag", write_bag_pictures, WALK, True),
     Recording("WiFi, BLE and pressure, bag", write_bag_readings, ("scan", 0)),
@@ -172,13 +191,17 @@ RECORDINGS = (
 )
 
 
+def run_alone(code: str, *words: str) -> list[Any]:
+    """Run code in a process of its own that prints a list; a shell between, so that the memory of this one does not count."""
+    command = ["sh", "-c", '"$@"; exit $?', "sh", sys.executable, "-c", code, *words]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    printed: list[Any] = json.loads(done.stdout.splitlines()[-1])
+    return printed
+
+
 def measure_reading(path: Path, options: dict[str, bool], repeat: int) -> tuple[float, float, int]:
-    """Measure s of processor and MiB of reading a file in a process of its own, the best of some; and count its landmarks."""
-    runs = []
-    for _ in range(repeat):
-        command = [sys.executable, "-c", READ, str(path), json.dumps(options)]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-        runs.append(json.loads(done.stdout.splitlines()[-1]))
+    """Measure s of processor and MiB of reading a file, the better of some runs; and count its landmarks."""
+    runs = [run_alone(READ, str(path), json.dumps(options)) for _ in range(repeat)]
     return min(r[0] for r in runs), min(r[1] for r in runs), int(runs[0][2])
 
 
@@ -204,39 +227,22 @@ def measure_readers(recordings: tuple[Recording, ...], repeat: int) -> str:
     return write_table(heads, lines)
 
 
-def count_calls(signs: bool) -> list[object]:
-    """Merge two maps in this process; count what was imported and how much of it was called for landmarks."""
-    from topomerge.fusion.pipeline import merge
-
-    maps = [office_map(k) for k in range(2)]
-    if signs:
-        maps = [add_landmarks(m, build_landmarks("text", ["2.113"], "hand", m.rooms["centroid"][:1] + (0, 0, 1.5))) for m in maps]
-    profile, began = cProfile.Profile(), time.process_time()
-    profile.enable()
-    merge(maps)
-    profile.disable()
-    spent = time.process_time() - began
-    stats = pstats.Stats(profile).stats  # type: ignore[attr-defined]
-    ours = {key: value for key, value in stats.items() if "topomerge/landmarks/" in key[0]}
-    calls, seconds = sum(v[1] for v in ours.values()), sum(v[2] for v in ours.values())
-    names = set(sys.modules)
-    loaded = sum(name.startswith("topomerge.landmarks") for name in names)
-    packages = [name for name in PACKAGES if name in names]
-    return [len(names), loaded, ", ".join(packages) or "none", calls, f"{1000 * seconds:.1f}", f"{spent:.1f}"]
-
-
 def measure_merges() -> str:
-    """Measure merges of maps without landmarks and with a sign each, as a table."""
-    lines = []
-    for words, signs in (("without landmarks", False), ("with a sign each", True)):
-        code = f"import json\nfrom benchmarks.speed.readers import count_calls\nprint(json.dumps(count_calls({signs})))"
-        done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-        lines.append([words, *json.loads(done.stdout.splitlines()[-1])])
+    """Measure merges of maps without landmarks and with one sign that both have, as a table."""
+    lines, at = [], office_map(0).rooms["centroid"][:1] + (0, 0, 1.5)
+    for words, signs in (("without landmarks", False), ("with a sign that both have", True)):
+        with TemporaryDirectory() as name:
+            for k in range(2):
+                map, place = office_map(k), truth(0, k).inverse().apply(at)
+                save_map(
+                    add_landmarks(map, build_landmarks("text", ["2.113"], "hand", place)) if signs else map, f"{name}/{k}.tmap"
+                )
+            lines.append([words, *run_alone(MERGE, name)])
     heads = ["two maps", "modules loaded", "of these of landmarks", "packages that read signs", "calls of landmarks"]
     return write_table([*heads, "ms in these", "s of processor in all"], lines)
 
 
-def main(page: str = "", most: int = len(RECORDINGS), repeat: int = 2) -> None:
+def main(page: str = "", most: int = len(RECORDINGS), repeat: int = 1) -> None:
     """Print the tables, of the first `most` recordings; write them into a page."""
     blocks = {"readers": measure_readers(RECORDINGS[:most], repeat), "without": measure_merges()}
     print("\n\n".join(blocks.values()))
