@@ -43,7 +43,8 @@ def add_means(grid: VoxelGrid, points: Array, counts: Array | None = None) -> Vo
     rows = np.concatenate(parts) if parts else np.zeros(0, np.int64)
     inside = rows >= 0
     weights = np.ones(len(rows)) if counts is None else np.asarray(counts, np.float64)
-    points, rows, weights = (x if inside.all() else x[inside] for x in (points, rows, weights))
+    if not inside.all():
+        points, rows, weights = points[inside], rows[inside], weights[inside]
     many = np.bincount(rows, weights, len(grid))
     offset = np.empty((len(grid), 3), np.uint8)
     for k in range(3):  # an axis at a time: a merge is largest here
