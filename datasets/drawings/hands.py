@@ -188,7 +188,7 @@ def draw_plan(
     for rectangle in shapes.stairs:
         draw_treads(sheet, rectangle, hand, rng)
     furnish_rooms(sheet, shapes, hand, rng)
-    _write_rooms(sheet, shapes, hand, rng)
+    _write_rooms(sheet, shapes, hand, walls, rng)
     if hand.dimensions:
         _draw_dimensions(sheet, shapes, hand, rng)
     picture = np.asarray(sheet.picture.reduce(FINER))
@@ -345,7 +345,7 @@ def format_area(area: float, width: float, depth: float, style: str) -> list[str
     return {"": [], "m2": [metric], "size": [size], "feet": [feet], "both": [size, feet]}[style]
 
 
-def _write_rooms(sheet: Sheet, shapes: DrawingShapes, hand: Hand, rng: np.random.Generator) -> None:
+def _write_rooms(sheet: Sheet, shapes: DrawingShapes, hand: Hand, walls: Array, rng: np.random.Generator) -> None:
     label = np.asarray(sheet.rooms)
     colour = hand.ink if rng.random() < 0.8 else (90, 90, 160)
     height = hand.letter * sheet.scale
@@ -353,10 +353,11 @@ def _write_rooms(sheet: Sheet, shapes: DrawingShapes, hand: Hand, rng: np.random
         lines = []
         if rng.random() < hand.names:
             lines.append(str(rng.choice(WORDS.get(room.kind, OTHER_WORDS))))
-        x, y = room.polygon.T
-        area = 0.5 * abs(float(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))))
+        clear = np.nonzero((label == number + 1) & ~walls)  # people measure from wall to wall
+        area = len(clear[0]) / sheet.scale**2
         if area > 3:
-            lines += format_area(area, float(np.ptp(x)), float(np.ptp(y)), hand.areas)
+            depth, width = ((np.ptp(side) + 1) / sheet.scale for side in clear)
+            lines += format_area(area, float(width), float(depth), hand.areas)
         if not lines:
             continue
         rows, columns = np.nonzero(label[::4, ::4] == number + 1)

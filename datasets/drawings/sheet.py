@@ -18,11 +18,12 @@ WALL_STYLES = {"filled": 0.5, "grey": 0.12, "double": 0.14, "hatched": 0.08, "si
 
 @dataclass(frozen=True)
 class DrawnText:
-    """A text on a drawing: what it says, its middle (column, row), px, and its room, or -1."""
+    """A text on a drawing: what it says, its middle (column, row), px, its room, or -1, and the height of its letters, px."""
 
     text: str
     place: tuple[float, float]
     room: int
+    height: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,13 +140,14 @@ class Sheet:
         self, text: str, at: tuple[float, float], height: float, font: int, colour: tuple[int, int, int], room: int = -1
     ) -> None:
         """Write a text about a place, in finer pixels."""
-        letters = load_font(font, max(int(height), 7))
+        height = max(int(height), 7)
+        letters = load_font(font, height)
         box = self.draw.textbbox(at, text, font=letters, anchor="mm")
         if box[0] < 2 or box[1] < 2 or box[2] > self.shape[1] - 2 or box[3] > self.shape[0] - 2:
             return
         self.draw.text(at, text, fill=colour, font=letters, anchor="mm")
         self.mark.text(at, text, fill=TEXT, font=letters, anchor="mm")
-        self.texts.append(DrawnText(text, (at[0] / FINER, at[1] / FINER), room))
+        self.texts.append(DrawnText(text, (at[0] / FINER, at[1] / FINER), room, height / FINER))
 
 
 @cache

@@ -254,12 +254,26 @@ def test_tiles_are_floor():
     assert ink.sum() > 2000 and (classes[ink] == FLOOR).all() and set(np.unique(classes)) == {PAGE, FLOOR}
 
 
+def find_clear_floor(drawing):
+    return (drawing.rooms == 0) & (drawing.classes != WALL)
+
+
+def test_areas_are_of_the_floor_between_the_walls():
+    drawing = draw(areas="m2", inner=0.2)
+    (text,) = drawing.texts
+    assert parse_lengths(text.text)[0] == pytest.approx(find_clear_floor(drawing).sum() / SCALE**2, abs=0.15)
+    assert text.height == pytest.approx(0.3 * SCALE, abs=1)
+
+
 def test_names_and_areas_are_texts():
     drawing = draw(names=1.0, areas="both")
     mask, inside = drawing.classes == TEXT, ndimage.binary_erosion(drawing.rooms == 0, np.ones((3, 3)), 8)
     assert_same(find_ink(drawing.picture) & inside, mask)
     assert [text.room for text in drawing.texts] == [0, 0, 0]
-    assert any(parse_lengths(text.text)[1] == pytest.approx((4.0, 3.0)) for text in drawing.texts)
+    clear = find_clear_floor(drawing)
+    sides = tuple(np.ptp(side) / SCALE for side in np.nonzero(clear))[::-1]
+    assert sides == pytest.approx((3.85, 2.85), abs=0.05)  # from wall to wall: half of a wall is on either side
+    assert any(parse_lengths(text.text)[1] == pytest.approx(sides, abs=0.03) for text in drawing.texts)
     for text in drawing.texts:
         column, row = (int(v) for v in text.place)
         assert mask[row - 6 : row + 6, column - 12 : column + 12].any()

@@ -20,8 +20,8 @@ from topomerge.io.drawing import (
     parse_drawing,
 )
 from topomerge.io.drawn_page import DrawnPage, compute_levels, find_homography, find_page, move_places
-from topomerge.io.drawn_storeys import find_storeys, parse_storey
-from topomerge.io.grid import build_drawn_pieces, read_picture
+from topomerge.io.drawn_storeys import correlate_masks, find_storeys, parse_storey
+from topomerge.io.grid import build_drawn_pieces, count_pages, read_picture
 from topomerge.io.piece import ReadOptions
 from topomerge.io.points import read_points
 
@@ -209,6 +209,27 @@ def test_a_picture_of_a_cat_has_no_walls(tmp_path):
     assert "cat.png" in str(refusal.value) and "\n" not in str(refusal.value)
 
 
+@pytest.mark.parametrize("name", ["page.png", "page.pdf"])
+def test_a_page_with_nothing_on_it(tmp_path, name):
+    Image.new("RGB", (400, 300), (250, 250, 246)).save(tmp_path / name)
+    with pytest.raises(InputError, match=f"{name}: nothing is drawn on it$"):
+        read_points(tmp_path / name, resolution=0.02, text=False)
+
+
+def test_a_tiff_of_several_pages_says_which_was_read(tmp_path):
+    first, second = (np.full((140, 180), 254, np.uint8) for _ in range(2))
+    first[40:100, 40:42] = first[40:42, 40:100] = first[98:100, 40:100] = first[40:100, 98:100] = 0
+    page, other, small = (Image.fromarray(a) for a in (first, second, first[::2, ::2]))
+    small.encoderinfo = {"tiffinfo": {254: 1}}
+    page.save(tmp_path / "one.tif", save_all=True, append_images=[small])  # a smaller copy, as viewers use
+    page.save(tmp_path / "two.tif", save_all=True, append_images=[other])
+    told = [read_points(tmp_path / f, resolution=0.05, drawing=False).warnings for f in ("one.tif", "two.tif")]
+    assert not any("pages" in t for t in told[0]) and count_pages(tmp_path / "one.tif") == 1
+    assert [t for t in told[1] if "pages" in t] == [
+        "two.tif: has 2 pages, and the first was read; save the others as files of their own"
+    ]
+
+
 @pytest.mark.parametrize(
     ("text", "rank"),
     [
@@ -368,3 +389,14 @@ def test_levels_are_means_to_the_bit() -> None:
     picture = np.random.default_rng(0).integers(0, 256, (40, 50, 3)).astype(np.uint8)
     assert (compute_levels(picture) == picture.mean(axis=2).round()).all()
     assert (compute_levels(np.full((1, 1, 3), 255, np.uint8)) == 255).all()
+
+
+@pytest.mark.parametrize("shapes", [((9, 14), (5, 6)), ((4, 3), (8, 11))])
+def test_masks_are_correlated_at_every_move(shapes):
+    below, above = (np.random.default_rng(k).random(shape) < 0.4 for k, shape in enumerate(shapes))
+    score = correlate_masks(below, above)
+    assert score.shape == tuple(a + b - 1 for a, b in zip(*shapes, strict=True))
+    for i, j in np.ndindex(score.shape):
+        moved = np.argwhere(above) + [i, j] - np.array(above.shape) + 1
+        inside = ((moved >= 0) & (moved < below.shape)).all(axis=1)
+        assert score[i, j] == pytest.approx(below[tuple(moved[inside].T)].sum(), abs=1e-3)

@@ -34,6 +34,7 @@ FOOT, INCH = 0.3048, 0.0254  # m
 PLAUSIBLE_AREA, PLAUSIBLE_SIDE = (0.8, 3000.0), (0.6, 100.0)  # m2, m
 FEWEST_PIXELS = 30  # of a room that gives a scale
 AGREEING = 0.12  # of the logarithm of the scale: texts that differ more from the median are not of their room
+BLANK = 16  # levels of 255 between the darkest and the lightest pixel: less is paper
 NAME_HEIGHT = 1.2  # m above the floor at which the name of a room is placed
 ALIKE = 0.3  # likewise, of how long rooms are for their width
 DOOR_WIDTH, DOOR_SPREAD = 0.82, 0.12  # m, usual clear width of drawn doors, and its spread as a logarithm
@@ -367,7 +368,7 @@ def trace_drawing(
     known = resolution if resolution is not None or stated is None or paper is None else paper * stated
     drawing = parse_drawing(picture, known)
     if not drawing.free.any() or measure_straight_share(drawing.occupied) < LEAST_STRAIGHT:
-        raise InputError(f"{path}: no walls around a room were found in it; if it is a robot's grid, give --no-drawing")
+        raise InputError(f"{path}: {explain_missing_walls(path, picture)}")
     warnings = [f"{path.name}: was read as a drawn plan, without its page, texts and furniture"]
     if page.mended:
         warnings.append(f"{path.name}: its page was {', '.join(page.mended)} first; places are those on that page")
@@ -389,6 +390,14 @@ def trace_drawing(
     drawing = replace(drawing, stairs=treads & ndimage.binary_fill_holes(drawing.free | drawing.occupied))
     placed = [PictureText(t.text, (t.place[0] * zoom, t.place[1] * zoom), t.height * zoom, t.confidence) for t in texts or ()]
     return TracedDrawing(drawing, known / zoom, tuple(placed), tuple(warnings))
+
+
+def explain_missing_walls(path: Path, picture: Array) -> str:
+    """Explain why a picture (h, w, 3) has no rooms, and what to do."""
+    if np.ptp(picture.mean(axis=2, dtype=np.float32)) < BLANK:
+        return "nothing is drawn on it"
+    advice = "" if path.suffix.lower() in (".pdf", ".svg") else "; if it is a robot's grid, give --no-drawing"
+    return f"no walls around a room were found in it{advice}"
 
 
 def find_stated_scale(texts: Sequence[PictureText]) -> float | None:

@@ -11,7 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from scipy import ndimage, signal
+from scipy import fft, ndimage
 
 from topomerge.errors import InputError
 from topomerge.io.drawing import ParsedDrawing, PictureText, TracedDrawing
@@ -148,15 +148,25 @@ def place_storeys(plans: Sequence[DrawnStorey], resolution: float, common: float
     for below, above in pairwise(plans):
         floors = [reduce_mask(ndimage.binary_fill_holes(p.free | p.occupied), step) for p in (below, above)]
         walls = [ndimage.binary_dilation(reduce_mask(p.occupied, step)) for p in (below, above)]
-        score = sum(signal.fftconvolve(a.astype(np.float32), b[::-1, ::-1].astype(np.float32)) for a, b in (floors, walls))
-        row, column = np.unravel_index(int(np.argmax(score)), score.shape)
-        move = np.array([row, column]) - np.array(floors[1].shape) + 1
+        score = correlate_masks(*floors) + correlate_masks(*walls)
+        move = np.array(np.unravel_index(int(np.argmax(score)), score.shape)) - np.array(floors[1].shape) + 1
         both = count_common(floors[0], floors[1], move)
         if both < common * (floors[0].sum() + floors[1].sum() - both):
             return None
         shift = shift + move * step
         out.append(replace(above, corner=(float(shift[1]) * resolution, -float(shift[0]) * resolution)))
     return out
+
+
+def correlate_masks(below: Array, above: Array) -> Array:
+    """Count the cells that two masks (h, w), (k, m) share, for every move of the second: (h + k - 1, w + m - 1) float32.
+
+    Entry (i, j) is of the second moved by i - k + 1 rows and j - m + 1 columns.
+    """
+    shape = [a + b - 1 for a, b in zip(below.shape, above.shape, strict=True)]
+    fast = [fft.next_fast_len(side, real=True) for side in shape]
+    spectrum = fft.rfft2(below.astype(np.float32), fast) * fft.rfft2(above[::-1, ::-1].astype(np.float32), fast)
+    return np.asarray(fft.irfft2(spectrum, fast)[: shape[0], : shape[1]])
 
 
 def reduce_mask(mask: Array, step: int) -> Array:

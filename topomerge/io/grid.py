@@ -111,6 +111,7 @@ IMAGES = (".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 IMAGE_FORMATS = ("PPM", "PNG", "JPEG", "BMP", "TIFF")
 MODES = ("trinary", "scale", "raw")
 JPEG_MAGIC = b"\xff\xd8\xff"
+MOST_PAGES = 100  # of a TIFF that are counted
 NOISE_SHARE = 0.05  # of the floor: less in a picture without loss are edges that somebody smoothed, and stay
 TOLD_SHARE = 0.01  # of the floor: more noise around the grey of unknown is told
 
@@ -132,6 +133,9 @@ class Plan:
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Read floor points, then walls layer by layer, in metres."""
     names: Landmarks | None = None
+    if (pages := count_pages(path)) > 1:
+        wanted = f"{path.name}: has {pages} pages, and the first was read; save the others as files of their own"
+        yield Piece(np.empty((0, 3)), warnings=(wanted,), done=0.0)
     if path.suffix.lower() in (".yaml", ".yml"):
         plan = read_yaml(path)
         if options.resolution is not None:
@@ -195,6 +199,24 @@ def list_drawn_doors(storey: DrawnStorey, plan: Plan, floor: float, factor: floa
     x = plan.origin[0] + (columns + j) * plan.resolution
     y = plan.origin[1] + (len(storey.doorway) - rows - i) * plan.resolution
     return np.stack(np.broadcast_arrays(x, y, floor, storey.doorway[rows, columns]), axis=-1).reshape(-1, 4)
+
+
+def count_pages(path: Path) -> int:
+    """Count the pages of a TIFF, without smaller copies of a page; 1 for any other file."""
+    if path.suffix.lower() not in (".tif", ".tiff"):
+        return 1
+    from PIL import Image, TiffTags
+
+    reduced = next(number for number, tag in TiffTags.TAGS_V2.items() if tag.name == "NewSubfileType")
+    pages = 0
+    try:
+        with Image.open(path, formats=("TIFF",)) as opened:
+            for number in range(min(getattr(opened, "n_frames", 1), MOST_PAGES)):
+                opened.seek(number)
+                pages += not int(getattr(opened, "tag_v2", {}).get(reduced, 0)) & 1
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError):
+        return 1  # `read_image` tells what is wrong
+    return max(pages, 1)
 
 
 def read_picture(path: Path) -> Array:
