@@ -23,6 +23,7 @@ from topomerge.datasets.core.builder import limit_threads
 from topomerge.datasets.pairs.localisation import make_located_scan
 
 from benchmarks.peers.methods import GuardedWork
+from topomerge.code_digest import compute_code_digest
 from topomerge.errors import InputError
 from topomerge.evaluation.documents import build_stamp, write_blocks, write_table
 from topomerge.evaluation.locate import FIRST, MAKERS, MAPS, RIGHT_POSE, classify_outcome, load_atlas, measure_scan
@@ -125,7 +126,8 @@ def main(scans: str = "15", maps: str = "10") -> None:
     folder = Path(settings.cache) / "locate" / "test"
     wanted = [(FIRST["test"] + k // len(KINDS), KINDS[k % len(KINDS)]) for k in range(int(scans))]
     items = {f"{number} {kind} {maps}": (number, kind, int(maps), folder) for number, kind in wanted}
-    rows = measure_missing(Path(settings.cache) / "evaluation" / "locate_peers.jsonl", items, compare_scan, print, settings)
+    path = Path(settings.cache) / "evaluation" / "locate_peers.jsonl"
+    rows = measure_missing(path, items, compare_scan, print, settings, compute_code_digest(*MAKERS))
     table = tabulate(rows)
     print(table)
     if PAGE.exists():

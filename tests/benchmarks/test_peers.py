@@ -347,3 +347,21 @@ def test_a_scan_in_whole_maps_is_counted_by_its_pose_and_by_the_map_with_most_in
 
     table = scans.tabulate([row(good, 20.0), row(good, 5.0), row(far, 20.0)])
     assert "| sweep | 3 | 2 | 2 | 1 | 1.00 | 50 | 3 | 0 | 0.50 |" in table
+
+
+def test_scans_are_compared_when_the_module_is_the_program(module, tmp_path, monkeypatch, capsys) -> None:
+    scans = module("scans")
+
+    def compare(number: int, kind: str, count: int, folder) -> dict:
+        found = {"map": number, "inliers": float(count), "seconds": 1.0, "away": 0.1, "turned": 0.0}
+        ours = {"status": "located", "room": True, "seconds": 0.5, "stranger": False}
+        return {"kind": kind, "building": number, "ours": ours, "kiss": [found]}
+
+    compare.__module__ = "__main__"
+    for name, value in (("compare_scan", compare), ("find_spec", lambda name: name)):
+        monkeypatch.setattr(scans, name, value)
+    monkeypatch.setattr(scans.os, "sched_setaffinity", lambda process, cores: None)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.chdir(tmp_path)
+    scans.main("2", "3")
+    assert "| all | 2 | 2 | 2 | 2 | 1.00 | 50 | 2 | 0 | 0.50 |" in capsys.readouterr().out
