@@ -22,7 +22,7 @@ import numpy as np
 from topomerge.datasets.core.builder import limit_threads
 from topomerge.datasets.pairs.localisation import make_located_scan
 
-from benchmarks.peers.methods import GuardedWork
+from benchmarks.peers.methods import CALL_FAILED, GuardedWork
 from topomerge.code_digest import compute_code_digest
 from topomerge.errors import InputError
 from topomerge.evaluation.documents import build_stamp, write_blocks, write_table
@@ -43,7 +43,8 @@ def run_kiss_matcher(scan: Array, map: Array) -> Iterator[tuple[str, tuple[Array
 
     begun = time.process_time()
     matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(VOXEL, use_quatro=True))
-    solution = matcher.estimate(*(np.asarray(cloud, float).T for cloud in (scan, map)))
+    pairs = matcher.match(*(np.asarray(cloud, float).T for cloud in (scan, map)))
+    solution = matcher.solve(*(np.array(side, float).reshape(-1, 3).T for side in pairs))
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = np.array(solution.rotation), np.array(solution.translation).ravel()
     inliers = float(matcher.get_num_final_inliers()) if solution.valid else 0.0
@@ -71,7 +72,9 @@ def compare_scan(number: int, kind: str, count: int, folder: Path) -> Row:
         ours = measure_scan(index, scan.cloud, (number, true))
     found = []
     for k in choose_maps(number, count):
-        answers, _, used = start_peer()(scan.cloud.points, index.maps[k].load().grid.compute_centroids())
+        answers, why, used = start_peer()(scan.cloud.points, index.maps[k].load().grid.compute_centroids())
+        if why == CALL_FAILED:  # else a peer that cannot be called would count as wrong
+            raise RuntimeError(f"KISS-Matcher failed on {number} {kind} in map {k}; is it version 1.0.2?")
         matrix, inliers, seconds = answers.get("kiss", (np.eye(4), 0.0, used))
         found.append({"map": k, "inliers": inliers, "seconds": seconds, **measure_error(matrix, true)})
     return {"kind": kind, "building": number, "ours": ours, "kiss": found}

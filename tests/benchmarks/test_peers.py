@@ -365,3 +365,16 @@ def test_scans_are_compared_when_the_module_is_the_program(module, tmp_path, mon
     monkeypatch.chdir(tmp_path)
     scans.main("2", "3")
     assert "| all | 2 | 2 | 2 | 2 | 1.00 | 50 | 2 | 0 | 0.50 |" in capsys.readouterr().out
+
+
+def test_a_peer_that_cannot_be_called_is_an_error_and_not_a_wrong_answer(module, monkeypatch) -> None:
+    scans = module("scans")
+    cloud = SimpleNamespace(points=np.zeros((3, 3)))
+    stored = SimpleNamespace(load=lambda: SimpleNamespace(grid=SimpleNamespace(compute_centroids=lambda: np.zeros((3, 3)))))
+    placed = SimpleNamespace(place_scan=lambda scan: (Sim3(0.0), np.zeros(3)))
+    monkeypatch.setattr(scans, "load_atlas", lambda *args: (SimpleNamespace(maps=[stored] * 50), [placed] * 50))
+    monkeypatch.setattr(scans, "make_located_scan", lambda *args: SimpleNamespace(cloud=cloud))
+    monkeypatch.setattr(scans, "measure_scan", lambda *args: {})
+    monkeypatch.setattr(scans, "start_peer", lambda: lambda *args: ({}, scans.CALL_FAILED, 0.0))
+    with pytest.raises(RuntimeError, match="KISS-Matcher failed on 24 walk"):
+        scans.compare_scan(24, "walk", 3, None)
