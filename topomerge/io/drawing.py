@@ -15,6 +15,7 @@ from topomerge.errors import InputError
 from topomerge.io.drawn_page import DrawnPage, find_lines, move_places
 from topomerge.io.pictures import load_text_reader
 from topomerge.io.sightings import clean_text
+from topomerge.kernels import run_side_by_side
 from topomerge.networks.drawing import DOOR, FLOOR, PAGE, WALL, WINDOW, compute_drawing_probabilities
 from topomerge.networks.network import Run
 from topomerge.types import Array, Landmarks, build_landmarks, join_landmarks
@@ -171,9 +172,9 @@ def find_treads(picture: Array, resolution: float) -> Array:
     """
     bright = picture.mean(axis=2, dtype=np.float32)
     out = np.zeros(bright.shape, bool)
-    for flip in (False, True):
-        mask = out.T if flip else out
-        lines = np.array(find_lines(bright, flip, TREAD_WIDTH[0] / resolution, TREAD_STRONG)).reshape(4, -1)
+    found = run_side_by_side(lambda flip: find_lines(bright, flip, TREAD_WIDTH[0] / resolution, TREAD_STRONG), (False, True))
+    for mask, ends in zip((out, out.T), found, strict=True):
+        lines = np.array(ends).reshape(4, -1)
         x, y, slope, length = lines[:, np.lexsort((lines[0], lines[1]))]
         x, y, length = x * resolution, y * resolution, length * resolution
         open_lines = (np.abs(slope) <= 0.03) & (length <= TREAD_WIDTH[1])

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
 
+from topomerge.kernels import run_side_by_side
 from topomerge.networks.network import Network, Run, Signature, Tensor, load_shipped_network
 from topomerge.types import Array
 
@@ -46,7 +48,7 @@ def compute_drawing_probabilities(picture: Array, network: Run | None = None) ->
             part = picture[box]
             pad = [(0, -part.shape[0] % STRIDE), (0, -part.shape[1] % STRIDE), (0, 0)]
             x = np.pad(part, pad, mode="edge").transpose(2, 0, 1)[None].astype(np.float32) / 255.0
-            probability = np.mean([_look(x, run, turn) for turn in range(LOOKS)], axis=0)
+            probability = np.mean(run_side_by_side(partial(_look, x, run), range(LOOKS)), axis=0)
             rows, columns = slice(top - box[0].start, bottom - box[0].start), slice(left - box[1].start, right - box[1].start)
             out[top:bottom, left:right] = probability[0].transpose(1, 2, 0)[rows, columns]
     return out
