@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.archive import replace_on_success
 from topomerge.changes.compare import Change, Changes
 from topomerge.changes.layers import RelativePlacement
 from topomerge.embedding.sheets import build_sheet_arrays
@@ -22,7 +21,7 @@ from topomerge.matching.match import Matching
 from topomerge.types import Array, TopometricMap
 from topomerge.viz.merge_plan import lay_out_pair, render_blend_view, render_lines
 from topomerge.viz.merge_report import FOR, PIXEL_COLOURS, SILENT, UNKNOWN, encode_png_uri, flip_north_up
-from topomerge.viz.report import render_page, render_plan_view, render_scroller, render_section
+from topomerge.viz.report import render_page, render_plan_view, render_scroller, render_section, write_page
 from topomerge.viz.svg import Sheet
 from topomerge.viz.tables import (
     Markup,
@@ -46,9 +45,7 @@ def save_match_report(matching: Matching, a: TopometricMap, b: TopometricMap, pa
     Raises:
         InputError: the path can't be written.
     """
-    text = render_match_html(matching, a, b)
-    with replace_on_success(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", errors="replace", newline="\n")
+    write_page(render_match_html(matching, a, b), path)
 
 
 def render_match_html(matching: Matching, a: TopometricMap, b: TopometricMap) -> str:
@@ -203,9 +200,7 @@ def save_changes_report(changes: Changes, path: str | Path) -> None:
     Raises:
         InputError: the path can't be written.
     """
-    text = render_changes_html(changes)
-    with replace_on_success(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", errors="replace", newline="\n")
+    write_page(render_changes_html(changes), path)
 
 
 def render_changes_html(changes: Changes) -> str:

@@ -47,7 +47,15 @@ def save_report(map: TopometricMap, path: str | Path) -> None:
     Raises:
         InputError: the path can't be written.
     """
-    text = render_report_html(map)
+    write_page(render_report_html(map), path)
+
+
+def write_page(text: str, path: str | Path) -> None:
+    """Write a page whole or not at all, the same bytes on every system.
+
+    Raises:
+        InputError: the path can't be written.
+    """
     with replace_on_success(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="replace", newline="\n")
 
