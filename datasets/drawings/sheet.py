@@ -141,7 +141,7 @@ class Sheet:
     ) -> None:
         """Write a text about a place, in finer pixels."""
         height = max(int(height), 7)
-        letters = load_font(font, height)
+        letters = load_font(font, height, text)
         box = self.draw.textbbox(at, text, font=letters, anchor="mm")
         if box[0] < 2 or box[1] < 2 or box[2] > self.shape[1] - 2 or box[3] > self.shape[0] - 2:
             return
@@ -161,8 +161,22 @@ def _list_fonts() -> tuple[str, ...]:
     return tuple(str(folder / name) for name in plain if "Display" not in name)
 
 
-@cache
-def load_font(number: int, size: int) -> ImageFont.FreeTypeFont:
-    """Load a font of matplotlib."""
+def load_font(number: int, size: int, text: str = "") -> ImageFont.FreeTypeFont:
+    """Load a font of matplotlib that can write a text.
+
+    Args:
+        number: any; the fonts are counted round and round.
+        size: height of letters, px.
+        text: what is to be written; in DejaVu Sans if the font has ASCII only and the text has more.
+    """
     fonts = _list_fonts()
-    return ImageFont.truetype(fonts[number % len(fonts)], size)
+    path = fonts[number % len(fonts)]
+    # The tables of the fonts of TeX name "¿" where others have "²".
+    if not text.isascii() and Path(path).name.startswith("cm"):
+        path = next(p for p in fonts if Path(p).name == "DejaVuSans.ttf")
+    return _open_font(path, size)
+
+
+@cache
+def _open_font(path: str, size: int) -> ImageFont.FreeTypeFont:
+    return ImageFont.truetype(path, size)

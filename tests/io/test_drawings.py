@@ -242,6 +242,17 @@ def draw_case(path, labels=True):
     return path
 
 
+@pytest.mark.parametrize("text", ["12 m²", "Küche", "2 × 3"])
+def test_fonts_of_tex_do_not_write_what_they_lack(text):
+    # Their tables name "¿" where others have "²", and nothing at all for "ü".
+    plain = [load_font(number, 20, "12 m2").getname()[0] for number in range(19)]
+    fonts = [load_font(number, 20, text).getname()[0] for number in range(19)]
+    assert [name for name in plain if name.startswith("cm")] and not [name for name in fonts if name.startswith("cm")]
+    assert [a for a in plain if not a.startswith("cm")] == [
+        a for a, b in zip(fonts, plain, strict=True) if not b.startswith("cm")
+    ]
+
+
 @pytest.mark.parametrize("labels", [True, False])
 def test_a_drawn_plan_has_its_rooms_and_nothing_outside(tmp_path, labels):
     map = extract(read_points(draw_case(tmp_path / "plan.png", labels), resolution=0.02, text=False))

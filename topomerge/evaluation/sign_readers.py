@@ -73,7 +73,7 @@ def draw_sign(text: str, height: int, angle: float, rng: np.random.Generator) ->
         angle: radians by which the sign is turned away from the camera.
     """
     large = 4 * height  # drawn larger, then made smaller, as a lens does
-    font = load_font(int(rng.integers(1000)), round(large / 0.72))
+    font = load_font(int(rng.integers(1000)), round(large / 0.72), text)
     left, top, right, bottom = font.getbbox(text)
     w, h = int(right - left + 2 * large), int(bottom - top + 2 * large)
     wall, plate = int(rng.integers(120, 240)), int(rng.integers(170, 256))
