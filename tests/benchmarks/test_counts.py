@@ -22,7 +22,7 @@ from topomerge.extraction.plans.plan_network import LOOKS, PLAN_NETWORK_FILE
 from topomerge.io import piece, ply
 from topomerge.io.points import read_chunks
 from topomerge.io.rooms_ply import assign_room_colours
-from topomerge.kernels import voxels
+from topomerge.kernels import occupied_cells
 from topomerge.networks.network import Network
 from topomerge.types import PointCloud, VoxelGrid
 
@@ -88,13 +88,13 @@ def test_each_point_is_read_once(tmp_path: Path, read: Counter[str], monkeypatch
 def test_each_point_is_laid_into_cells_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cells of 10 cm are made of those of 5 cm that walls are looked at in."""
     laid: Counter[float] = Counter()
-    before = voxels._count_in_bricks
+    before = occupied_cells._count_in_bricks
 
     def note(points: np.ndarray, shift: np.ndarray, edge: float, *words: Any) -> Any:
         laid[edge] += len(points)
         return before(points, shift, edge, *words)
 
-    monkeypatch.setattr(voxels, "_count_in_bricks", note)
+    monkeypatch.setattr(occupied_cells, "_count_in_bricks", note)
     points = two_rooms().points().astype(np.float32)
     extract(PointCloud(part) for part in np.array_split(points, 3))
     assert laid == {0.05: len(points)}

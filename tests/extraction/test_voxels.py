@@ -15,8 +15,8 @@ from topomerge.extraction.cleaning import add_means, coarsen_until_dense, comput
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.slices import raise_slice
 from topomerge.extraction.voxels import LatticeCells, voxelise
-from topomerge.kernels import stencil
-from topomerge.kernels import voxels as kernel
+from topomerge.kernels import count_threads, set_thread_count, stencil
+from topomerge.kernels import occupied_cells as kernel
 from topomerge.types import PointCloud, VoxelGrid
 
 RNG = np.random.default_rng(5)
@@ -227,6 +227,25 @@ def test_table_and_sorting_agree(monkeypatch):
     order, other = np.lexsort((cells + base).T), np.lexsort((other_cells + other_base).T)
     assert ((cells + base)[order] == (other_cells + other_base)[other]).all()
     assert (counts[order] == other_counts[other]).all() and (sums[order] == other_sums[other]).all()
+
+
+def test_slabs_of_points_and_threads_count_what_numpy_counts():
+    points = np.random.default_rng(3).uniform(-9, 9, (kernel.SLAB + 50_000, 3)).astype(np.float32)
+    points[[5, -5]] = np.nan
+    edge = 1.0  # a few thousand cells, so that NumPy is done soon
+    lattice = np.floor(points[np.isfinite(points).all(axis=1)].astype(np.float64))
+    parts = np.floor((points[np.isfinite(points).all(axis=1)].astype(np.float64) - lattice) * kernel.OFFSET_STEPS).astype(
+        np.int64
+    )
+    cells, row, number = np.unique(lattice.astype(np.int64), axis=0, return_inverse=True, return_counts=True)
+    sums = np.column_stack([np.bincount(row.ravel(), parts[:, k], len(cells)) for k in range(3)])
+    before = count_threads()
+    for threads in (1, 2):
+        set_thread_count(threads)
+        base, found, counts, added = kernel.find_occupied_cells(points, np.zeros(3), edge)
+        order = np.lexsort((found + base).T[::-1])
+        assert ((found + base)[order] == cells).all() and (counts[order] == number).all() and (added[order] == sums).all()
+    set_thread_count(before)
 
 
 def test_dust_between_strays_joins_nothing():

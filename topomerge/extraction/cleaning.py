@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from topomerge.errors import InputError
 from topomerge.extraction.convolution import build_moore, convolve
-from topomerge.kernels.voxels import OFFSET_STEPS
+from topomerge.kernels.occupied_cells import OFFSET_STEPS
 from topomerge.types import Array, VoxelGrid
 
 # Where the points of a cell lie on average: surfaces are known better by it than by the cell alone.

@@ -12,7 +12,7 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.extraction.cleaning import compute_box_volume, select_largest_place, select_without_strays
 from topomerge.kernels import count_threads, voxels
-from topomerge.kernels import voxels as kernel
+from topomerge.kernels import occupied_cells as kernel
 from topomerge.types import Array, PointCloud, VoxelGrid
 
 # Lattice cells of a cloud that comes in chunks: 40 bytes a cell, and at most two and a half times that while runs are united.
@@ -23,7 +23,7 @@ BLOCK = 1_000_000  # cells that are looked at together
 ORIGIN_POINTS = 10_000  # about the middle of which cells are numbered
 _Cells = tuple[
     Array, Array, Array
-]  # cells (n, 3) or their codes (n,), counts (n,), sums (n, 3): `kernels.voxelise.find_occupied_cells`
+]  # cells (n, 3) or their codes (n,), counts (n,), sums (n, 3): `kernels.occupied_cells.find_occupied_cells`
 
 
 class LatticeCells:

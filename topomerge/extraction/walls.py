@@ -23,7 +23,7 @@ from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, PLACES,
 from topomerge.extraction.plans.storey_floor import WALL_REACH, find_cells_of_storey
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.segment import RasterisedStoreys, SegmentedStorey, find_segments
-from topomerge.kernels.voxels import OFFSET_STEPS
+from topomerge.kernels.occupied_cells import OFFSET_STEPS
 from topomerge.structure.floors import FACE_HEIGHTS, FULL_COLUMN, LEAST_CELLS
 from topomerge.structure.lines import detect_lines, estimate_main_direction
 from topomerge.types import Array, VoxelGrid

@@ -43,7 +43,7 @@ from topomerge.fusion.transfer import (
     vote_rooms,
 )
 from topomerge.kernels import run_side_by_side
-from topomerge.kernels.voxels import OFFSET_STEPS
+from topomerge.kernels.occupied_cells import OFFSET_STEPS
 from topomerge.matching.consistency import find_matches
 from topomerge.matching.room_plans import build_room_plans
 from topomerge.registration.storeys import is_extruded

@@ -23,7 +23,7 @@ from typing import Any
 import llvmlite.binding
 import numba
 
-MODULES = ("bend", "graphs", "images", "rasters", "rays", "registration", "stencil", "voxels")
+MODULES = ("bend", "graphs", "images", "occupied_cells", "rasters", "rays", "registration", "stencil", "voxels")
 SWITCH = "TOPOMERGE_COMPILE_AHEAD"  # environment variable: 0 compiles nothing ahead
 NOTE = "ahead"
 AHEAD: dict[Any, tuple[str, ...]] = {}  # loops, each with the types of its arguments

@@ -15,7 +15,7 @@ import numpy as np
 import shapely
 from scipy import ndimage
 
-from topomerge.kernels.voxels import OFFSET_STEPS
+from topomerge.kernels.occupied_cells import OFFSET_STEPS
 from topomerge.types import Array, TopometricMap
 
 CLOSED_GAP = 0.1  # m: gaps in a floor up to twice this are closed: scan lines
