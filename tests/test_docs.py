@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-import importlib
+import importlib.util
 import os
 import re
 import shutil
@@ -182,15 +182,23 @@ def test_everything_that_the_page_of_python_names_is_there() -> None:
             pytest.fail(f"docs/api.md: {name}: {error}")
 
 
-@pytest.mark.parametrize("page", ["method.md", "extend.md", "api.md", "evaluation.md", "glossary.md"])
-def test_every_file_that_a_page_names_is_there(page: str) -> None:
-    """Also with the name of what stands in it: `file.py:name`; and ``X` of `file.py``."""
-    text = (ROOT / "docs" / page).read_text()
-    new = set(re.findall(NEW, text))
-    for path in re.findall(r"`((?:topomerge|models|datasets|configs|tests|benchmarks|docs)/[\w./-]*)", text):
-        assert path in new or (ROOT / path).exists(), f"docs/{page}: {path} is not there"
-    for name, path in re.findall(r"in `(\w+)`\s+of\s+`([\w/]+\.py)`", text):
-        assert hasattr(importlib.import_module(source_name(path)), name), f"docs/{page}: {path} has no {name}"
+def test_every_file_that_a_page_names_is_there() -> None:
+    """Also with the name of what stands in it, `file.py:name` and ``X` of `file.py``; and modules that ``python -m`` starts.
+    Records of decisions may name what went."""
+    new = set(re.findall(NEW, (ROOT / "docs" / "extend.md").read_text()))
+    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")):
+        text, where = page.read_text(encoding="utf-8"), page.relative_to(ROOT)
+        for module in re.findall(r"python -m ((?:topomerge|benchmarks)[\w.]*)", text):
+            assert importlib.util.find_spec(module.rstrip(".")), f"{where}: {module} is not there"
+        if page.parent.name == "adr":
+            continue
+        for path, name in re.findall(
+            r"`((?:topomerge|models|datasets|configs|tests|benchmarks|docs|ros)/[\w./-]*)(?::([\w.]+))?`", text
+        ):
+            assert path in new or (ROOT / path).exists(), f"{where}: {path} is not there"
+            assert not name or name in named_in(ROOT / path), f"{where}: {path} has no {name}"
+        for name, path in re.findall(r"in `(\w+)`\s+of\s+`([\w/]+\.py)`", text):
+            assert hasattr(importlib.import_module(source_name(path)), name), f"{where}: {path} has no {name}"
 
 
 def source_name(path: str) -> str:
@@ -200,35 +208,32 @@ def source_name(path: str) -> str:
 
 
 @pytest.mark.longer
-def test_yaml_of_extend_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the page adds can be named in a training, from a folder of one's own."""
+def test_the_files_of_extend_work_as_they_stand(tmp_path: Path) -> None:
+    """Each file that the page adds is imported by itself, its YAML is taken, and its task trains, from a folder of one's own."""
     pytest.importorskip("hydra")
     text = (ROOT / "docs" / "extend.md").read_text()
     added = re.findall(r"\*\*One YAML\*\*, `configs/(\w+)/(\w+)\.yaml`.*?```yaml\n(.*?)```", text, re.DOTALL)
     assert len(added) == text.count("```yaml") == 7
-    code = [
-        re.findall(r"```python\n(.*?)```", text[text.index(head) :], re.DOTALL)[0] for head in ("### A task", "### A dataset")
-    ]
-    classes = code[0].partition("TASKS.register")[0].partition("class AreaJob")[0]
-    (tmp_path / "page.py").write_text(
-        "from torch import nn\nimport torch\nfrom topomerge.registry import *\n"
-        "NODES.register('transformer')(nn.Linear)\nLOSSES.register('alignment')(print)\nPOINTS.register('extent')(nn.Linear)\n"
-        "OPTIMIZERS.register('nadam')(torch.optim.NAdam)\nSCHEDULES.register('halved')(max)\nLOGGERS.register('lines')(print)\n"
-        f"{classes}\nTASKS.register('area')(Task(Area, print, ('error',)))\n{code[1]}"
-    )
     for group, name, block in added:
         (tmp_path / "configs" / group).mkdir(parents=True, exist_ok=True)
         (tmp_path / "configs" / group / f"{name}.yaml").write_text(block)
+    files = re.findall(r"\*\*One file\*\*, `(?:\w+/)*(\w+)\.py`.*?```python\n(.*?)```", text, re.DOTALL)
+    for name, block in files:
+        (tmp_path / f"{name}.py").write_text(block)
+    plugins = ["extent", "transformer", "alignment", "descent", "lines", "area", "twins"]
+    assert sorted(name for name, _ in files) == sorted([*plugins, "outline", "mine"])
     script = (
-        "import sys; from topomerge.training.tasks import compose_settings as c; from topomerge.training.settings import check\n"
-        "s = c(['plugins=[page]', 'geometry=extent', 'node=transformer', 'loss=alignment',"
+        "import importlib; from topomerge.training.tasks import compose_settings as c, train\n"
+        "from topomerge.training.settings import check\n"
+        f"for name in {[name for name, _ in files]}: importlib.import_module(name)\n"
+        f"s = c(['plugins=[{','.join(plugins)}]', 'geometry=extent', 'node=transformer', 'loss=alignment',"
         " 'experiment=descent', 'data=twins', 'path=.']); check(s)\n"
         "print(s.network.geometry.parts, s.network.node.kind, s.loss.options, s.optimizer, s.schedule, s.data)\n"
-        "print(c(['plugins=[page]', 'experiment=told']).logger)\n"
-        "print(c(['plugins=[page]', 'task=area']).watch)"
+        "train(c(['plugins=[area,lines]', 'task=area', 'experiment=told', 'epochs=1']), print)"
     )
     done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300)
-    assert done.stdout == "['extent'] transformer {'spread': 0.5} nadam halved twins\n['lines']\nerror\n", done.stderr
+    assert done.stdout.startswith("['extent'] transformer {'spread': 0.5} nadam halved twins\nepoch 1/1 "), done.stderr
+    assert " rectangles/s" in done.stdout and (tmp_path / "runs" / "area" / "lines.txt").is_file()
 
 
 def test_every_formula_has_its_function() -> None:

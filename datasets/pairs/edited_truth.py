@@ -79,7 +79,7 @@ def build_edited_truth(path: str | Path, output: str | Path) -> EditedTruth:
             save_map_truth(done.map, out / f"{names[file]}{TRUTH_SUFFIX}")
         pairs, captures = _collect_pairs(decisions, edited, names, out)
         if any(pair.pose is not None for pair in pairs):
-            listing = PairsFile(out / PAIRS_FILE, captures, (), Split())
+            listing = PairsFile(out / PAIRS_FILE, str(out / PAIRS_FILE), captures, (), Split())
             write_pairs_file(
                 listing, {name: load_map_with_landmarks(c.path) for name, c in captures.items()}, pairs, out / PAIRS_FILE
             )

@@ -121,7 +121,7 @@ def list_captures(path: str | Path) -> PairsFile:
     stems = [file.stem for file in files]
     names = [file.name if stems.count(file.stem) > 1 else file.stem for file in files]
     captures = {name: Capture(name, file, "") for name, file in zip(names, files, strict=True)}
-    return PairsFile(place / PAIRS_FILE, captures, (), Split())
+    return PairsFile(place / PAIRS_FILE, str(place / PAIRS_FILE), captures, (), Split())
 
 
 def try_pairs(maps: Mapping[str, TopometricMap], scale: str, log_line: LogFn) -> list[TriedPair]:

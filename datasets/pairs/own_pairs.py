@@ -143,7 +143,7 @@ def build_own_sets(
     listing = read_pairs_file(path, data)
     items, faults = extract_captures(listing, cache, jobs, log_line)
     if faults:
-        raise InputError(f"{listing.path}: {next(iter(faults.values()))}")
+        raise InputError(f"{listing.where}: {next(iter(faults.values()))}")
     parts, warnings = split_pairs(listing)
     own = Path(cache).resolve() / OWN_FOLDER
     tasks = {
@@ -158,7 +158,7 @@ def build_own_sets(
             build_set(manifests[part], of, make_pair_file, OwnSharing(str(cache), jobs), log_line)
         _check_part(part, of, manifests[part], listing)
     for text in warnings:
-        log_line(f"{listing.path}: {text}")
+        log_line(f"{listing.where}: {text}")
     return OwnSets(manifests, warnings)
 
 
@@ -254,7 +254,7 @@ def split_pairs(listing: PairsFile) -> tuple[dict[str, list[PairTruth]], tuple[s
     if len(buildings) == 1:
         only = f"all pairs are of building {buildings[0]!r}"
         if listing.split.part:
-            raise InputError(f"{listing.path}: split: {only}; give shares, which hold out captures")
+            raise InputError(f"{listing.where}: split: {only}; give shares, which hold out captures")
         of = _captures_held_out(listing, pairs)
         warnings.append(f"{only}: captures are held out, and nothing is said of other buildings")
     else:
@@ -300,8 +300,10 @@ def _captures_held_out(listing: PairsFile, pairs: Sequence[PairTruth]) -> dict[s
         found = {max((drawn[pair.a], drawn[pair.b]), key=PARTS.index) for pair in pairs}
         if found >= set(drawn.values()) | {"train"}:
             return {name: drawn.get(name, "train") for name in listing.captures}
-    text = f"of its {len(names)} captures, all of one building, none can be held out"
-    raise InputError(f"{listing.path}: {text}; add captures of it, or of another building")
+    text = f"of its {len(names)} captures, all of one building, none can be held out (topomerge dataset check shows them)"
+    raise InputError(
+        f"{listing.where}: {text}; add captures of it, or of another building; topomerge dataset check shows each pair"
+    )
 
 
 def _negatives(
@@ -318,6 +320,8 @@ def _negatives(
         and part_of(a.name, b.name) == part
         and frozenset((a.name, b.name)) not in listed
     ]
+    # A part of one building has no others of its own to tell it from: then they are of an earlier part.
+    choices = [(a, b) for a, b in choices if part_of(a, a) == part_of(b, b)] or choices
     number = min(int(np.ceil(listing.negatives * len(positives))), len(choices))
     order = np.random.default_rng([listing.split.seed, PARTS.index(part)]).permutation(len(choices))[:number]
     return [PairTruth(a, b, different=True, listed=False) for a, b in (choices[k] for k in sorted(order.tolist()))]
@@ -391,15 +395,19 @@ def build_truth_arrays(
 
 def _check_part(part: str, tasks: Sequence[tuple[OwnPairItem, Any, str]], manifest: Path, listing: PairsFile) -> None:
     """Raise InputError for a listed pair that could not be made, or a part in which no rooms match."""
+    reasons: list[str] = []
     for item, (pair, _), folder in tasks:
-        reason = (
-            "" if (Path(folder) / f"{item.name}.npz").exists() else read_refusal(Path(folder), item.name) or "could not be made"
-        )
-        if reason and (pair.listed or NO_OVERLAP not in reason):
-            raise InputError(f"{listing.path}: {reason}")
+        if (Path(folder) / f"{item.name}.npz").exists():
+            continue
+        reasons.append(read_refusal(Path(folder), item.name) or f"{pair.a} and {pair.b}: could not be made")
+        if pair.listed or NO_OVERLAP not in reasons[-1]:
+            raise InputError(f"{listing.where}: {reasons[-1]}")
     rows = [json.loads(line) for line in manifest.read_text(encoding="utf-8").splitlines()]
     if not any(sum(row["partners"]) for row in rows):
-        raise InputError(f"{listing.path}: no rooms match in the pairs of {part}; see topomerge dataset check, or change split")
+        why = f" ({reasons[0]})" if reasons else ""
+        raise InputError(
+            f"{listing.where}: no rooms match in the pairs of {part}{why}; see topomerge dataset check, or change split"
+        )
 
 
 def check_folder(

@@ -93,9 +93,14 @@ class Split:
 
 @dataclass(frozen=True)
 class PairsFile:
-    """What a `pairs.yaml` says."""
+    """What a `pairs.yaml` says.
+
+    Args:
+        path: of the file; where: what messages call it: a data set of one's own has no such file.
+    """
 
     path: Path
+    where: str
     captures: Mapping[str, Capture]
     pairs: tuple[PairTruth, ...]
     split: Split
@@ -152,7 +157,7 @@ def read_pairs_file(path: str | Path, data: str = OWN_DATA, paired: bool = True)
     negatives = _number(given.get("negatives", 0.25), f"{where}: negatives", 0.0, 10.0)
     voxel_size = _number(given.get("voxel_size", 0.1), f"{where}: voxel_size", 0.02, 1.0)
     split = _split(given.get("split", {}), f"{where}: split", {c.building for c in captures.values()})
-    return PairsFile(file, captures, pairs, split, negatives, voxel_size)
+    return PairsFile(file, where, captures, pairs, split, negatives, voxel_size)
 
 
 def read_transform(value: Any, where: str) -> Array:

@@ -265,7 +265,7 @@ def shipped(folder: Path) -> Path:
     ("change", "message"),
     [
         (lambda t: t.update(format=99), "has format 99"),
-        (lambda t: t.update({"class": "os.system"}), "is of class 'os.system'"),
+        (lambda t: t.update({"class": "os.system"}), r"is no embedder \('os.system', not"),
         (lambda t: t.pop("network"), "lacks network"),
         (lambda t: t.pop("sha256"), "lacks network, sha256"),
         (lambda t: t.update(about=3), "lacks network, sha256, about"),

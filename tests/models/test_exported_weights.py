@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from topomerge.training.drawing_segmentation import compute_dice_loss
 from topomerge.training.loop import Exported
 from topomerge.training.scan_settings import DrawingSegmentation
 from topomerge.training.starts import start_from_exported
+from topomerge.training.tasks import find_start, train
 
 WIDTHS = [2, 2]  # an export of all levels takes seconds
 
@@ -78,16 +80,25 @@ class Job:
 def test_a_training_starts_from_a_file_and_tells_which(exported: Path) -> None:
     first, job = build(1), Job(build(2), {"set": "drawings"})
     settings = DrawingSegmentation(init_from=str(exported))
-    start_from_exported(job, settings, "drawing_network.onnx")
+    start_from_exported(job, settings)
     assert all(torch.equal(a, b) for a, b in zip(first.parameters(), job.network.parameters(), strict=True))
     assert job.origin["set"] == "drawings" and len(job.origin["init_from"]) == 64
     with pytest.raises(InputError, match="init_from is for networks that are exported"):
-        start_from_exported(object(), settings, "drawing_network.onnx")
+        start_from_exported(object(), settings)
+
+
+def test_a_run_is_a_start_and_what_is_none_is_told_before_data_is_made(exported: Path, tmp_path: Path) -> None:
+    (tmp_path / "run" / "best").mkdir(parents=True)
+    shutil.copy(exported, tmp_path / "run" / "best" / "drawing_network.onnx")
+    assert find_start("drawing_segmentation", str(tmp_path / "run")) == tmp_path / "run" / "best" / "drawing_network.onnx"
+    settings = DrawingSegmentation(init_from=str(tmp_path), runs=str(tmp_path))
+    with pytest.raises(InputError, match=r"^init_from=.*: holds no drawing_network.onnx; name a run of task=drawing_segm"):
+        train(settings, print)
 
 
 def test_the_network_that_ships_is_a_start() -> None:
     job = Job(build(1, DrawingSegmentation().widths), {})
-    start_from_exported(job, DrawingSegmentation(init_from="pretrained"), "drawing_network.onnx")
+    start_from_exported(job, DrawingSegmentation(init_from="pretrained"))
     picture = np.random.default_rng(0).random((1, 3, 64, 96), np.float32)
     (expected,) = load_drawing_network()(picture=picture)
     np.testing.assert_allclose(job.network(torch.tensor(picture)).detach().numpy(), expected, atol=1e-4)

@@ -141,7 +141,8 @@ def check_settings(path: Path, values: Mapping[str, Any], format_number: int) ->
         InputError: of another format or class, incomplete, or trained on other features.
     """
     if values.get("class") != EMBEDDER_CLASS:
-        raise InputError(f"{path}: is of class {str(values.get('class'))[:60]!r}, not {EMBEDDER_CLASS}")
+        of = str(values.get("class") or values.get("task"))[:60]
+        raise InputError(f"{path}: is no embedder ({of!r}, not {EMBEDDER_CLASS}); give a run of task=embedding, or {PRETRAINED}")
     if values.get("format") != format_number:
         raise InputError(
             f"{path}: has format {str(values.get('format'))[:20]}, this version reads {format_number}; export it with the "
@@ -321,7 +322,7 @@ def build_embedder(name: str | Descriptor = DEFAULT, k: int = 0, context: str = 
     """Return a callable map -> (R, D) float64.
 
     Args:
-        name: ``"learned"``, ``"engineered"``, ``"shapedna"``, ``"feather"``, the folder of a trained one, or a descriptor.
+        name: ``"learned"``, ``"engineered"``, ``"shapedna"``, ``"feather"``, the run or file of a trained one, or a descriptor.
         k: steps of context (see `add_context`).
         context: ``"join"`` or ``"mean"``.
         options: those of the function of that name.
@@ -333,10 +334,10 @@ def build_embedder(name: str | Descriptor = DEFAULT, k: int = 0, context: str = 
         if options:
             raise InputError(f"options {', '.join(options)} are for embedders that are named, not for a callable")
         return add_context(name, k, context)
-    if name and name not in EMBEDDERS and Path(name).is_dir():
+    if name and name not in EMBEDDERS and (Path(name).is_dir() or Path(name).suffix == Path(EMBEDDER_FILE).suffix):
         return build_embedder("learned", k, context, path=name, **options)
     if name not in EMBEDDERS:
-        raise InputError(f"unknown descriptor {name!r}: {', '.join(EMBEDDERS)} or the folder of a trained one are possible")
+        raise InputError(f"unknown descriptor {name!r}: {', '.join(EMBEDDERS)} or the run or file of a trained one are possible")
     make = EMBEDDERS[name]
     unknown = set(options) - set(inspect.signature(make).parameters)
     if unknown:

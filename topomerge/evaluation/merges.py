@@ -189,7 +189,7 @@ def find_own(name: str, settings: TaskSettings, log_line: LogFn) -> Items:
     listing = read_pairs_file(getattr(settings, "path", ""))
     captures, faults = extract_captures(listing, settings.cache, settings.jobs, log_line)
     if faults:
-        raise InputError(f"{listing.path}: {next(iter(faults.values()))}")
+        raise InputError(f"{listing.where}: {next(iter(faults.values()))}")
     listed = {frozenset((pair.a, pair.b)) for pair in listing.pairs}
     apart = [
         PairTruth(a.name, b.name, different=True, listed=False)

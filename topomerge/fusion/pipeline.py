@@ -203,7 +203,7 @@ def merge(
         threshold: probability from which a merge is believed; that of the calibration if None;
         `fusion.inputs.find_risk_threshold`
             gives that of a stated risk.
-        embedder: "learned" (default), "engineered", "shapedna", "feather", the folder of a trained one, or a callable
+        embedder: "learned" (default), "engineered", "shapedna", "feather", the run or file of a trained one, or a callable
             map -> (R, D), for the matching of rooms.
         poses: "search": of walls and, where the best one is not believed, of matched rooms (default); "rooms": of matched rooms
             alone; "surfaces": of each matched pair of rooms by its surfaces, as the thesis does (with `embedder="shapedna"` its

@@ -107,7 +107,7 @@ def match(
     """Return rooms of a that are rooms of b.
 
     Args:
-        embedder: ``"learned"``, ``"engineered"``, ``"shapedna"``, ``"feather"``, the folder of a trained one, or a callable
+        embedder: ``"learned"``, ``"engineered"``, ``"shapedna"``, ``"feather"``, the run or file of a trained one, or a callable
             map -> (R, D).
         method: ``"consistent"``: sets of matches that one transform explains, by walls and floor; ``"attention"``: what rooms
             look like and how they lie to each other, by a network (`room_matcher`, with the embedder that ships);

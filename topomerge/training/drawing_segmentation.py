@@ -107,6 +107,8 @@ def draw_pages(shapes: Sequence[DrawingShapes], settings: DrawingSegmentation, s
 class DrawingJob(ExportedJob):
     """Batches of the latest pages; in each step some are drawn anew and as many of the oldest go."""
 
+    unit = "pages"
+
     def __init__(self, settings: DrawingSegmentation, stream: PageStream, watched: Sequence[Page]) -> None:
         origin = {"set": settings.data.name, "split": settings.data.split, "plans": len(stream.shapes), "watched": len(watched)}
         network = DrawingUNet(settings.widths).to(memory_format=torch.channels_last)  # type: ignore[call-overload]

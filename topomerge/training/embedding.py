@@ -147,6 +147,8 @@ class EmbeddingJob:
         pairs: to train on, to watch, and, where `replay` is set, to draw from besides.
     """
 
+    unit = "rooms"
+
     def __init__(
         self, settings: Training, fabric: Any, network: Embedder, optimizer: Any, pairs: tuple[Sequence[GraphPair], ...]
     ) -> None:

@@ -269,6 +269,7 @@ class StepTracer:
         if self.done == self.first:
             kinds = torch.profiler.ProfilerActivity
             activities = [kinds.CPU, *([kinds.CUDA] if torch.cuda.is_available() else [])]
+            os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # it prints errors where there is no card
             self.profiler = torch.profiler.profile(activities=activities)
             self.profiler.start()
         elif self.done == self.first + TRACED_STEPS:

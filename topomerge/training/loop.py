@@ -90,7 +90,13 @@ class Schedule:
 
 
 class Job(Protocol):
-    """What a task does in the loop."""
+    """What a task does in the loop.
+
+    Args:
+        unit: name of what `count_items` counts.
+    """
+
+    unit: str
 
     @property
     def network(self) -> torch.nn.Module:
@@ -182,7 +188,7 @@ class Loop:
             left = clock.format_time_left(self.state.epoch)
             self.log_line(
                 f"epoch {self.state.epoch}/{settings.epochs} loss {row['train/loss']:.3f} {self.job.format_scores(row)}"
-                f"{' *' if better else ''} {row['rooms_per_second']:.0f} rooms/s, {left} left"
+                f"{' *' if better else ''} {row['rooms_per_second']:.0f} {self.job.unit}/s, {left} left"
             )
             if self.log is not None and (report := REPORT.get()) is not None:
                 report(row)
@@ -375,6 +381,8 @@ class Exported(NamedTuple):
 class NetworkJob(ABC):
     """A job of a task; the task adds batches, steps, scores and what is exported. Processes beside it make other batches."""
 
+    unit = "examples"
+
     def __init__(self, settings: NetworkTask, network: torch.nn.Module, origin: Mapping[str, Any]) -> None:
         check_accelerator(settings)
         self.fabric = start_fabric(settings)
@@ -483,7 +491,7 @@ def run_network(job: Job, settings: NetworkTask, steps: int, log_line: LogFn) ->
     state, chief = State(), get_rank() == 0
     task = TASKS[settings.task]
     if settings.init_from and not settings.resume:
-        start_from_exported(job, settings, task.file)
+        start_from_exported(job, settings)
     if settings.resume:
         state = State(**load_state(settings.folder / "last", job.network, job.get_optimizer(), NETWORK_FILE))
     if chief:

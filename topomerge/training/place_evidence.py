@@ -114,6 +114,8 @@ def select_places(places: Places, pick: Array) -> Places:
 class PlaceJob(ExportedJob):
     """Squares, right ones and wrong ones alike."""
 
+    unit = "squares"
+
     def __init__(self, settings: PlaceEvidence, learned: Places, watched: Places) -> None:
         origin = {"set": settings.data.name, "split": settings.data.split, "places": len(learned.right)}
         origin |= {"right": int(learned.right.sum()), "watched": len(watched.right)}

@@ -158,6 +158,8 @@ def fit(settings: PlanSegmentation, log_line: LogFn) -> dict[str, float]:
 class PlanJob(ExportedJob):
     """Crops of plans, larger plans more often."""
 
+    unit = "crops"
+
     def __init__(self, settings: PlanSegmentation, learned: Sequence[PlanExample], watched: Sequence[PlanExample]) -> None:
         origin = {"set": settings.data.name, "split": settings.data.split, "plans": len(learned), "watched": len(watched)}
         super().__init__(settings, PlanUNet(settings.widths), origin)

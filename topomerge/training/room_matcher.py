@@ -123,6 +123,8 @@ class MatcherJob(ExportedJob):
         embedder: hash of the embedder.
     """
 
+    unit = "rooms"
+
     def __init__(
         self, settings: RoomMatching, learned: Sequence[MatcherExample], watched: Sequence[MatcherExample], embedder: str
     ) -> None:

@@ -178,7 +178,7 @@ class NetworkTask(TaskSettings, NetworkSettings):
 
     Args:
         hold_out: the scans of every n-th physical building are watched and train nothing.
-        init_from: `pretrained`, or a file of exported weights, from which the whole network starts; empty: from random numbers.
+        init_from: `pretrained`, a run or a file, whose weights the whole network starts from; empty: from random numbers.
     """
 
     hold_out: int = 8

@@ -159,6 +159,8 @@ def check_start(settings: Any) -> None:
     if settings.watch not in possible:
         raise InputError(f"watch: unknown {settings.watch!r}; {', '.join(possible)} are possible for task={settings.task}")
     check_accelerator(settings)
+    if getattr(settings, "init_from", "") and not TASKS[settings.task].is_descriptor:
+        find_start(settings.task, settings.init_from)
     if names := [name for name in settings.logger if name != NO_LOGGER]:
         from topomerge.training.instruments import check_installed
 
@@ -193,10 +195,28 @@ def find_weights(task: str, run: str) -> Path:
     name = TASKS[task].file
     if not run:
         return find_weights_file(TASKS[task].package, name)
+    return _find_in_run(task, run, "run")
+
+
+def find_start(task: str, start: str) -> Path:
+    """Find the file of weights that a training starts from: `pretrained`, a run, a folder or a file.
+
+    Raises:
+        InputError: there is none.
+    """
+    from topomerge.embedding.learned import PRETRAINED  # here: wrong words are told before the networks are imported
+
+    if start == PRETRAINED and not Path(start).exists():
+        return find_weights_file(TASKS[task].package, TASKS[task].file)
+    return _find_in_run(task, start, "init_from")
+
+
+def _find_in_run(task: str, run: str, key: str) -> Path:
+    name = TASKS[task].file
     places = (Path(run), Path(run) / "best" / name, Path(run) / name)
     path = next((path for path in places if path.is_file()), None)
     if path is None:
-        raise InputError(f"run={run}: holds no {name}; name a run of task={task}, or what it exported")
+        raise InputError(f"{key}={run}: holds no {name}; name a run of task={task}, or what it exported")
     return path
 
 

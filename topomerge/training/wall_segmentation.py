@@ -77,6 +77,8 @@ def split_train_val(
 class WallJob(ExportedJob):
     """Stretches of walls, most of them about a door or a window."""
 
+    unit = "stretches"
+
     def __init__(self, settings: WallSegmentation, learned: Sequence[WallExample], watched: Sequence[WallExample]) -> None:
         origin = {"set": settings.data.name, "split": settings.data.split, "scans": len(learned), "watched": len(watched)}
         super().__init__(settings, WallNetwork(settings.widths), origin)

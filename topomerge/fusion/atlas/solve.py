@@ -91,7 +91,7 @@ def build_atlas(
         maps: topometric maps or `.tmap` files, two or more; of files only a few are in memory at once.
         scale: "fixed", or "free" where the scales of the maps differ in unknown ways.
         threshold: probability from which a link is believed; if None 0.8, of more than eleven maps 0.9: a wrong one does harm.
-        embedder: "learned", "engineered", "shapedna", "feather", the folder of a trained one, or a callable map -> (R, D):
+        embedder: "learned", "engineered", "shapedna", "feather", the run or file of a trained one, or a callable map -> (R, D):
             matched rooms propose poses, too. None: the learned descriptors only say which pairs to try first.
         rigid: leave the maps as they are? Else all that belong together are bent together, each by as much as its sensor drifts.
         same: "nothing", "building" or "storey": all maps are known to be of one.
