@@ -368,7 +368,7 @@ def export_embedder(network: Embedder, folder: str | Path, about: Mapping[str, A
 
 
 def run_with_torch(module: nn.Module, signature: Signature) -> Run:
-    """A network as `topomerge.networks.Network` would run it: what training is scored with, before anything is exported."""
+    """Run a network as `topomerge.networks.network.Network` would: training is scored with it before anything is exported."""
 
     @torch.no_grad()
     def run(outputs: Sequence[str] | None = None, /, **inputs: Array) -> list[Array]:

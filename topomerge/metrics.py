@@ -1,7 +1,7 @@
 """How well the rooms, doors and storeys of a map agree with the truth, or with another map.
 
 Everything here works on label arrays: one integer per place (cell or column of the floor), 0 and above for a room, -1 for
-none. `datasets.judge` makes such arrays from maps and from what is true about a scan.
+none. `datasets.simulation.floor_truth` makes such arrays from maps and from what is true about a scan.
 """
 
 from __future__ import annotations

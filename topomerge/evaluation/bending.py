@@ -38,7 +38,7 @@ ROOM_LIMITS = (0.1, 1.0)  # m, degrees
 
 
 class Bending(Protocol):
-    """What moves the points of a map (`fusion.bend.deformation.Deformation`)."""
+    """What moves the points of a map (`types.placement.Deformation`)."""
 
     def apply(self, points: Array) -> Array: ...
 

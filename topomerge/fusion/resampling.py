@@ -75,8 +75,9 @@ def _find_filled_cells(grid: VoxelGrid, chosen: slice, placement: Placement, ori
 
 
 def _linearise(bend: Deformation | None, cells: Array, places: Array, grid: VoxelGrid) -> tuple[Array, Array]:
-    """Where bending moves the middles (n, 3) of cells (n, 3) of a grid, and the bending about them as `kernels.resample` wants
-    it: (n, 8), or (0, 8) where nothing is bent. Of one storey it is the same for all cells of a column, and computed once."""
+    """Return where bending moves the middles (n, 3) of cells (n, 3) of a grid, and the bending about them as
+    `kernels.voxels.find_filled_cells` takes it: (n, 8), or (0, 8) where nothing is bent. Of one storey it is the same for all
+    cells of a column, and computed once."""
     if bend is None:
         return places, np.zeros((0, 8))
     if len(bend.fields) > 1:
@@ -199,7 +200,7 @@ def find_wall_copies(first: Seen, second: Seen, edge: float) -> Array:
 
 
 def _build_table(cells: Array, size: Array) -> tuple[Array, Array]:
-    """`kernels.lookup` of those cells that lie in a volume of so many cells."""
+    """Build the look-up (`kernels.voxels.build`) of those cells that lie in a volume of so many cells."""
     inside = ((cells >= 0) & (cells < size)).all(axis=1)
     x, y, z = size.tolist()
     return build(np.ascontiguousarray(cells[inside]), (x, y, z))

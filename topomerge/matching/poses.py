@@ -23,8 +23,8 @@ class PoseHypothesis:
 
     Args:
         transform: T_ab.
-        score: what the last step ranks hypotheses by: the agreement of walls in `fusion.search`, m of walls in
-            `matching.consistency`, log odds that it is right, seen by itself, after `fusion.verify.rank`.
+        score: what the last step ranks hypotheses by: the agreement of walls in `registration.search`, m of walls in
+            `matching.consistency`, log odds that it is right, seen by itself, after `registration.verify.rank`.
         probability: that it is right, beside all others; with "none of them" these sum to 1.
         features: what it was judged by, name -> number.
         from_rooms: was it proposed by matched rooms? Correlation never pushes such a one out.

@@ -244,7 +244,7 @@ def build_signature(numbers: int, width: int, stages: int) -> Signature:
 
 
 def load_matcher_weights() -> Matcher:
-    """Load the network that ships, or the one in its place (`io.weight_files`)."""
+    """Load the network that ships, or the one in its place (`archive.find_weights_file`)."""
     return read_matcher(find_weights_file(WEIGHTS_PACKAGE, MATCHER_FILE))
 
 

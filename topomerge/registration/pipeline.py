@@ -169,7 +169,7 @@ class Registration:
         reason: in words.
         seconds: step -> s.
         bend: how the maps are bent onto each other under the transform; None where a rigid pose was asked for.
-        posterior: probability of this place and of each named alternative (`fusion.posterior`); they sum to 1.
+        posterior: probability of this place and of each named alternative (`registration.posterior`); they sum to 1.
         places: what both maps show of each place that they share under it, and how much that speaks for it.
         landmarks: what signs, tags and the like say of it.
         walls: the probability without landmarks.

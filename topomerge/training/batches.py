@@ -157,8 +157,8 @@ def compute_relative_positions(graph: Graph, names: Sequence[str]) -> Graph:
 
 
 def augment_sheet(graph: Graph, augment: Augment, generator: torch.Generator) -> Graph:
-    """A map whose storeys were seen by another sensor on another walk (`training.other_sensors`); middles of rooms, and doors,
-    lie elsewhere."""
+    """Return a map as another sensor saw its storeys on another walk (`simulate_partial_walk`, `simulate_slice`); middles of
+    rooms, and doors, lie elsewhere."""
     rng = np.random.default_rng(int(torch.randint(1 << 40, (), generator=generator)))
     planes, room, anchor, doors = (graph[name].numpy() for name in ("sheet", "sheet_room", "anchor", "door_anchor"))
     if rng.random() < augment.walks:

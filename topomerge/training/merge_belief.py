@@ -285,7 +285,7 @@ def find_best_hypothesis(
 
 
 def _find_distinct_poses(poses: Array, middle: Array) -> list[int]:
-    """Which of ranked poses (n, 4, 4) end in no better one's place (as `fusion.candidates`)."""
+    """Which of ranked poses (n, 4, 4) end in no better one's place (as `matching.poses.select_distinct_hypotheses`)."""
     hypotheses = [PoseHypothesis(convert_to_sim3(pose)) for pose in poses]  # type: ignore[arg-type]
     single = {id(h) for h in select_distinct_hypotheses(hypotheses, middle, BASIN)}
     return [k for k, h in enumerate(hypotheses) if id(h) in single]

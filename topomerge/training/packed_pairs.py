@@ -87,13 +87,13 @@ def load_pairs(
     limit: int = 0,
     around: float = 0.0,
 ) -> list[GraphPair]:
-    """Load the pairs of a manifest (`datasets.build`), from the packed file, which is made if there is none.
+    """Load the pairs of a manifest (`datasets.pairs.build`), from the packed file, which is made if there is none.
 
     Args:
         manifest: or a packed file itself.
         extras: what is wanted, too: of `EXTRAS`, `landmarks`, `near`, the layout of doors, or `sheet`, the storeys from above.
         limit: of the first pairs only; 0: all.
-        around: m within which rooms are neighbours, too (`embedding.rooms_around`); 0: by doors only.
+        around: m within which rooms are neighbours, too (`embedding.graph.add_proximity_edges`); 0: by doors only.
 
     Raises:
         InputError: no such manifest, or a file is damaged.

@@ -1,4 +1,4 @@
-"""Task `passages`: how much all evidence together says of a door between two segments (`extraction.passages`).
+"""Task `passages`: how much all evidence together says of a door between two segments (`extraction.plans.passages`).
 
 A logistic model for scans that show walls, pulled towards the plan's own answer: what evidence adds must show in the scans.
 Slices have none: on them the plan alone was better.

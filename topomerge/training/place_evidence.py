@@ -1,4 +1,4 @@
-"""Task `place_evidence`: the network that says how much two squares from above speak for one place (`fusion.evidence.network`).
+"""Task `place_evidence`: the network that scores whether two squares from above show one place (`registration.evidence.places`).
 
 Squares of simulated maps under their right pose and under wrong ones that the search proposed: another place of the building, a
 twin wing, another storey, another building. Furniture is moved, doors are opened and maps drift between the two. Turned, mirrored

@@ -215,7 +215,7 @@ def write_card(
         settings: of the run.
         data: what was learned from: counts, names of sets.
         metrics: on what was held out of the training.
-        interface: what a network does, its inputs and outputs (`networks.signature`).
+        interface: what a network does, its inputs and outputs (`networks.network.Signature`).
     """
     run = next((folder for folder in file.parents[1:3] if (folder / RUN_FILE).is_file()), file.parent.parent)
     keys = (f"{k}={v}" for k, v in settings.items() if isinstance(v, int | float | str) and k in ("seed", "epochs"))

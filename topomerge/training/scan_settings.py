@@ -31,7 +31,7 @@ class PlanAugment:
     Args:
         upper: share of crops without ceiling or without floor.
         columns: share of crops that lose single columns; lost: share of these, drawn between 0 and this.
-        grid_noise: share of crops with the noise of robots' grids (`training.grid_noise`).
+        grid_noise: share of crops with the noise of robots' grids (`training.plan_segmentation.add_grid_noise`).
     """
 
     grid_noise: float = 0.0
@@ -155,7 +155,7 @@ class WallSegmentation(RasterTask):
     steps: of an epoch; warmup: steps in which the rate rises.
     length: places of a stretch, even; at_holes: share of the stretches about the side of a door or window.
     classes: weights of the classes in the cross-entropy.
-    widths: of `models.wall_network.WallNetwork`.
+    widths: of `models.convolutional.WallNetwork`.
     unseen: weight of places where nothing was seen.
     """
 

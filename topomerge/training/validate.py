@@ -42,7 +42,7 @@ def estimate_pose(a: Mapping[str, Array], b: Mapping[str, Array], certain: Array
 
     Args:
         a, b: `pos`, `edge_pos` and `edge_index` of both graphs (`embedding.graph`).
-        certain: (R_a, R_b) `matching.scores.compute_certainty`.
+        certain: (R_a, R_b) `matching.assignment.compute_certainty`.
     """
     pairs = assign_certain(certain, LEAST_CERTAINTY)
     pairs = pairs[np.argsort(-certain[tuple(pairs.T)], kind="stable")]

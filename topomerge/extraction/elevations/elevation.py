@@ -155,7 +155,7 @@ def compute_place_probabilities(strip: Array, network: Run | None = None) -> Arr
 
 
 def weights() -> Network:
-    """Load the network that ships, or the one in its place (`io.weight_files`)."""
+    """Load the network that ships, or the one in its place (`archive.find_weights_file`)."""
     return load_shipped_network(WALL_NETWORK_FILE, WALL_SIGNATURE)
 
 

@@ -170,7 +170,7 @@ def _is_seen_through(crossed: VoxelGrid, grid: VoxelGrid, low: Array, base: Arra
 
 
 def build_profile_bands(edge: float) -> HeightBands:
-    """Build the height bands of the bits of a profile (`kernels.profile`): each is as high as a cell, m."""
+    """Build the height bands of the bits of a profile (`kernels.rasters.fill_profiles`): each is as high as a cell, m."""
     return HeightBands(edge, PROFILE_BELOW, PROFILE_LEVELS)
 
 

@@ -168,7 +168,7 @@ def run_network(x: Array, network: Run) -> Array:
 
 
 def load_weights(raised: bool = False) -> Network:
-    """Load the network that ships, or the one in its place (`io.weight_files`).
+    """Load the network that ships, or the one in its place (`archive.find_weights_file`).
 
     Args:
         raised: that of robots' grids and drawings, whose walls were all raised alike.

@@ -15,7 +15,7 @@ from topomerge.types import Array, VoxelGrid
 # A storey seen from above: the one type for it, and the one rule for which of its columns are walls (beyond the thesis).
 #
 # A wall fills most of the heights between furniture and lintels; what fills fewer is clutter. The extraction makes such plans
-# from the navigable volume (`extraction.plans.plan`), the merging from bare cells (`fusion.storey_plan`), the matching from
+# from the navigable volume (`extraction.plans.plan`), the merging from bare cells (`registration.storeys`), the matching from
 # finished maps (`matching.room_plans`).
 
 WALL_HEIGHTS = np.linspace(0.5, 2.0, 7)  # m above the floor, limits of the bands in most of which a wall is seen

@@ -26,7 +26,8 @@ from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Array, Sim3
 
 # Log odds that agreement may add where no rival is named: of wrong registrations, one in e ** 1.5 (.22) is taken for a place that
-# looks the same to all of its maps. An assumption, as the priors of `fusion.posterior`, where storeys and wings are .36 of it.
+# looks the same to all of its maps. An assumption, as the priors of `registration.posterior`, where storeys and wings are .36 of
+# it.
 CLOSING_GAIN = 1.5
 PRIOR_SAME_PLACE = 4.0  # log odds against a registration giving just this place by chance
 NOT_NAMED = 0.1  # least share of what a pair's best pose leaves that belongs to placements no hypothesis names

@@ -251,7 +251,7 @@ def compute_network_log_odds(seen: Array, network: Run) -> Array:
 
 
 def load_weights() -> Network:
-    """Load the network that ships, or the one in its place (`io.weight_files`)."""
+    """Load the network that ships, or the one in its place (`archive.find_weights_file`)."""
     return load_shipped_network(PLACE_NETWORK_FILE, PLACE_SIGNATURE)
 
 
