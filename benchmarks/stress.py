@@ -1,4 +1,4 @@
-"""What happens at the limits: large clouds, many rooms, many maps, many merges, threads, processes, and kills.
+"""Stress tests at the limits: large clouds, many rooms, many maps, many merges, threads, processes, and kills.
 
 ``python -m benchmarks.stress CASE [NUMBER]`` runs one case and prints a line or a few: seconds of the processor, and the peak of
 the memory. The cases are the functions below; each has a default that takes minutes.
@@ -131,7 +131,7 @@ def merges(count: int = 300) -> None:
 
 
 def extract_signature(cloud: PointCloud) -> bytes:
-    """What tells two maps of a cloud apart: their tables, as bytes."""
+    """Serialise the tables of the map of a cloud: maps that differ give different bytes."""
     return compute_signature(tm.extract(cloud))
 
 
@@ -141,7 +141,7 @@ def compute_signature(map: TopometricMap) -> bytes:
 
 
 def summarise_merge(maps: Sequence[TopometricMap]) -> tuple[str, float]:
-    """What a merge says."""
+    """Summarise a merge: its verdict and its probability."""
     result = tm.merge(list(maps))
     return result.status, float(result.probability)
 

@@ -45,7 +45,7 @@ class LossSettings:
 
 @dataclass(eq=False)  # not frozen: fabric fills a copy of it in half precision
 class Truth:
-    """What belongs together in a batch of N rooms.
+    """Rooms that belong together in a batch of N rooms.
 
     Args:
         pair: (N,) which pair of maps a room is of.
@@ -77,7 +77,7 @@ class Others:
 
 
 class RoomLosses(NamedTuple):
-    """What a loss gives.
+    """The values of a loss.
 
     Args:
         values: (N,) of each room.
@@ -93,7 +93,7 @@ class RoomLosses(NamedTuple):
 
 @dataclass(eq=False)
 class RoomBatch:
-    """What a loss is computed from.
+    """The inputs of a loss.
 
     Args:
         embedding: (N, D) of length 1.
@@ -108,7 +108,7 @@ class RoomBatch:
 
 
 class Processes(Protocol):
-    """What a loss asks of the processes that train together."""
+    """Collective operations of the processes that train together, as losses use them."""
 
     def gather_others(self, rows: Tensor) -> Tensor:
         """Return the rows (M, ...) of all other processes; gradients flow back to where they come from."""

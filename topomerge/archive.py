@@ -174,7 +174,7 @@ def list_arrays(path: str | Path, kind: str = "archive") -> list[str]:
 
 
 class ArrayHeader(NamedTuple):
-    """What an array of an archive declares of itself."""
+    """Shape and type that an array of an archive declares."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
@@ -197,7 +197,7 @@ def read_array_headers(path: str | Path, kind: str = "archive") -> dict[str, Arr
 
 
 def _apply_to_archive(path: str | Path, kind: str, use: Callable[[zipfile.ZipFile, int], R]) -> R:
-    """What `use` makes of an archive and the size of its file; whatever goes wrong is told of the file."""
+    """Apply `use` to an archive and the size of its file; every error names the file."""
     path = Path(path)
     if path.is_dir():
         raise InputError(f"{path}: is a folder, not a {kind}; name a file")

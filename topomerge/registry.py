@@ -1,5 +1,5 @@
-"""What can be swapped by name, and added from outside of the package: encoders, losses, optimizers, schedules,
-loggers, sets, tasks.
+"""Registries of parts that can be swapped by name, and added from outside of the package: encoders, losses, optimizers,
+schedules, loggers, sets, tasks.
 
 A registry knows what ships, what packages that are installed announce (entry points of its group, such as ``topomerge.losses``),
 and what a module registered that was imported, such as one that ``plugins=[my_package.my_module]`` names:

@@ -37,7 +37,7 @@ Work = Callable[..., Iterator[tuple[str, Any]]]
 
 @dataclass(frozen=True)
 class PeerAnswer:
-    """What a method says of two clouds.
+    """The answer of a method about two clouds.
 
     Args:
         pose: (4, 4) maps b into a, as the solver returned it.

@@ -63,7 +63,7 @@ def find_cell(about: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def described(pair: GridPair) -> dict[str, Any]:
-    """What a line of results tells of a pair."""
+    """Select the properties of a pair that a line of results reports."""
     names = ("sensors", "building", "kind", "source", "overlap", "differs", "walls_differ", "lookalike", "tellable", "furniture")
     return {name: pair.about[name] for name in names if name in pair.about}
 

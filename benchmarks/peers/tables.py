@@ -203,7 +203,7 @@ def _measure_believed(rows: Sequence[Row]) -> tuple[float, float]:
 
 
 def tabulate_verdicts(verdicts: Mapping[str, PeerVerdict]) -> str:
-    """What makes each peer's answer believed, and what that gives on training pairs."""
+    """Render the threshold from which each peer's answer is accepted, with its recall and precision on training pairs."""
     out = []
     for name, v in verdicts.items():
         solver = "" if not name.startswith("kiss") else ("yaw only (Quatro)" if v.variant.endswith("q") else "all rotations")

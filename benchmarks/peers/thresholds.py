@@ -134,7 +134,7 @@ def load_verdicts(path: Path = THRESHOLDS_FILE) -> dict[str, PeerVerdict]:
 
 
 def serialise_verdicts(rows: Sequence[Row], verdicts: dict[str, PeerVerdict]) -> dict[str, Any]:
-    """What is committed: verdicts, where they are from, and what each variant had right."""
+    """Serialise the verdicts, the command and pairs that they are from, and how many pairs each variant had right."""
     fair = [r for r in rows if is_tellable(r) and not is_broken(r)]
     variants = {
         v: sum(is_good(apply_refinement(r, v)) for r in fair if v in r["methods"]) for names in VARIANTS.values() for v in names

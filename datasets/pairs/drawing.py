@@ -1,4 +1,4 @@
-"""What truly stands in each column of a building's plan, and this plan as a map of its own: no furniture, no rays."""
+"""True classes of the columns of a building's plan, and this plan as a map of its own: no furniture, no rays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What corrections teach: true rooms, doors and matches out of maps that somebody corrected, and how much there was to correct.
+"""Truth from corrections: true rooms, doors and matches out of maps that somebody corrected, and how much there was to correct.
 
 Of each map with a journal that holds, the corrected map becomes a capture of a `pairs.yaml` (`data=folder`), and a truth for the
 evaluation of rooms (`evaluate.py task=rooms path=DIR`). Merges that were decided by hand become its pairs.
@@ -42,7 +42,7 @@ MERGE_FILE = f"merge{JOURNAL_SUFFIX}"
 
 @dataclass(frozen=True)
 class EditedTruth:
-    """What became of a folder: lines of a table, and how many maps, edits, rooms and pairs there are."""
+    """The outcome of a folder: lines of a table, and how many maps, edits, rooms and pairs there are."""
 
     lines: tuple[str, ...]
     maps: int

@@ -35,7 +35,7 @@ LAID_IOU = 0.4  # IoU from which rooms that lie over each other are one
 
 
 class HasTruth(Protocol):
-    """What has a true transform, or None."""
+    """Anything with a true transform, or None where it is not known."""
 
     @property
     def truth(self) -> Sim3 | None:
@@ -44,7 +44,7 @@ class HasTruth(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class EvaluationPair:
-    """What is true of an evaluation pair; `maps` reads the maps.
+    """A pair of maps with its truth, for evaluation; `maps` reads the maps.
 
     Args:
         name: of the files.

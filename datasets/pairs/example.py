@@ -189,7 +189,7 @@ def _make_first_pair(item: Item, plans: Sequence[Sequence[Plan]]) -> tuple[Pair,
 
 
 def _make_first(item: Item, make: Callable[[int, np.random.Generator], Made]) -> Made:
-    """What is made of the first of an item's candidates that has it, from its number and a generator of its own."""
+    """Make an example of the first of an item's candidates that gives one, from its number and a generator of its own."""
     refused: InputError | None = None
     for k in range(len(item.buildings)):
         try:

@@ -1,4 +1,4 @@
-"""What phones hear at look-alikes: the two places of a pair in one world, with access points, walls and floors between them.
+"""Radio readings at look-alikes: the two places of a pair in one world, with access points, walls and floors between them.
 
 Places with the same walls are put where such places are: on two storeys, in two wings or rooms of one row, or in two buildings
 that hear nothing of each other (`draw_relation`). Readings are a switch, as signs are: the arrays of the pair stay as they are.
@@ -104,7 +104,7 @@ def find_track(building: Building, rooms: Array) -> Array:
 
 @dataclass(frozen=True)
 class RadioPair:
-    """What two phones hear, each in the frame of its map; "" or how the second place lies to the first one."""
+    """The readings of two phones, each in the frame of its map; "" or how the second place lies to the first one."""
 
     readings: tuple[Landmarks, Landmarks]
     relation: str

@@ -94,7 +94,7 @@ RAYS_AT_A_TIME = 2_000_000  # rays at a time
 
 @dataclass(frozen=True, eq=False)
 class RayHits:
-    """What rays met, row by row.
+    """Hits of rays, row by row.
 
     Args:
         pose: (n,) int64 from where.

@@ -34,7 +34,7 @@ FAR = 10.0  # m, of distances where nothing stands
 
 
 class PlacedMap(Protocol):
-    """What takes points (n, 3) of the new map into the frame of the old one, and back; `types.Placement` is one."""
+    """A transform of points (n, 3) of the new map into the frame of the old one, and back; `types.Placement` is one."""
 
     @property
     def pose(self) -> Sim3:
@@ -70,7 +70,7 @@ class RelativePlacement:
 
 @dataclass(frozen=True, eq=False)
 class MapLayer:
-    """What one map shows of a storey, (nx, ny) each.
+    """Rasters (nx, ny) of a storey as one map shows it.
 
     Args:
         wall, standing, tall: bool; a wall by the rule of plans, anything at the height of a body, and what reaches `HIGH_BAND`.

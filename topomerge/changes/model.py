@@ -349,7 +349,7 @@ def _decide_elsewhere(shift: float, sigma: float) -> tuple[str, float]:
 def _judge_element(
     element: ModelElement, planes: Sequence[PlaneShift], layers: Sequence[StoreyLayers], correct: Correction
 ) -> ElementRow:
-    """What the scan says of a wall, a column or a slab."""
+    """Judge by the scan whether a wall, a column or a slab is where the model has it."""
     seen = [p for p in planes if np.isfinite(p.shift) and p.share >= LEAST_SEEN and p.cells >= LEAST_CELLS]
     normal = planes[0].normal if planes else np.array([1.0, 0.0, 0.0])
     if seen:
@@ -418,7 +418,7 @@ class _ModelDoors:
         return partner
 
     def judge(self, element: ModelElement) -> ElementRow:
-        """What the scan says of a door: a way through or a leaf is there, farther along its wall, or not at all."""
+        """Judge by the scan whether a door (a way through, or a leaf) is in place, farther along its wall, or missing."""
         door = self.doors[element.guid]
         normal = np.array([np.cos(door["direction"]), np.sin(door["direction"]), 0.0])
         k, shift = self.partner.get(element.guid, (-1, np.nan))

@@ -55,7 +55,7 @@ STATE_FILE, STATE_SETTINGS = "embedder.safetensors", "embedder.json"  # of a tra
 
 @dataclass(frozen=True, eq=False)
 class EmbedderCard:
-    """What is known of an embedder.
+    """The card of an embedder.
 
     Args:
         path: of its network.
@@ -123,13 +123,13 @@ def read_embedder_card(path: str | Path | None = None) -> EmbedderCard:
 
 
 def describe_embedder(network: Network, about: Mapping[str, Any] | None) -> dict[str, Any]:
-    """What both kinds of files say of a network: of its architecture, of the features that it reads, and of its training."""
+    """Describe a network, as both kinds of files do: its architecture, the features that it reads, and its training."""
     features = {name: list(TABLES[name]) for name in list_tensors(network) if name in TABLES}
     return {"class": EMBEDDER_CLASS, "network": asdict(network), "features": features, "about": dict(about or {})}
 
 
 def build_card(network: Network, temperature: float, about: Mapping[str, Any] | None) -> dict[str, Any]:
-    """What the card of an embedder says, but for its file."""
+    """Build the card of an embedder, but for its file."""
     known = {"format": EMBEDDER_FORMAT, "temperature": temperature, **describe_embedder(network, about)}
     return build_embedder_signature(network).describe() | known
 

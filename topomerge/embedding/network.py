@@ -1,4 +1,5 @@
-"""What a network is made of: plain dataclasses, stored as JSON beside its weights; and what of a map's graph it reads."""
+"""Settings of an embedding network: plain dataclasses, stored as JSON beside its weights; and the inputs that it reads of a map's
+graph."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ SAME_YAW = np.radians(10.0)  # turns that differ by less are one
 
 @dataclass(frozen=True, eq=False)
 class TurnedRows:
-    """What rooms look like in a map that is turned by 0 to 3 quarter turns, counter-clockwise seen from above.
+    """Descriptors of rooms in a map that is turned by 0 to 3 quarter turns, counter-clockwise seen from above.
 
     Args:
         rows: (R, 4, D) of length 1 each.

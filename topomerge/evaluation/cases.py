@@ -226,8 +226,8 @@ def list_marked() -> list[Case]:
 
 
 def peers() -> list[Case]:
-    """What the classic methods are compared on: every grid with true rooms, and scans from above of each sensor that sees more
-    than a slice."""
+    """List the cases that classic methods are compared on: every grid with true rooms, and scans from above of each sensor that
+    sees more than a slice."""
     scans = [*simulate_scan(), *(case for case in plans() if case.source == "campus")]
     return [*grids(), *(case for case in scans if case.sensor != "laser2d")]
 

@@ -183,7 +183,7 @@ OF_MERGES = ("merging", "kinds", "decides", "sites", "independence", "reliabilit
 
 @dataclass(frozen=True)
 class Scores:
-    """What an evaluation found: rows of counts, a short report, and where everything lies."""
+    """The result of an evaluation: rows of counts, a short report, and where everything lies."""
 
     matches: list[Row]
     ranks: list[Row]

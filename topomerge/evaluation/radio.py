@@ -1,4 +1,4 @@
-"""What readings of radio tell: poses, storeys and verdicts, by real walks on storeys whose law was fitted on the others.
+"""Evaluation of radio readings: poses, storeys and verdicts, by real walks on storeys whose law was fitted on the others.
 
 ``python evaluate.py task=radio`` parts the walks on each storey of `wifi_malls` in two sets, in frames of their own, and asks for
 the pose from radio alone: of all walks, and of few. It asks which of five storeys readings are from, and how right poses and

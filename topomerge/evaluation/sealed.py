@@ -85,7 +85,7 @@ def check_page(page: Path, version: str, again: bool) -> None:
 
 
 def format_block(rows: Sequence[Row], version: str, command: str, seconds: float, before: int) -> str:
-    """What is appended.
+    """Format the block of a run, which is appended to the page.
 
     Args:
         before: blocks of the same version that are there.
@@ -123,7 +123,7 @@ def parse_public_sets(words: Sequence[str]) -> list[tuple[str, Path]]:
 
 
 def parse_arguments(words: Sequence[str]) -> argparse.Namespace:
-    """What the command line says."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(
         prog="python -m topomerge.evaluation.sealed", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,4 +1,4 @@
-"""What an evaluation is told: the pairs, what predicts, and what is reported."""
+"""Settings of an evaluation: the pairs, the predictor, and the report."""
 
 from __future__ import annotations
 

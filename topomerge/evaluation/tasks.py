@@ -56,7 +56,7 @@ MODULES = {
 
 @dataclass
 class Data:
-    """What is measured.
+    """The data that a task measures.
 
     Args:
         set: name of the set, or several with commas between them.
@@ -93,7 +93,7 @@ class TaskSettings:
 
 
 class EvaluationModule(Protocol):
-    """What a module of a task has."""
+    """The functions that the module of a task defines."""
 
     Settings: type[TaskSettings]
     MAKERS: tuple[str, ...]
@@ -113,7 +113,7 @@ class EvaluationModule(Protocol):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a task found."""
+    """The outcome of a task."""
 
     rows: list[Row]
     summary: str
@@ -342,7 +342,8 @@ def find_buildings(pair: GridPair, split: str) -> tuple[str, str]:
 
 
 def describe_places(names: tuple[str, str], sources: tuple[str, str] | None = None) -> dict[str, str]:
-    """What a row of results tells of where its maps are from: names, sources and physical buildings of a and of b.
+    """Return the columns of a row of results that tell where its maps are from: names, sources and physical buildings of a and of
+    b.
 
     Args:
         sources: None: as the names of cached pairs tell them.
@@ -354,7 +355,7 @@ def describe_places(names: tuple[str, str], sources: tuple[str, str] | None = No
 
 
 def list_difficulties(pair: GridPair) -> list[str]:
-    """What makes a cached pair hard beside its kind (`grid_pairs`: every sixth, every eighth)."""
+    """List the difficulties of a cached pair beside its kind (`grid_pairs`: every sixth, every eighth)."""
     difficulty: dict[str, float] = pair.about.get("difficulty", {})  # type: ignore[assignment]
     limits = {"much moved furniture": ("moved", 0.6), "glass walls": ("glass", 0.5)}
     return [title for title, (name, least) in limits.items() if difficulty.get(name, 0.0) >= least]

@@ -281,7 +281,7 @@ def cut_rooms(
 
 
 def list_warnings(map: TopometricMap) -> list[str]:
-    """What the user should know about the map as a whole."""
+    """List warnings about the map as a whole, for the user."""
     doubts = []
     if map.grid.edge > COARSE_CELL:
         doubts.append(f"cells of {map.grid.edge:g} m are coarse: doors may be lost, {COARSE_CELL} m or less finds them")

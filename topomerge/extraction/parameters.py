@@ -10,7 +10,8 @@ from topomerge.errors import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class SharedParameters:
-    """What both presets have: cells, navigable volume (seeds 2.3), free space. The defaults are ours; docs/adr/0003 says why."""
+    """Parameters of both presets: cells, navigable volume (seeds 2.3), free space. The defaults are ours; docs/adr/0003 says
+    why."""
 
     level: bool = True  # tilted clouds are levelled first
     noise: float = 0.4  # cells with a smaller share of the usual number of neighbours are in nobody's way; 0: all are

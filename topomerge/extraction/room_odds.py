@@ -200,7 +200,7 @@ def _iter_windows(storey: _StoreyFloor) -> Iterator[tuple[int, tuple[slice, slic
 
 
 def _measure_outline(storey: _StoreyFloor, room: int, window: tuple[slice, slice]) -> dict[str, float]:
-    """What the outline of a room tells.
+    """Measure the outline of a room: what it borders on.
 
     Args:
         window: the part of the raster from where others look into it; the outline itself is looked for in the room's own box.
@@ -245,7 +245,7 @@ def measure_thin_share(own: Array, edge: float) -> float:
 
 
 class _Hulls:
-    """What lies between the rooms of a storey."""
+    """Convex hulls of the rooms of a storey."""
 
     def __init__(self, storey: _StoreyFloor) -> None:
         at = np.argwhere(storey.room >= 0)

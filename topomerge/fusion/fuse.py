@@ -112,7 +112,7 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
 
 @dataclass(frozen=True)
 class _Part:
-    """What is asked of a map before it is fused: number of provenance bits, edge length in the joined frame, m, and whether its
+    """A map as it is prepared for fusion: number of provenance bits, edge length in the joined frame, m, and whether its
     heights were assumed."""
 
     bits: int
@@ -135,7 +135,7 @@ def _choose_edge(parts: Sequence[_Part]) -> float:
 
 
 class _JoinedCells:
-    """What is joined so far: cells by their Morton codes, ascending, which maps saw them, the room of a map that they are of
+    """Cells that are joined so far: their Morton codes, ascending, which maps saw them, the room of a map that they are of
     (numbered through all maps, -1 none), and where in them their points lie on average (0..1), as how many points say; codes of
     the free cells, which are twice as long.
 
@@ -274,7 +274,7 @@ def _build_joined(
 
 
 def _build_free_space(joined: _JoinedCells, grid: VoxelGrid, base: Array) -> VoxelGrid | None:
-    """What a part saw empty and none occupied; None where no part knows any.
+    """Build the grid of cells that a part saw empty and none occupied; None where no part knows any.
 
     Args:
         base: (3,) cell of the lattice at the corner of the grid.

@@ -1,4 +1,4 @@
-"""What two maps or many must be to be merged, and what a user should know of them before."""
+"""Checks of the maps that are to be merged, two or many, and warnings for the user."""
 
 from __future__ import annotations
 

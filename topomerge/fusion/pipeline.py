@@ -140,7 +140,8 @@ def list_posterior(registration: Registration) -> list[tuple[str, str]]:
 
 
 def _list_winner_evidence(f: Mapping[str, float]) -> list[Row]:
-    """What only the best hypothesis was asked (`compute_winner_features`); joined maps of older versions do not have it."""
+    """List the evidence that is computed for the best hypothesis only (`compute_winner_features`); joined maps of older versions
+    do not have it."""
     if "moved_walls" not in f:
         return []
     rows = [
@@ -288,7 +289,7 @@ def _explain_pair(registration: Registration, threshold: float, config: MergeCon
 
 
 def _find_observations(a: TopometricMap, b: TopometricMap, registration: Registration, accepted: bool) -> list[Observation]:
-    """What would settle a merge that is refused, or of which another alternative is left."""
+    """Find observations that would settle a merge that is refused, or of which another alternative is left."""
     each = registration.posterior
     left = max((p for name, p in each.items() if name != "here"), default=0.0)
     if registration.transform is None or not registration.posterior or (accepted and left < LEFT_OPEN):

@@ -1,4 +1,5 @@
-"""What the maps know that were joined -> the joined map: doors, windows, landmarks, and who was in the rooms (method 4)."""
+"""Transfer knowledge of the maps that were joined to the joined map: doors, windows, landmarks, and who was in the rooms (method
+4)."""
 
 from __future__ import annotations
 
@@ -27,7 +28,7 @@ LEAST_COVER = 0.3  # of a joined room's floor, from which on a part knows who wa
 
 
 class PlacedPart(NamedTuple):
-    """What of a part is needed once it is joined: its rooms, ROOM_DTYPE of them, and its doors and openings as they lie in the
+    """A part as it is kept once it is joined: its rooms, ROOM_DTYPE of them, and its doors and openings as they lie in the
     joined map, EDGE_DTYPE with the part's rooms; likewise its narrowings, with the part's areas."""
 
     rooms: PartRooms
@@ -114,7 +115,7 @@ def transform_floor(part: TopometricMap, placement: Placement) -> tuple[Array, A
 
 @dataclass(frozen=True, eq=False)
 class _PlacedFloor:
-    """What a part says of doors, in the joined map.
+    """The floor and doors of a part, in the joined map.
 
     Args:
         floor: tree of the floor of its rooms, (k, 3) m.

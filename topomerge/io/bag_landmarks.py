@@ -292,7 +292,7 @@ class LandmarkReader:
             self.pictures.warnings.append(f"not all landmarks are read: {reason}")
 
     def _find_decoders(self) -> Decoders:
-        """What to do with the messages of the topics that are known, pictures apart."""
+        """Find the decoders of the topics that are known, but for pictures."""
         decoders: Decoders = {}
         for types, decode in ((TAGS, self._read_tags), ((OBJECTS,), self._read_objects), ((PRESSURE,), self._read_pressure)):
             for topic in self.bag.find_topics(*types):

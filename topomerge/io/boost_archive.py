@@ -28,7 +28,7 @@ Passing = Generator[Any, Any, Any]
 
 @dataclass(frozen=True, eq=False)
 class ArchiveLayout:
-    """What an archive is read by.
+    """The layout that an archive is read by.
 
     Args:
         classes: members in their order, `name:type`; without a name: a base.

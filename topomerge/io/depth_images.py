@@ -18,7 +18,7 @@ from topomerge.types import Array, Landmarks
 
 @dataclass(frozen=True, eq=False)
 class PosedScan:
-    """What a sensor measured from one place.
+    """The points that a sensor measured from one place.
 
     Args:
         points: (n, 3) in the sensor's frame, or in the fixed frame where they are `registered`.

@@ -63,7 +63,7 @@ class PictureText:
 
 @dataclass(frozen=True, eq=False)
 class ParsedDrawing:
-    """What a drawing shows, in pixels of `zoom` times the picture's number a side.
+    """The content of a drawing, in pixels of `zoom` times the picture's number a side.
 
     Args:
         occupied: (h, w) bool, walls and windows; free: floor and open doors; door, window: (h, w) bool.

@@ -102,7 +102,7 @@ def place_text(text: PictureText, corner: tuple[float, float], pixel: float, row
 
 @dataclass
 class Content:
-    """What a drawing holds, in its units: lines, swings of doors, texts at their middle, layers, and the unit it states."""
+    """The content of a drawing, in its units: lines, swings of doors, texts at their middle, layers, and the unit it states."""
 
     lines: list[Line] = field(default_factory=list)
     swings: list[Swing] = field(default_factory=list)

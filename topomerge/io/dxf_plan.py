@@ -261,7 +261,7 @@ def _erase_gap(raster: _Raster, occupied: Array, ends: Array) -> None:
 
 
 def _fill_floor(raster: _Raster, occupied: Array, seals: Array) -> PlanMasks:
-    """What the page can't reach is floor, but for what is as thin as a wall and has no door."""
+    """Fill the floor: all that the page's border can't reach, but for parts as thin as a wall that have no door."""
     pixel = raster.pixel
     closed = occupied | seals
     distance = ndimage.distance_transform_edt(~closed)
@@ -286,7 +286,7 @@ def _fill_floor(raster: _Raster, occupied: Array, seals: Array) -> PlanMasks:
 
 
 def _find_inside(closed: Array, distance: Array, radius: float) -> Array:
-    """What a disc of a radius (px) does not reach from the border; `distance` is that to what is closed."""
+    """Find the pixels that a disc of a radius (px) does not reach from the border; `distance` is to the nearest closed one."""
     label, _ = ndimage.label(distance > radius)
     outside = label == label[0, 0]
     if radius > 0:

@@ -118,7 +118,7 @@ TOLD_SHARE = 0.01  # of the floor: more noise around the grey of unknown is told
 
 @dataclass(frozen=True)
 class Plan:
-    """What a map_server file says; the defaults are its own."""
+    """The content of a map_server file; the defaults are its own."""
 
     image: Path
     resolution: float  # m per pixel
@@ -302,7 +302,7 @@ def _read_number(path: Path, values: dict[str, Any], key: str, default: float | 
 
 
 def _shorten_value(value: object) -> str:
-    """What stands in a file, not longer than fits into a message: aliases can make a list of a few bytes endless."""
+    """Shorten a value of a file to fit into a message: aliases can make a list of a few bytes endless."""
     short = reprlib.Repr()
     short.maxlevel = short.maxlist = short.maxdict = 2
     return short.repr(value)[:60]

@@ -202,7 +202,7 @@ def read_las_node(path: Path, promised: int, options: ReadOptions) -> Iterator[P
 
 
 def _select_fields() -> Any:
-    """What a cloud is made of; other layers of a packed file are not unpacked, where it has layers."""
+    """Select the fields of a cloud; other layers of a packed file are not unpacked, where it has layers."""
     from laspy import DecompressionSelection
 
     return DecompressionSelection.base().decompress_z().decompress_classification().decompress_intensity().decompress_rgb()
@@ -322,7 +322,7 @@ def _convert_colors(rows: object) -> Array | None:
 
 
 def _check_head(path: Path) -> None:
-    """What the library would trust: the magic and the number of records before the points."""
+    """Check what the library would trust: the magic and the number of records before the points."""
     head = read_head(path, "a LAS file", b"LASF", 227)
     start, records = int.from_bytes(head[96:100], "little"), int.from_bytes(head[100:104], "little")
     size = path.stat().st_size

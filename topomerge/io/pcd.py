@@ -26,7 +26,7 @@ PCD_TYPES = {("F", 4), ("F", 8), ("U", 1), ("U", 2), ("U", 4), ("U", 8), ("I", 1
 
 @dataclass(frozen=True)
 class Header:
-    """What stands before the points."""
+    """The header of a PCD file, before the points."""
 
     dtype: np.dtype
     points: int

@@ -61,7 +61,7 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """What stands before the rows; `start` is the offset of the first."""
+    """The header of a PLY file; `start` is the offset of the first row."""
 
     order: str  # "", "<" or ">"
     elements: list[Element]

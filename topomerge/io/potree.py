@@ -46,7 +46,8 @@ FILES = {"LAS": "las", "LAZ": "laz"}
 
 @dataclass(frozen=True)
 class Octree:
-    """What `cloud.js` says: the folder of nodes, how many levels lie in one file, the cube of the root, and a point's row."""
+    """The layout that `cloud.js` states: the folder of nodes, how many levels lie in one file, the cube of the root, and a
+    point's row."""
 
     folder: Path
     step: int  # 0: the nodes are listed

@@ -319,7 +319,7 @@ def read_poses(path: Path, base: sqlite3.Connection, version: tuple[int, ...], w
 
 
 def _detect_kind(path: Path, base: sqlite3.Connection, version: tuple[int, ...]) -> str:
-    """What to read: "spatial" or "flat" scans, or "depth", by the first node that has any.
+    """Detect what to read: "spatial" or "flat" scans, or "depth", by the first node that has any.
 
     Raises:
         InputError: there is none of these.
@@ -461,7 +461,7 @@ def _find_places(poses: Poses, nodes: list[int]) -> Array:
 
 
 def _read_labels(base: sqlite3.Connection, poses: Poses) -> Landmarks:
-    """What the user called nodes, as names of where they are."""
+    """Read the labels that the user gave nodes, as names of their places."""
     rows = base.execute(f"SELECT id, label FROM Node WHERE LENGTH(label) > 0 ORDER BY id LIMIT {MOST_SIGHTINGS}")
     named = [(node, clean_text(label)) for node, label in rows if isinstance(label, str) and poses.get(node) is not None]
     named = [(node, label) for node, label in named if label and not OWN_NAME.fullmatch(label)]

@@ -26,7 +26,7 @@ OCTREE = "copc"  # a record that says where the nodes of an octree lie in the fi
 
 @dataclass(frozen=True)
 class SavedPoints:
-    """What was written: the number of points, and of those that lie too far from all others for LAS."""
+    """Counts of what was written: the number of points, and of those that lie too far from all others for LAS."""
 
     written: int
     beyond: int = 0

@@ -34,7 +34,7 @@ WALLED = 0.3  # share of the floor's outline along which robots that draw walls 
 
 @dataclass(frozen=True)
 class RobotMap:
-    """What a vacuum robot drew; arrays (h, w), the lowest row of the picture first.
+    """The map of a vacuum robot; arrays (h, w), the lowest row of the picture first.
 
     Args:
         walls, free: bool.

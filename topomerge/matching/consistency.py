@@ -268,7 +268,7 @@ NEAR_SCALE = 1.16  # factor by which the scale of a pose differs from that at wh
 
 
 class Sampled(NamedTuple):
-    """What of a map is laid over the other's plan."""
+    """Samples of a map that are laid over the other's plan."""
 
     places: Array
     storey: Array

@@ -63,7 +63,7 @@ class Matcher:
 
 @dataclass(frozen=True, eq=False)
 class RoomsSeen:
-    """What the network sees of the rooms of a map.
+    """Inputs of the network from the rooms of a map.
 
     Args:
         rows: (R, 4 D) of length 1, of the map as it is turned (`TurnedRows.flatten`).

@@ -53,7 +53,7 @@ class RoomPlans:
 
     @cached_property
     def fields(self) -> tuple[PlanFields, ...]:
-        """What poses are refined by, of each storey."""
+        """Return the fields of each storey by which poses are refined."""
         return tuple(PlanFields(plan) for plan in self.plans)
 
     @cached_property

@@ -1,4 +1,4 @@
-"""What each pixel of a drawn floor plan shows: a convolutional network, trained on plans drawn in many hands
+"""Classes of the pixels of a drawn floor plan: a convolutional network, trained on plans drawn in many hands
 (`train.py task=drawing_segmentation`; beyond the thesis: docs/adr/0032)."""
 
 from __future__ import annotations

@@ -246,7 +246,7 @@ def register(
 
 
 def _prepare_completely(map: Map | Prepared, free: VoxelGrid | None) -> Prepared:
-    """What registration needs of a map; where several threads share loops, drawn at once, beside the other map."""
+    """Prepare a map for registration; where several threads share loops, completely, beside the other map."""
     if isinstance(map, Prepared):
         return map
     prepared = prepare(map, free)

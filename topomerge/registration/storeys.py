@@ -1,4 +1,4 @@
-"""What each storey of a map shows from above: walls, empty space and clutter, by which registration goes (method 4).
+"""Storeys of a map seen from above: walls, empty space and clutter, by which registration goes (method 4).
 
 Storeys are found by their floors and ceilings, by layers of slices, or by lines that were given walls. A *wall* column is filled
 at most of the heights between 0.5 and 2.0 m above the floor; a *free* one has a floor or a ceiling and nothing between, or rays
@@ -253,7 +253,7 @@ def _build_plan(rasters: tuple[Array, ...], origin: Array, cell: float, levels: 
 
 
 def _find_straight_runs(mask: Array, cell: float) -> Array:
-    """What a slice shows of walls: straight runs beside which little stands. Legs and chairs are as dense, but stand in heaps."""
+    """Find the walls in a slice: straight runs beside which little stands. Legs and chairs are as dense, but stand in heaps."""
     angles = np.pi * np.arange(24) / 24
     long = max(round(STRAIGHT_RUN / cell), 3)
     straight: Array = find_line_columns(mask, np.cos(angles), np.sin(angles), long, long - 1, max(round(BESIDE_RUN / cell), 2))

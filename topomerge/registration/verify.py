@@ -75,7 +75,7 @@ def load_model() -> dict[str, Any]:
 
 
 def _select_models(f: Features) -> dict[str, Any]:
-    """What pairs with these features are judged by: a slice shows no heights, and is another matter."""
+    """Select the models for pairs with these features: a slice shows no heights and has models of its own."""
     models: dict[str, Any] = load_model()["flat" if f["sliced"] else "solid"]
     return models
 

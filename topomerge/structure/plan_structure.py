@@ -338,7 +338,7 @@ def _shift_line(line: Line, off: Array, extent: Line) -> Line:
 
 @dataclass(frozen=True, eq=False)
 class PlanStructure:
-    """What stands between rooms.
+    """Walls, openings and windows between the rooms of a map.
 
     Args:
         walls: (W,) WALL_DTYPE, by storey.

@@ -37,7 +37,7 @@ class UploadError(InputError):
 
 @dataclass(frozen=True)
 class UploadLimits:
-    """What may be added: bytes of a file, files in the folder, and files at a time."""
+    """Limits of uploads: bytes of a file, files in the folder, and files at a time."""
 
     file_bytes: int = 50 << 30
     files: int = 2000
@@ -140,7 +140,7 @@ class StudioFolder:
             shutil.rmtree(place, ignore_errors=True)
 
     def _iter_paths(self, folder: Path) -> Iterator[Path]:
-        """What is visible of a folder and lies in it: links that lead out are left out."""
+        """Yield the visible entries of a folder, without links that lead out of it."""
         try:
             names = sorted(entry.name for entry in os.scandir(folder) if not entry.name.startswith("."))
         except OSError:
@@ -177,7 +177,7 @@ def clean_name(name: str) -> str:
 
 @lru_cache(maxsize=4 * MOST_ENTRIES)
 def _describe_entry(path: Path, stamp: tuple[int, int]) -> dict[str, Any] | None:
-    """What an entry of the folder is; None: nothing that the page shows. Read again when its stamp changes."""
+    """Describe an entry of the folder; None where the page does not show it. It is read again when its stamp changes."""
     about = {"name": path.name, "bytes": stamp[1], "changed": stamp[0] // 1_000_000}
     suffix = path.suffix.lower()
     if path.is_dir():

@@ -280,7 +280,7 @@ def _describe(folder: StudioFolder, maps: OpenMaps, path: Path, listing: Mapping
 
 
 def _list_alternatives(each: Mapping[str, float]) -> list[tuple[str, float]]:
-    """What else it could be, in words, with its probability; the most probable first."""
+    """List the alternatives in words, each with its probability; the most probable first."""
     ranked = sorted(each.items(), key=lambda one: -one[1])
     return [(WORDS.get(name, name), float(p)) for name, p in ranked if p >= LEAST_SHOWN]
 

@@ -1,4 +1,4 @@
-"""What the page draws of a map: plans of its storeys as outlines, doors and labels, on a paper in cm."""
+"""Drawings of a map for the page: plans of its storeys as outlines, doors and labels, on a paper in cm."""
 
 from __future__ import annotations
 
@@ -190,7 +190,7 @@ def assign_colours(rooms: int, pairs: Array, old: Mapping[int, int]) -> Array:
 
 
 def _describe_rooms(map: TopometricMap, colours: Array) -> list[dict[str, Any]]:
-    """What is known of each room, without its outline."""
+    """Describe each room, without its outline."""
     names = find_room_names(map.landmarks, len(map.rooms))
     texts = {kind: _find_room_words(map, kind) for kind in ("use", "area") if kind in LANDMARK_KINDS}
     described = []
@@ -209,7 +209,7 @@ def _find_room_words(map: TopometricMap, kind: str) -> dict[int, str]:
 
 
 def _list_parts(map: TopometricMap, sheet: Sheet, storey: int) -> dict[str, Any]:
-    """What a storey has beside its rooms."""
+    """List the doors, stairs, windows, narrowings and landmarks of a storey."""
     of_storey = map.rooms["storey"] == storey if len(map.rooms) else np.zeros(0, bool)
     edges = np.flatnonzero(of_storey[map.edges["rooms"]].any(axis=1)).tolist() if len(map.edges) else []
     windows = map.windows[of_storey[map.windows["rooms"][:, 0]]] if len(map.windows) else map.windows

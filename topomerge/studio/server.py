@@ -174,13 +174,13 @@ class Studio:
         return _send_package_file(PAGE_FILES[name], name)
 
     async def send_events(self, _: Request) -> Response:
-        """What happens, from now on."""
+        """Stream the events from now on."""
         return StreamingResponse(self.hub.stream(), media_type="text/event-stream")
 
     # The folder.
 
     async def list_folder(self, _: Request) -> Response:
-        """What lies in the folder, and the jobs."""
+        """List the entries of the folder, and the jobs."""
         entries = await run_in_threadpool(self.folder.list_entries)
         return JSONResponse(
             {"name": self.folder.root.name, "entries": entries, "jobs": [job.describe() for job in self.jobs.jobs.values()]}

@@ -250,7 +250,7 @@ class MapPair(Data):
 
     @property
     def truth(self) -> Truth:
-        """What belongs together in a batch."""
+        """Return which rooms of the batch belong together."""
         pair, side, true = self["batch"], self["side"], self["true"]
         same = torch.zeros((len(pair), len(pair)), dtype=torch.bool, device=pair.device)
         first, second = self["match_index"]

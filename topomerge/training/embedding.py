@@ -141,7 +141,7 @@ def fit(settings: Training, log_line: LogFn = lambda text: print(text, file=sys.
 
 
 class EmbeddingJob:
-    """What the loop does for an embedder.
+    """The job of training an embedder, as the loop runs it.
 
     Args:
         pairs: to train on, to watch, and, where `replay` is set, to draw from besides.

@@ -31,7 +31,7 @@ RUN = "run"  # folder of the training in the output
 
 @dataclass(frozen=True)
 class Verdict:
-    """What fine-tuning did on the pairs that were left out.
+    """The verdict on fine-tuning: its gain on the pairs that were left out.
 
     Args:
         old, new, gain: of each of `SCORES`: value, and the ends of its 95 % interval; the gain is drawn in pairs.

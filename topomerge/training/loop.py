@@ -90,11 +90,11 @@ class Schedule:
 
 
 class Job(Protocol):
-    """What a task does in the loop."""
+    """The job of a task, as the loop runs it."""
 
     @property
     def network(self) -> torch.nn.Module:
-        """What is trained."""
+        """Return the network that is trained."""
 
     def iter_batches(self, state: State) -> Generator[Any, None, None]:
         """Yield the batches of the state's epoch, from its step on."""
@@ -307,7 +307,7 @@ class Loop:
 
 
 def build_diverged(state: State) -> InputError:
-    """What is raised where a loss or its gradient is no finite number."""
+    """Build the error for a loss or gradient that is no finite number."""
     where = f"step {state.step + 1} of epoch {state.epoch + 1}"
     return InputError(f"training diverged by {where}: a loss or gradient is no finite number; train anew with a lower rate")
 
@@ -423,7 +423,7 @@ class NetworkJob(ABC):
         """Write the weights as the package has them."""
 
     def interface(self) -> dict[str, Any]:
-        """What a card says of inputs and outputs; nothing of weights that are no network of `topomerge.networks`."""
+        """Describe inputs and outputs for the card; nothing for weights that are no network of `topomerge.networks`."""
         return {}
 
     def write_checkpoint(self, folder: Path, row: Mapping[str, Any]) -> None:
@@ -469,7 +469,7 @@ class ExportedJob(NetworkJob):
         export_network(module, signature, [tensor.to(self.device) for tensor in sample], path)
 
     def interface(self) -> dict[str, Any]:
-        """What it does, inputs and outputs."""
+        """Describe what the network does, its inputs and outputs."""
         return self.exported().signature.describe()
 
 

@@ -165,7 +165,7 @@ def _add_sheets(pairs: Sequence[GraphPair], files: Sequence[Path], packed_file: 
 
 
 def _get_landmarks(arrays: Mapping[str, Array], extras: Sequence[str]) -> dict[str, Array]:
-    """What landmarks say of all rooms, where it is wanted; of sets without any, 0."""
+    """Get the landmark features of all rooms, where they are asked for; 0 in sets without any."""
     none = np.zeros((len(arrays["x"]), count_columns(LANDMARK_PART)), np.float32)
     return {LANDMARK_PART: arrays.get(LANDMARK_PART, none)} if LANDMARK_PART in extras else {}
 

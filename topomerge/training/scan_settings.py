@@ -26,7 +26,7 @@ class PlanLoss:
 
 @dataclass
 class PlanAugment:
-    """What is taken away from crops while training, now and then.
+    """Augmentation of crops while training: what is taken away, now and then.
 
     Args:
         upper: share of crops without ceiling or without floor.
@@ -132,7 +132,7 @@ class DrawingSegmentation(RasterTask):
 
 @dataclass
 class WallAugment:
-    """What is done to stretches of walls while training, beside mirroring.
+    """Augmentation of stretches of walls while training, beside mirroring.
 
     Args:
         shift: elements by which a face is moved nearer or farther, at most.

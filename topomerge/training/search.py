@@ -36,7 +36,7 @@ OWN_WORDS = ("search", "name", "runs", "resume", "overwrite")  # which a trial h
 
 @dataclass(frozen=True)
 class Plan:
-    """What each process of a search needs.
+    """The plan of a search, as each of its processes needs it.
 
     Args:
         words: of every trial.

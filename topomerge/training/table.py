@@ -107,7 +107,7 @@ class SweepTable:
     """Hydra's callback that writes table.md when all runs of a sweep have ended."""
 
     def _ignore_event(self, **_: Any) -> None:
-        """What else Hydra reports."""
+        """Ignore the other events that Hydra reports."""
 
     on_run_start = on_run_end = on_multirun_start = on_job_start = on_job_end = on_compose_config = _ignore_event
 

@@ -77,7 +77,7 @@ def _is_finished(runs: Path, task: str) -> bool:
 
 
 def _read_seconds(runs: Path) -> dict[str, float]:
-    """What was recorded of the steps."""
+    """Read the seconds that were recorded of the steps."""
     path = runs / "seconds.json"
     seconds: dict[str, float] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     return seconds

@@ -177,7 +177,7 @@ class Deformation:
 
     @staticmethod
     def from_json(values: Mapping[str, Any]) -> Deformation:
-        """What `to_json` gave.
+        """Build a deformation from what `to_json` gave.
 
         Raises:
             InputError: something else, or a deformation that folds space.

@@ -266,7 +266,7 @@ def _render_verdict(result: MergeResult) -> Markup:
 
 
 def _render_observations(result: MergeResult) -> list[Markup]:
-    """What would settle the merge, where anything would."""
+    """Render the observations that would settle the merge, where any would."""
     if not result.settle:
         return []
     names = [m.title for m in result.maps]

@@ -100,7 +100,7 @@ def _compute_shades(map: TopometricMap, rooms: Array, probability: Array) -> Arr
 
 
 def _render_pairs(matches: Sequence[RoomMatch], a: TopometricMap, b: TopometricMap) -> list[Markup]:
-    """What stands around the rooms of each match, folded."""
+    """Render the surroundings of the rooms of each match, folded."""
     if not matches:
         return []
     around_a, around_b = (cut_crops(build_sheet_arrays(m)) for m in (a, b))

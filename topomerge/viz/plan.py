@@ -1,4 +1,4 @@
-"""What views of a map show: rasters of its storeys, and its cells in 3D."""
+"""Data of the views of a map: rasters of its storeys, and its cells in 3D."""
 
 from __future__ import annotations
 

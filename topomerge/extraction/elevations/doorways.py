@@ -197,7 +197,7 @@ def _build_doorway(face: Array, room: int, doors: Array, start: int, stop: int) 
 
 
 def _merge_faces(rows: Array) -> Array:
-    """What several faces show of one doorway as one row, the likeliest first."""
+    """Merge the rows of several faces of one doorway into one, the likeliest first."""
     if len(rows) < 2:
         return rows
     from scipy.cluster.hierarchy import fcluster, linkage  # here: maps that are only merged need none of it

@@ -48,7 +48,7 @@ LEAST_FILL = 0.01  # share of the elements
 
 @dataclass(frozen=True, eq=False)
 class DoorCandidates:
-    """What plans or walls show.
+    """Candidates for doors from plans or walls.
 
     Args:
         edges: (n,) EDGE_DTYPE.

@@ -1,4 +1,4 @@
-"""What the maps that a joined map was made of say of its narrowings: is there a door, or one room on both sides (docs/adr/0020)?
+"""Votes of the maps that a joined map was made of on its narrowings: is there a door, or one room on both sides (docs/adr/0020)?
 
 Walls of two maps that do not quite meet, and a slice among scans, make narrowings where no map has any, and hide doors that one
 of them has. What each map had for one room, and what for two, is weighed with what the joined plan shows.

@@ -241,8 +241,8 @@ def _remove_clutter(wall: Array, edge: float) -> Array:
 
 
 def _fill_holes(inside: Array, wall: Array, seen: Array, covered: Array, edge: float) -> Array:
-    """What is known, without small holes and without parts of which neither a floor was seen nor walls around what has a ceiling
-    or was looked through (`covered`)."""
+    """Return the observed columns, without small holes and without parts of which neither a floor was seen nor walls around what
+    has a ceiling or was looked through (`covered`)."""
     reach = max(round(0.2 / edge), 1)
     closed = ndimage.binary_closing(np.pad(inside | wall, reach), np.ones((2 * reach + 1,) * 2))[reach:-reach, reach:-reach]
     hole, count = ndimage.label(~closed)

@@ -1,4 +1,4 @@
-"""What probably stands in each column of a plan: a convolutional network, trained on simulated scans of training buildings
+"""Class probabilities of each column of a plan: a convolutional network, trained on simulated scans of training buildings
 (`train.py task=plan_segmentation`; for robots' grids and drawings `task=grid_segmentation`; beyond the thesis: docs/adr/0005).
 
 A U-Net (Ronneberger et al. 2015) over what the plan knows of each column. It sees a few metres around, so that it may take the

@@ -128,7 +128,7 @@ class StoreyPlan:
 
 @dataclass(frozen=True)
 class WallRule:
-    """What makes a column a wall.
+    """The rule that makes a column a wall.
 
     Args:
         share: of the observed bands that it fills.

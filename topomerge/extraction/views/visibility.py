@@ -1,4 +1,4 @@
-"""What views see: rays through a sparse voxel octree (seeds 2.5)."""
+"""Visibility from views: rays through a sparse voxel octree (seeds 2.5)."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ def place_component(a: Poses, b: Poses, pair: tuple[int, int], pose: Sim3) -> Si
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """What names placements of two maps (i < j).
+    """A source of placements of two maps (i < j).
 
     Args:
         named: poses T_ij with their shares.
@@ -215,7 +215,7 @@ class _LinkScorer:
         return self._poses[pair, move]
 
     def _compute_share(self, source: Source) -> float | None:
-        """What a source gives to the placement of the link; None where it does not name it."""
+        """Compute the share of a source for the placement of the link; None where it does not name it."""
         if source not in self._shares:
             pose, named = self._compute_pose(source.pair, self.move), None
             if source.direct and source.pair == self.pair:  # the link itself, even if others moved it a little
@@ -228,7 +228,7 @@ class _LinkScorer:
         return next((share for p, share in source.named if self.evidence.is_same_pose(*source.pair, p, pose, limits)), None)
 
     def _compute_rival_share(self, source: Source, rival: Sim3) -> float | None:
-        """What a source gives to a rival placement or to a poor fit near it, but for what it gives to the link itself."""
+        """Compute the share of a source for a rival placement or a poor fit near it, without its share for the link itself."""
         own, pose = self._compute_pose(source.pair, self.move), self._compute_pose(source.pair, rival)
         others = [(p, share) for p, share in source.named if not self.evidence.is_same_pose(*source.pair, p, own)]
         near = [share for p, share in others if self.evidence.is_same_pose(*source.pair, p, pose, LOOK_ALIKE_LIMITS)]
@@ -252,7 +252,7 @@ class _LinkScorer:
         return max(odds, default=0.0) + min(sum(supports), CLOSING_GAIN)
 
     def _sum_contradictions(self, move: Sim3) -> tuple[float, dict[tuple[int, int], float]]:
-        """What walls on free floor say against a placement, each place once; and the cost of each pair by itself."""
+        """Sum the evidence of walls on free floor against a placement, each place once; and the cost of each pair by itself."""
         costs: dict[tuple[int, int], float] = {}
         places: list[tuple[Array, float]] = []
         for source in self.sources:

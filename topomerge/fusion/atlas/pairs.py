@@ -160,7 +160,7 @@ def serialise_contradiction(c: Contradiction) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Check:
-    """What two maps say to a pose T_ij.
+    """The check of a pose T_ij by its two maps.
 
     Args:
         pose: after it was moved to where the walls meet.
@@ -243,7 +243,7 @@ class Checks:
         return _get_or_compute(self._fine, (i, j), pose, self.maps.get_middle(j), make)
 
     def __call__(self, i: int, j: int, pose: Sim3) -> Check:
-        """What maps i and j say to T_ij."""
+        """Check T_ij by maps i and j."""
         if j < i:
             turned = self(j, i, pose.inverse())
             back = turned.pose.inverse()
@@ -284,7 +284,7 @@ class Checks:
 def _get_or_compute(
     memory: dict[tuple[int, int], list[tuple[Sim3, T]]], pair: tuple[int, int], pose: Sim3, at: Array, make: Callable[[], T]
 ) -> T:
-    """What was made for a pair under a pose that is the same, or what is made now."""
+    """Get the value of a pair under the same pose from the memory, or compute it now."""
     entries = memory.setdefault(pair, [])
     for other, value in entries:
         if is_same_pose(pose, other, at, CHECKED_ONCE):

@@ -196,7 +196,7 @@ def select_tile(map: TopometricMap, rooms: Sequence[int] | Array) -> TopometricM
 
 @dataclass(frozen=True)
 class Change:
-    """What an atlas shall hold.
+    """A change of an atlas: the maps and settings that it shall hold.
 
     Args:
         stored: its maps and settings.

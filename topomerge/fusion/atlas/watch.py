@@ -269,7 +269,7 @@ class FolderWatcher:
         return compute_stamp(path, self.reader.options)
 
     def _list_inputs(self) -> list[Path]:
-        """What may be a map."""
+        """List the files that may be maps."""
         try:
             there = sorted(p for p in self.folder.resolve().iterdir() if not p.name.startswith("."))
         except OSError as error:
@@ -299,7 +299,7 @@ class FolderWatcher:
             yield batch
 
     def _read_file(self, path: Path) -> _ReadFile | None:
-        """What a file gives; None where it changes meanwhile."""
+        """Read a file as a map; None where it changes meanwhile."""
         stamp, sources = self._compute_stamp(path), read_sources(self.atlas)
         try:
             digest = compute_digest(path, self.reader.options)
@@ -329,7 +329,7 @@ class FolderWatcher:
 
 
 class _Plan:
-    """What a batch changes of an atlas, found out when nobody else can change it."""
+    """The changes of an atlas by a batch, planned while nobody else can change it."""
 
     def __init__(self, watch: FolderWatcher, batch: list[_ReadFile]) -> None:
         self.watch, self.batch = watch, batch

@@ -106,7 +106,7 @@ def _join_graphs(graphs: Sequence[KartoGraph], doubt: Doubt) -> int:
 
 
 def _list_values(of: Sequence[Any]) -> list[Any]:
-    """What a list holds, or a map of numbers."""
+    """List the values of a list, or of a map by number."""
     return [entry[1] if isinstance(entry, tuple) else entry for entry in of]
 
 

@@ -283,7 +283,7 @@ def _write_value(base: sqlite3.Connection, table: str, column: str, steps: dict[
 
 
 def _choose_ending(base: sqlite3.Connection) -> str:
-    """What is put behind the names of nodes that another session has, so that no two are alike."""
+    """Choose the ending for names of nodes that another session has, too, so that no two are alike."""
     there, own = (
         {label for (label,) in base.execute(f"SELECT label FROM {schema}.Node WHERE label IS NOT NULL")}
         for schema in ("main", "source")
