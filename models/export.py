@@ -140,8 +140,8 @@ class GraphRewriter:
             kernel = self._add("MatMul", [kernel, columns], f"{name}_kernel")
             low = self._add("Conv", [x, kernel], f"{name}_low", pads=pads, kernel_shape=[2, 2])
             inputs = [skip, f"{out}_of_skip", node.input[2]]
-            beside = self._add("Conv", inputs, f"{name}_skip", pads=pads, kernel_shape=[3, 3], strides=[2, 2])
-            phase = self._add("Relu", [self._add("Add", [beside, low], f"{name}_sum")], name)
+            own = self._add("Conv", inputs, f"{name}_skip", pads=pads, kernel_shape=[3, 3], strides=[2, 2])
+            phase = self._add("Relu", [self._add("Add", [own, low], f"{name}_sum")], name)
             phases.append(
                 phase if last is None else self._add("Conv", [phase, *last.input[1:]], f"{name}_last", kernel_shape=[1, 1])
             )

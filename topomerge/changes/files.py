@@ -169,8 +169,8 @@ def save_bcf(changes: Changes, path: str | Path) -> None:
         _fix_dates(temporary)
 
 
-def _make_guid(*words: str) -> str:
-    return str(uuid.uuid5(uuid.NAMESPACE_URL, ":".join(("topomerge", *words))))
+def _make_guid(*parts: str) -> str:
+    return str(uuid.uuid5(uuid.NAMESPACE_URL, ":".join(("topomerge", *parts))))
 
 
 def _build_camera(model: Any, change: Change) -> Any:

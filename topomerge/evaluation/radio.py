@@ -228,8 +228,8 @@ def tabulate_left_out(rows: Sequence[Row]) -> str:
             cells += [f"{trials[:, 1].mean():.2f}", f"{(trials[:, 0] <= FAR).mean():.2f}", f"{z:.2f}"]
         lines.append([name, *cells])
     head = ["storey left out", "verdicts", "log loss", "other place: told", "was"]
-    for words in ("half of all walks", f"{WALKS[1]} walks"):
-        head += [f"{words}: pose told right", f"within {FAR:g} m", "error over sigma"]
+    for selection in ("half of all walks", f"{WALKS[1]} walks"):
+        head += [f"{selection}: pose told right", f"within {FAR:g} m", "error over sigma"]
     return write_table(head, lines)
 
 

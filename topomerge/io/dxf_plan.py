@@ -69,7 +69,7 @@ class PlanMasks:
     warnings: tuple[str, ...] = ()
 
 
-class _Raster:
+class _LineRaster:
     """Pixels over all lines, first row at the top."""
 
     def __init__(self, lines: list[Line], pixel: float) -> None:
@@ -128,7 +128,7 @@ def build_plan_masks(lines: list[Line], swings: list[Swing], pixel: float) -> Pl
         swings: arcs of doors, in m.
         pixel: m.
     """
-    raster = _Raster(lines, pixel)
+    raster = _LineRaster(lines, pixel)
     swings = [s for s in swings if SWING[0] <= np.linalg.norm(s.ends[0] - s.hinge) <= SWING[1]]
     is_leaf = [line.kind == "door" or is_door_leaf(line, swings) for line in lines]
     leaves, walls = ([line for line, leaf in zip(lines, is_leaf, strict=True) if leaf is side] for side in (True, False))
@@ -188,7 +188,7 @@ def _fill_narrow(drawn: Array, pixel: float) -> Array:
     return drawn | (size >= LEAST_NARROW)[label]
 
 
-def find_gaps(raster: _Raster, occupied: Array, swings: list[Swing], leaves: list[Line]) -> list[Array]:
+def find_gaps(raster: _LineRaster, occupied: Array, swings: list[Swing], leaves: list[Line]) -> list[Array]:
     """Find the (2, 2) ends of the gap of each door: of its arc, else of its block."""
     gaps = []
     boxes = np.array([[*line.points.min(axis=0), *line.points.max(axis=0)] for line in leaves]).reshape(-1, 4)
@@ -220,7 +220,7 @@ def _runs_along(points: Array, start: Array, end: Array) -> bool:
     return max(away) < LEAF_THICKNESS
 
 
-def _score_gap(raster: _Raster, occupied: Array, ends: Array) -> float:
+def _score_gap(raster: _LineRaster, occupied: Array, ends: Array) -> float:
     """Count the ends (2, 2) beyond which a wall goes on."""
     along = (ends[1] - ends[0]) / max(float(np.linalg.norm(ends[1] - ends[0])), 1e-9)
     score = 0.0
@@ -229,7 +229,7 @@ def _score_gap(raster: _Raster, occupied: Array, ends: Array) -> float:
     return score
 
 
-def _find_block_gap(raster: _Raster, occupied: Array, points: Array) -> list[Array]:
+def _find_block_gap(raster: _LineRaster, occupied: Array, points: Array) -> list[Array]:
     """The gap of a door without an arc: the line across its box whose ends meet walls; none where no line's do."""
     from shapely import MultiPoint
 
@@ -252,7 +252,7 @@ def _lengthen(ends: Array, length: float) -> Array:
     return ends + np.stack([-along, along]) * length
 
 
-def _erase_gap(raster: _Raster, occupied: Array, ends: Array) -> None:
+def _erase_gap(raster: _LineRaster, occupied: Array, ends: Array) -> None:
     """Erase what is drawn across a gap."""
     inner = _lengthen(ends, -2 * raster.pixel)
     along = (inner[1] - inner[0]) / np.linalg.norm(inner[1] - inner[0])
@@ -260,7 +260,7 @@ def _erase_gap(raster: _Raster, occupied: Array, ends: Array) -> None:
     raster.fill(occupied, [np.stack([inner[0] - aside, inner[1] - aside, inner[1] + aside, inner[0] + aside])], False)
 
 
-def _fill_floor(raster: _Raster, occupied: Array, seals: Array) -> PlanMasks:
+def _fill_floor(raster: _LineRaster, occupied: Array, seals: Array) -> PlanMasks:
     """Fill the floor: all that the page's border can't reach, but for parts as thin as a wall that have no door."""
     pixel = raster.pixel
     closed = occupied | seals

@@ -15,7 +15,7 @@ from topomerge.structure.floors import compute_jambs
 from topomerge.types import LANDMARK_KINDS, Array, TopometricMap, classify_door_state, find_room_names
 from topomerge.viz.plan import (
     StoreyCells,
-    StoreyPlan,
+    StoreyView,
     compute_frame,
     find_label_place,
     format_hex_colour,
@@ -114,7 +114,7 @@ def build_plan_data(
 
 
 def _trace_storey(
-    plan: StoreyPlan, sheet: Sheet, known: Mapping[bytes, Outline], kept: dict[bytes, Outline]
+    plan: StoreyView, sheet: Sheet, known: Mapping[bytes, Outline], kept: dict[bytes, Outline]
 ) -> dict[int, Outline]:
     """Room -> its outline; one whose pixels are known is not traced again. All go to `kept`."""
     room = fill_rooms(plan, sheet.frame)

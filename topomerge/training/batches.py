@@ -184,10 +184,10 @@ def augment_sheet(graph: Graph, augment: Augment, generator: torch.Generator) ->
     return {**out, "sheet": torch.from_numpy(planes), "sheet_room": torch.from_numpy(room), **places}
 
 
-def _rotate_relative_positions(ways: Tensor, angle: float) -> Tensor:
+def _rotate_relative_positions(positions: Tensor, angle: float) -> Tensor:
     """Ways (E, 4), two of x and y each, turned by an angle, rad."""
     c, s = math.cos(angle), math.sin(angle)
-    return (ways.reshape(-1, 2, 2) @ torch.tensor([[c, s], [-s, c]])).flatten(1)
+    return (positions.reshape(-1, 2, 2) @ torch.tensor([[c, s], [-s, c]])).flatten(1)
 
 
 def mirror_graph(graph: Graph) -> Graph:

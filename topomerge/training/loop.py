@@ -480,18 +480,18 @@ def run_network(job: Job, settings: NetworkTask, steps: int, log_line: LogFn) ->
         The row of the best epoch.
     """
     check_exporter()
-    state, chief = State(), get_rank() == 0
+    state, is_main_process = State(), get_rank() == 0
     task = TASKS[settings.task]
     if settings.init_from and not settings.resume:
         start_from_exported(job, settings, task.file)
     if settings.resume:
         state = State(**load_state(settings.folder / "last", job.network, job.get_optimizer(), NETWORK_FILE))
-    if chief:
+    if is_main_process:
         device = str(next(job.network.parameters()).device)
         begin_run(settings, torch.cuda.get_device_name() if device.startswith("cuda") else device, torch.get_num_threads())
-    log = MetricsLog(settings, state.epoch) if chief else None
+    log = MetricsLog(settings, state.epoch) if is_main_process else None
     schedule = Schedule(settings, steps, lower=settings.watch in task.lower)
     best = Loop(job, schedule, state, log, log_line).run()
-    if settings.export and chief:
+    if settings.export and is_main_process:
         export_files(settings.folder / "best", settings.export, task.package)
     return best

@@ -119,7 +119,7 @@ class PlaceJob(ExportedJob):
         origin |= {"right": int(learned.right.sum()), "watched": len(watched.right)}
         super().__init__(settings, PlaceNetwork(settings.widths, settings.dropout), origin)
         self.options, self.learned, self.watched = settings, learned, watched
-        self.chance = learned.weight / learned.weight.sum()
+        self.probability = learned.weight / learned.weight.sum()
 
     def iter_batches(self, state: State) -> Generator[tuple[torch.Tensor, ...], None, None]:
         """Yield squares, from a generator of each step."""
@@ -127,7 +127,7 @@ class PlaceJob(ExportedJob):
         options, learned = self.options, self.learned
         for step in range(state.step, options.steps):
             rng = self.start_generator(1, state.epoch, step)
-            rows = rng.choice(len(self.chance), options.batch, p=self.chance)
+            rows = rng.choice(len(self.probability), options.batch, p=self.probability)
             x = augment_planes(learned.planes[rows].astype(np.float32), options.augment, rng)
             right = torch.from_numpy(learned.right[rows].astype(np.float32))
             yield torch.from_numpy(x).permute(0, 3, 1, 2), right

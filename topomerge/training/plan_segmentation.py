@@ -164,7 +164,7 @@ class PlanJob(ExportedJob):
         self.options, self.watched = settings, watched
         self.plans = [build_plan_tensors(e, settings.loss) for e in learned]
         probability = np.sqrt([float(e.room.size) for e in learned])
-        self.chance = probability / probability.sum()
+        self.probability = probability / probability.sum()
 
     def iter_batches(self, state: State) -> Generator[tuple[torch.Tensor, ...], None, None]:
         """Yield crops."""
@@ -176,7 +176,7 @@ class PlanJob(ExportedJob):
         options = self.options
         for step in range(state.step, options.steps):
             rng = self.start_generator(1, state.epoch, step)
-            rows = rng.choice(len(self.plans), options.batch, p=self.chance)
+            rows = rng.choice(len(self.plans), options.batch, p=self.probability)
             crops = [crop(self.plans[row], options.crop, options.augment, rng) for row in rows]
             x, truth, weight = (np.stack(arrays) for arrays in zip(*crops, strict=True))
             labels = torch.from_numpy(truth.astype(np.int64))

@@ -151,9 +151,9 @@ def _render_index(result: AtlasResult, pages: Mapping[int, str]) -> Markup:
     return render_section("The joined maps", _render_text_table(("page", "maps", "weakest link", "names"), rows), "joined")
 
 
-def _render_link(words: str, file: str | None) -> str:
+def _render_link(text: str, file: str | None) -> str:
     """Words that lead to a file beside this one, if there is one."""
-    return words if file is None else build_element("a", words, href=file)
+    return text if file is None else build_element("a", text, href=file)
 
 
 def _render_verdict(result: AtlasResult, parts: Iterable[str]) -> Markup:

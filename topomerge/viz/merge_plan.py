@@ -13,7 +13,7 @@ import numpy as np
 from topomerge.fusion.result import RoomMatch
 from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.types import Array, Deformation, Placement, Sim3, TopometricMap
-from topomerge.viz.plan import StoreyPlan, find_label_places, format_hex_colour
+from topomerge.viz.plan import StoreyView, find_label_places, format_hex_colour
 from topomerge.viz.report import render_zoom_buttons
 from topomerge.viz.svg import Sheet, lay_out, render_drawing, trace_rooms, trace_walls
 from topomerge.viz.tables import Markup, build_element, join, render_room_link
@@ -191,7 +191,7 @@ def format_centimetres(metres: float) -> str:
     return f"{100 * metres:.1f} cm" if metres < 0.1 else f"{100 * metres:.0f} cm"
 
 
-Drawn = tuple[Sheet, list[StoreyPlan]]
+Drawn = tuple[Sheet, list[StoreyView]]
 LEVEL_TOLERANCE = 0.7  # m by which floors of one storey may differ
 AFFINE_REACH = 10_000  # cm: places on the paper are rounded, so an affine map is measured over a long way
 
@@ -277,7 +277,7 @@ class _OverlaySide:
     name: str
     map: TopometricMap
     sheet: Sheet
-    plans: list[StoreyPlan]
+    plans: list[StoreyView]
     pose: Sim3
     bend: Deformation | None
 
@@ -391,7 +391,7 @@ def render_lines(
     return build_element("svg", *parts, class_="plan lines", viewBox=view, style=style, role="img", aria_label=text)
 
 
-def _render_storey(map: TopometricMap, sheet: Sheet, plan: StoreyPlan, colours: Array | None) -> list[Markup]:
+def _render_storey(map: TopometricMap, sheet: Sheet, plan: StoreyView, colours: Array | None) -> list[Markup]:
     shades = assign_room_colours(map) if colours is None else colours
     rooms = [
         build_element(

@@ -187,10 +187,10 @@ def save_merge(result: MergeResult, folder: str | Path) -> None:
         with ExitStack() as stack, ThreadPoolExecutor(1) as pool:  # all are whole before the first is renamed
             places = [stack.enter_context(replace_on_success(folder / name)) for name, _ in writers]
             jobs = list(zip(writers, places, strict=True))
-            beside = [pool.submit(write, place) for (_, write), place in jobs[2:]]  # a third of it is compression
+            background = [pool.submit(write, place) for (_, write), place in jobs[2:]]  # a third of it is compression
             for (_, write), place in jobs[:2]:
                 write(place)
-            for done in beside:
+            for done in background:
                 done.result()
             (folder / "merge.json").unlink(missing_ok=True)  # renamed last: a kill leaves no list of another run's files
     except BaseException:

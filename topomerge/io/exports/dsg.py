@@ -135,9 +135,9 @@ def _group_edges_by_pair(table: Array) -> dict[tuple[int, int], list[Any]]:
     return dict(sorted(connections.items()))
 
 
-def _describe_edges(ways: list[Any], kind: str = "") -> Json:
+def _describe_edges(edges: list[Any], kind: str = "") -> Json:
     """Kind and width (m) of the widest way, then each way with its centre (m); a given kind stands for that of all."""
-    listed = [{"kind": kind or str(w["kind"]), "width": float(w["width"]), "centre": w["centre"].tolist()} for w in ways]
+    listed = [{"kind": kind or str(w["kind"]), "width": float(w["width"]), "centre": w["centre"].tolist()} for w in edges]
     widest = max(listed, key=lambda way: way["width"])
     return {"kind": widest["kind"], "width": widest["width"], "ways": listed}
 

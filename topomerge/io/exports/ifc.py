@@ -237,9 +237,9 @@ class _BuildingModel(Model):
         property_set.Name = name
         return property_set
 
-    def _define(self, product: Any, facts: Any) -> None:
-        name = f"{product.GlobalId} {facts.GlobalId}"
-        self.create_rooted("IfcRelDefinesByProperties", name, RelatedObjects=[product], RelatingPropertyDefinition=facts)
+    def _define(self, product: Any, properties: Any) -> None:
+        name = f"{product.GlobalId} {properties.GlobalId}"
+        self.create_rooted("IfcRelDefinesByProperties", name, RelatedObjects=[product], RelatingPropertyDefinition=properties)
 
     def add_slab(self, r: int, floor: Any, z: float, storey: Any) -> Any:
         """Return the floor of a room."""

@@ -165,7 +165,7 @@ class Route:
 
     first: int = 0
     nodes: list[Node] = field(default_factory=list)
-    ways: list[Pixel] = field(default_factory=list)
+    links: list[Pixel] = field(default_factory=list)
     edges: list[Edge] = field(default_factory=list)
 
     def add(self, point: Any, **metadata: Any) -> int:
@@ -187,7 +187,7 @@ def plan_storey_route(map: TopometricMap, grid: Occupancy, storey: int, first: i
             _add_room(route, map, grid.crop(wide), clear[wide], r, doors)
     number = first + len(route.nodes)
     place = {node.id: node.point for node in route.nodes}
-    for a, b in route.ways:
+    for a, b in route.links:
         length = float(np.hypot(*np.subtract(place[a], place[b])))
         route.edges += [Edge(number, a, b, length), Edge(number + 1, b, a, length)]
         number += 2
@@ -224,7 +224,7 @@ def _add_room(route: Route, map: TopometricMap, grid: Occupancy, clear: Array, r
             doors[i] = route.add(grid.compute_centre(np.array(leaf)) if is_flight(edge) else point, **values)
         leaves[leaf] = doors[i] if leaf not in leaves else leaves[leaf]
         if leaves[leaf] != doors[i]:
-            route.ways.append((leaves[leaf], doors[i]))
+            route.links.append((leaves[leaf], doors[i]))
     _add_tree(route, grid, mask, clear, parent, leaves, root, middle)
 
 
@@ -294,7 +294,7 @@ def _add_tree(
 ) -> None:
     """Ways from the root to all leaves (pixel -> node), with a node at every fork and bend."""
     if root in leaves:
-        route.ways.append((middle, leaves[root]))
+        route.links.append((middle, leaves[root]))
     nodes = {**leaves, root: middle}
     used: dict[Pixel, int] = {}  # pixel -> how many ways come into it from further out
     far = [leaf for leaf in leaves if leaf != root]
@@ -318,7 +318,7 @@ def _add_chain(route: Route, grid: Occupancy, mask: Array, clear: Array, chain: 
         if chain[i] not in nodes:
             nodes[chain[i]] = route.add(grid.compute_centre(np.array(chain[i])), kind="way")
     names = [nodes[chain[i]] for i in turns]
-    route.ways += [(a, b) for a, b in pairwise(names) if a != b]
+    route.links += [(a, b) for a, b in pairwise(names) if a != b]
 
 
 def _compute_predecessors(mask: Array, clear: Array, size: float, root: Pixel) -> dict[Pixel, Pixel]:
