@@ -269,6 +269,7 @@ class LearnedEmbedder:
         if "edge_way" in names:
             inputs["edge_way"] = compute_edge_positions(inputs)
         read = {name: inputs[name] for name in names}
+        # One call a turn: a graph with all four has four times as many nodes to export and to load (docs/adr/0025).
         computed = [self.run(**(rotate_graph(read, k) if k else read)) for k in range(turns)]
         rows, bins = ([array.astype(np.float64) for array in arrays] for arrays in zip(*computed, strict=True))
         if turns == 1:

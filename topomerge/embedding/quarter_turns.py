@@ -17,6 +17,8 @@ from topomerge.embedding.graph import count_columns
 from topomerge.embedding.surroundings import CROP_SHAPES, rotate_crops
 from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, Array, TopometricMap
 
+# Rows for each turn: a mean over turns could not tell a corridor with rooms to its left from one with rooms to its right
+# (docs/adr/0016).
 QUARTERS = 4
 FACTS = count_columns("x") + 2
 LIKENESS, EVEN = 20.0, 0.65  # log odds that rooms are one grow so fast with the cosine of their rows, and are even at this one
@@ -136,6 +138,7 @@ def estimate_turns(a: TurnedRows, b: TurnedRows) -> tuple[Turn, ...]:
         return tuple(replace(turn, probability=1 / len(turns)) for turn in turns)
     scored = [_score_turn(turn) for turn in turns]
     turns = [replace(turn, shift=shift) for turn, (_, shift) in zip(turns, scored, strict=True)]
+    # No turn is chosen: at the one with most votes a wrong choice lost every room of the pair (docs/adr/0016).
     shares = compute_shares(np.array([evidence for evidence, _ in scored]))
     return tuple(replace(turn, probability=float(share)) for turn, share in zip(turns, shares, strict=True))
 

@@ -99,6 +99,7 @@ def _rasterise_storey(map: TopometricMap, storey: int, near: float, scale: float
     anchors of other storeys' rooms mean nothing."""
     grid, nav = map.grid, map.navigable
     masks, ceiling = _classify_columns(map, storey)
+    # Within 1 degree of the truth in 51 of 52 validation pairs: so crops have the same direction in both maps (docs/adr/0016).
     first, *others = estimate_wall_directions(_compute_middles(grid.origin, np.argwhere(masks[0]), grid.edge))
     turn = near + (first - near + np.pi / 4) % (np.pi / 2) - np.pi / 4 + tilt
     origin, edge = scale * grid.origin, scale * grid.edge

@@ -222,6 +222,7 @@ def coarsen_until_dense(grid: VoxelGrid, neighbours: float, warnings: list[str])
 # At the edge of a door a laser or a depth camera averages what is in front and what is behind: points hang in the opening, and a
 # single one of them obstructs the body of the stick kernel.
 
+# By the median alone (26 of solid walls) the floor beside them was noise, and such plans were refused (docs/adr/0005).
 THICK_SURFACE = 17  # neighbours of a cell in a surface that is two cells thick
 
 

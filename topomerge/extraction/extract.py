@@ -47,6 +47,7 @@ from topomerge.types import EDGE_DTYPE, LEVELLED, Array, PointCloud, TopometricM
 
 # What the score of a passage weighs: the log odds of a door by the plan, and by the walls, on average along a doorway that they
 # show there; 0 where they show none or speak against one.
+# The sensor's way is no evidence here: fitted, it got a weight of the wrong sign (docs/adr/0024).
 SCORE_INPUTS = ("constant", "plan", "shown")
 KINDS = ("walls",)  # of scans that have a model: walls show at heights
 PASSAGES_FILE = "passages.json"
@@ -94,6 +95,7 @@ def choose_scorer(walls: bool) -> Scorer:
     Raises:
         InputError: the weights that ship are damaged.
     """
+    # Slices: a model of their own was fitted and was no better (log loss .265 with it, .248 without: docs/adr/0024).
     if not walls:
         return score_by_plan
     weights = np.array(read_weights_json("topomerge.extraction", PASSAGES_FILE).get("walls", ()), float)
@@ -250,6 +252,7 @@ def gather_evidence(
     watch.begin("segments", 0.4)
     looks = JOINED_LOOKS if parts else LOOKS
     rasters, places = rasterise_storeys(scan, navigable, p.standing_height, looks), scan.places
+    # Rather too many segments than too few: what is merged here, no later evidence can part (docs/adr/0024).
     narrow = min(p.narrow, p.slice_door if scan.flat else p.door)
     storeys = [segment_storey(rasters, i, narrow, parts, places) for i in range(len(rasters.numbers))]
     watch.begin("walls", 0.6)
@@ -270,8 +273,10 @@ def cut_rooms(
     """
     found = gather_evidence(scan, navigable, p, watch, parts)
     watch.begin("rooms", 0.75)
+    # Elevations of joined maps have no say: the faces of two maps differ by more than a leaf lies back (docs/adr/0014).
     weigh = p.walls and not parts
     score = choose_scorer(weigh and found.walls is not None)
+    # Of slices surer doors only: else their furniture cuts rooms (docs/adr/0026).
     door, least = (p.slice_door, LEAST_FLAT_ROOM) if scan.flat else (p.door, LEAST_ROOM)
     cut = [partition_rooms(storey, score, door, least) for storey in found.storeys]  # 2.6
     floor = build_floor(scan.grid, navigable, found.rasters.storey, found.rasters.storeys, cut, found.rasters.factor)

@@ -344,11 +344,14 @@ def compute_navigable_volume(scan: Scan, p: SharedParameters) -> tuple[Scan, Vox
 def _compute_navigable(grid: VoxelGrid, p: SharedParameters, places: Array = NOWHERE) -> VoxelGrid:
     """The steps of 2.3 in their order; those between them are beyond the thesis (docs/adr/0003)."""
     body = _build_stick_kernel(grid.edge, p)
+    # Points that fly in door openings shut nine of ten doors of simulated scans (docs/adr/0003).
     if p.noise:
         grid = remove_flying_cells(grid, p.noise)
     standing = select_unobstructed(grid, body)  # 2.3.1
+    # The upper side of the ceiling was often the largest component (docs/adr/0003).
     if not p.ceilings:
         standing = remove_ceilings(grid, standing, places)
+    # Sparse floors fell apart; more height in place of this turned beds into floor (docs/adr/0003).
     if p.bridge:
         standing = bridge_gaps(grid, standing, body, p.bridge)
     dilated = dilate_upwards(standing, p.dilation)  # 2.3.2

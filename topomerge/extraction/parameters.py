@@ -18,6 +18,7 @@ class SharedParameters:
     sparse: float = 3.5  # cells are doubled until they have that many neighbours of 26 (median): fewer are no surface; 0: never
     stem_height: float = 0.25  # a step may stand beside the foot
     body_width: float = 0.30
+    # Higher than the thesis' body of 0.75 m: table tops under shelves are no floor (docs/adr/0003).
     body_height: float = 1.50  # with the stem 1.75: a grown-up
     dilation: float = 0.25
     bridge: float = 0.30  # half the gap in the floor that is bridged; 0: none

@@ -23,6 +23,8 @@ FLOOR_SHARE = 0.7  # of the columns of a floor lie in such areas; of slices 0 to
 ENCLOSED_SHARE = 0.75  # of the directions in which a place inside sees a wall
 SIGHT_DIRECTIONS = 24
 SIGHT_RANGE = 15.0  # m
+# A slice has one point in a column where a scan has dozens: a single one at the edge of a leaf became a wall that shut the door.
+# Most missed doors of slices were shut so (docs/adr/0018).
 SEEN_THROUGH = 20  # rays through a column for each that ends in it: what hangs there is no wall
 FEW_POINTS = 0.25  # of the usual number in the columns around, where rays are unknown: likewise
 COLUMNS_AROUND = 0.3  # m

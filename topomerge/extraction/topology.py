@@ -308,6 +308,7 @@ def build_topometric_map(grid: VoxelGrid, floor: Floor, body_height: float, know
     areas, area, old_area = _build_areas(floor, label, area)
     owner = areas["room"]
     narrows = find_edges(floor, area, storey[owner], above, lambda a, b: (owner[a] == owner[b]) & fresh[owner[a]])
+    # How surely two areas are one room, so that zones can be cut without extracting again (docs/adr/0047).
     narrows["confidence"] = compute_merge_levels(floor.merges, old_area[narrows["rooms"]])
     return TopometricMap(grid, room, floor.cells, label, rooms, edges, floor.storeys, areas, area, narrows)
 

@@ -43,6 +43,7 @@ def unroll_walls(
     """
     if scan.fine is None or not any(storey.count for storey in storeys):
         return None
+    # Of segments, before rooms exist: so doors on walls have a say in the only cut (docs/adr/0024).
     first, rows = 0, []
     for storey in storeys:
         rows += _faces_of(scan.grid, rasters, storey, first)
@@ -61,6 +62,7 @@ def find_doorways(elevations: Elevations, doors: Array, locate: Locate) -> Array
     Args:
         doors: (n / 2, 3) of `compute_door_probabilities`.
     """
+    # A strip goes on past its face: a doorway there is of the room before it, not of that whose wall is in line (docs/adr/0018).
     found = detect_doorways(elevations, doors, _sides_before(elevations, locate))
     found = found[found["rooms"][:, 0] >= 0].copy()
     for k in np.flatnonzero(found["rooms"][:, 1] < 0).tolist():
@@ -79,6 +81,7 @@ def relabel_walls(walls: StoreyWalls, number: Array) -> StoreyWalls:
     """
     number = np.append(number, -1)
     faces, doorways = walls.elevations.faces.copy(), walls.doorways.copy()
+    # Read once: what walls lie beside is only named anew (docs/adr/0024).
     faces["room"] = number[faces["room"]]
     sides = number[doorways["rooms"]]
     sides[sides[:, 0] == sides[:, 1], 1] = -1

@@ -180,6 +180,7 @@ class _JoinedCells:
         room = map.room[rows].astype(np.int64)
         room = np.where(room >= 0, room + first_room, -1)
         means, points = transform_means(map.grid, placement, rows, cells, self.origin, self.edge)
+        # Walls that were raised from a slice are a guess: they go where no other map has any near (docs/adr/0020).
         if assumed and len(cells):
             added = self._is_occupied(cells) | ~(self._is_surveyed(cells) | self._is_seen_through(cells))
             cells, provenance, room, means, points = cells[added], provenance[added], room[added], means[added], points[added]
@@ -207,6 +208,7 @@ class _JoinedCells:
         labels[row[:before][kept]] = self.room[kept]
         self.room = labels
         means, points = np.concatenate([self.means, means]), np.concatenate([self.points, points])
+        # Means of both maps: so a wall lies within 6 mm of its points and is registered as well as one of a scan (docs/adr/0014).
         self.points = np.bincount(row, points, len(joined))
         total = np.column_stack([np.bincount(row, points * means[:, k], len(joined)) for k in range(3)])
         self.means = np.where(self.points[:, None] > 0, total / np.maximum(self.points, 1e-9)[:, None], 0.5)
@@ -261,6 +263,7 @@ def _build_joined(
         map = _carry_rooms(grid, label, floors, parts)
         map = replace(map, source=name)
     else:
+        # No part has a room that could be carried over (docs/adr/0038).
         map = extract(grid, name=name, carve=False)
         # Floors that the extraction assumes under slices are cells that no map saw.
         rows = grid.find_rows(grid.locate(map.grid.compute_centroids()))
@@ -301,6 +304,7 @@ def _carry_rooms(grid: VoxelGrid, label: Array, floors: Sequence[PartFloor], par
     member = np.where(found.member >= 0, number[found.member], -1)
     map, known = add_carried_odds(map, tables, member, found.share)
     map = add_room_probabilities(map, raised=is_raised(grid), asked=~known)
+    # None for walls: faces of two maps differ by more than a leaf lies back, so doors read off them are worse (docs/adr/0014).
     map = select_distinct_doors(add_wall_doors(map, found.floor.classified_storeys, None))
     assert map.navigable_area is not None
     area = np.append(_number_anew(found.floor.area, map.navigable_area), -1)[found.area_member]

@@ -17,6 +17,7 @@ from topomerge.types import TopometricMap
 MERGE_SCALES = ("fixed", "free")
 POSE_SOURCES = ("search", "rooms", "surfaces")
 FEW_MAPS = 11  # of which each is registered with all others
+# Among many strangers those that lie best lie well by chance (docs/adr/0019).
 LINK_BELIEVED = (0.8, 0.9)  # of few maps; of more, where those that look most alike are sought out among many strangers
 UNIT_SPAN = 300.0  # m, and
 UNIT_RATIO = 30.0  # times the other map: a map that spans this is in another unit

@@ -194,6 +194,7 @@ def unite_rooms(claims: Array, entered: Array, part_of: Array, column: float) ->
     share = common / np.maximum(area[pairs].min(axis=1), 1e-9)
     same = share >= SAME_SHARE
     partly = ~same & (share >= DOUBT_SHARE) & (common >= DOUBT_AREA)
+    # Else a glimpsed outline of 16 m2 takes a room of 5 m2 (docs/adr/0038).
     beyond = (area[pairs] - common[:, None] >= PIECE_AREA) & ~entered[pairs] & entered[pairs[:, ::-1]]
     doubtful = {int(r) for r in pairs[partly | (same & beyond.any(axis=1))].ravel()}
     group = np.arange(len(entered))
@@ -210,6 +211,7 @@ def unite_rooms(claims: Array, entered: Array, part_of: Array, column: float) ->
     names, group = np.unique(group, return_inverse=True)
     pieces = np.zeros((len(names), int(part_of.max(initial=-1)) + 1), np.int64)
     np.add.at(pieces, (group, part_of), area >= PIECE_AREA)
+    # A map that is sure of one large room would take both rooms of a map that glimpsed two (docs/adr/0038).
     doubt = np.asarray((pieces > 1).any(axis=1))
     doubt[group[sorted(doubtful)]] = True
     return group, doubt
@@ -250,6 +252,7 @@ def join_rooms(
     total = np.bincount(owner, minlength=len(doubt))
     doubt |= (total * grid.edge**2 < LEAST_ROOM) | _find_unknown_borders(columns, owner, group, part_of)
     for floor in floors:
+        # Floor of the thesis' preset ends before the walls (docs/adr/0038).
         doubt[group[floor.room]] |= not floor.complete
     number = np.where(doubt, -1, np.cumsum(~doubt) - 1)
     member, owner = number[group], number[owner]
@@ -307,6 +310,7 @@ def _add_fresh_rooms(cut: CutFloor, columns: _Columns, owner: Array, parts: Sequ
     redone = owner[columns.column] < 0
     near = np.zeros((grid.shape[0], grid.shape[1]), bool)
     near[tuple(navigable.cells[redone, :2].T)] = True
+    # The plan network's look was a third of a joined map's time: it looks only where the parts disagree (docs/adr/0038).
     near = edt.edt(~near, parallel=1) * grid.edge <= AROUND
     rows = np.flatnonzero(near[tuple(grid.cells[:, :2].T)])
     standing = redone & navigable.properties["standing"]

@@ -254,6 +254,7 @@ def place_pair(maps: Sequence[TopometricMap], config: MergeConfig, prepared: Seq
     describe = _TimedDescriptor(config.embedder or DEFAULT, watch, config.poses == "rooms")
     fixed = config.decided.get((0, 1))
     searched = config.poses == "search" and fixed is None
+    # Rooms are matched only where walls do not suffice (docs/adr/0021).
     proposals = FallbackProposals(partial(_propose_room_poses, a, b, config, describe), threshold if searched else np.inf)
     choices: dict[str, Any] = {"rigid": config.rigid or fixed is not None, "same": config.same}
     tried = proposals if fixed is None else [fixed]
@@ -410,6 +411,7 @@ class _TimedDescriptor:
 
     def __init__(self, embedder: str | Descriptor, watch: Stopwatch, scales: bool) -> None:
         self.embedder, self.watch = embedder, watch
+        # The one that ships is opened when rooms are asked for, not before each merge (docs/adr/0050).
         if embedder != DEFAULT or scales:
             _ = self.describe  # says at once what is wrong with it
         if scales and hasattr(self.describe, "at_scales"):

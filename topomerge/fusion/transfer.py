@@ -194,6 +194,7 @@ def add_part_odds(joined: TopometricMap, parts: Sequence[PartRooms]) -> Topometr
         present = room >= 0
         places = np.bincount(room[present], minlength=count)
         mean = np.bincount(room[present], part.entered[part.room[present]], count) / np.maximum(places, 1)
+        # By the surest part 94 % of 884 joined rooms are told right, by the joined outline 87 % (docs/adr/0020).
         entered = np.where(places * part.area >= LEAST_COVER * area, np.maximum(entered, mean), entered)
     rooms = joined.rooms.copy()
     rooms["entered"] = np.where(entered >= 0, entered, rooms["entered"])

@@ -294,6 +294,7 @@ def propose_hypotheses(
     """
     plans = (build_room_plans(a), build_room_plans(b))
     pairs = select_best_partners(cost, CONSISTENCY.partners)
+    # From rooms alone, not the search of walls: only so do descriptors reach a merge (docs/adr/0010).
     poses = propose_candidate_poses(a, b, plans, pairs, similarity[tuple(pairs.T)] + 1e-3, scale_free, scale)
     if not len(poses):
         return ()

@@ -26,6 +26,7 @@ from topomerge.types import Array
 
 MATCHER_FILE = "room_matcher.onnx"
 ATTENTION_HEADS = 4
+# Displacements, not coordinates: maps are turned to their walls, so that these are the same in both (docs/adr/0017).
 RINGS = np.array([0.0, 2.0, 4.0, 7.0, 11.0, 16.0, 24.0])  # m: how far another room is
 RING_WIDTH = (0.5, 0.3)  # m, and share of the ring's distance
 WAY_SOFT = 3.0  # m, at which half of the way to a room is told by its direction
@@ -36,6 +37,7 @@ VOTE_UNIT = 3.0  # votes are logarithms of 1 + so many times their sum
 LEVEL_GAP = 0.8  # m: storeys of ways that agree differ by less
 VOTERS = 3  # pairs of rooms that vote, times the number of rooms of both maps,
 MOST_VOTERS = 2000  # and at most
+# Pairs of rooms grow with the product of both maps (docs/adr/0017).
 MOST_VOTED = 20_000  # pairs of rooms that are voted for, the likeliest ones
 FIRST_SHARPNESS = 25.0  # that cosines are multiplied with for the first votes
 LIKENESS_SCALE = 10.0  # that likeness is multiplied with, times what is learned
@@ -120,6 +122,7 @@ def compute_room_odds(a: Rows, b: Rows, likeliest: bool = False) -> tuple[RoomOd
     """
     matcher = load_matcher_weights()
     for rows in (a, b):
+        # Rows of another embedder mean something else: the weights name theirs by its hash (docs/adr/0017).
         if not isinstance(rows, TurnedRows) or not len(rows) or rows.facts is None or rows.embedder != matcher.embedder:
             return ()
     assert isinstance(a, TurnedRows) and isinstance(b, TurnedRows)
@@ -144,6 +147,7 @@ def match_turns(a: TurnedRows, b: TurnedRows, matcher: Matcher, likeliest: bool 
         turns = (max(turns, key=lambda turn: turn.probability),)
     turns = tuple(turn for turn in turns if turn.probability >= LEAST_TURN)
     found = [_match_turn(turn, matcher) for turn in turns]
+    # At wrong turns no room has a partner; the network was trained with such pairs, so that its confidence tells (docs/adr/0017).
     evidence = np.log([turn.probability for turn in turns]) + [odds.confidence for odds in found]
     return tuple(replace(odds, probability=float(p)) for odds, p in zip(found, compute_shares(evidence), strict=True))
 
@@ -184,6 +188,7 @@ def run_network(a: RoomsSeen, b: RoomsSeen, matcher: Matcher) -> RoomOdds:
         feeds |= {f"rows_{side}": map.rows, f"facts_{side}": map.facts, f"places_{side}": map.places - map.places.mean(axis=0)}
         feeds |= {f"heights_{side}": map.heights - map.heights.mean(), f"state_{side}": np.zeros((len(map.rows), matcher.width))}
     likely = compute_first_guess(a.rows @ b.rows.T)
+    # One stage a call, as pairs of rooms vote between two of them, in a compiled loop (docs/adr/0025).
     for stage in range(matcher.stages):
         feeds |= {"stage": np.arange(matcher.stages) == stage, "votes": compute_agreement(likely, a, b)}
         feeds["state_a"], feeds["state_b"], rows, columns = matcher.run(**feeds)

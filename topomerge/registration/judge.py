@@ -159,6 +159,7 @@ class Side:
         rows = np.argwhere(kind > 0)
         self.weight = fields.plan.edge**2 * max(len(rows) / JUDGED_COLUMNS, 1.0)
         if len(rows) > JUDGED_COLUMNS:
+            # A fixed seed: the same maps have the same verdict.
             rows = rows[np.sort(np.random.default_rng(0).permutation(len(rows))[:JUDGED_COLUMNS])]
         at = (rows[:, 0], rows[:, 1])
         self.points = fields.plan.origin + (rows + 0.5) * fields.plan.edge

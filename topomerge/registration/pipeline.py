@@ -41,6 +41,8 @@ from topomerge.types import Sim3, TopometricMap, VoxelGrid
 
 AS_GOOD = 1.5  # log odds: less is no lead
 TESTIFIED = 3  # hypotheses that are bent, too, of those that landmarks speak for most
+# Between rigid maps drift makes the right pose look worse, and wrong ones hardly better: rivals are bent, too. That took the
+# real floor from 37 to about 60 believed pairs of 105 (docs/adr/0015).
 CLOSELY = 3  # hypotheses that are bent at most, the best ones; and one more that no ratio speaks against
 RIGID_FEATURES = {"strain": 0.0, "bent": 0.0, "farthest": 0.0, "doubted": 0.0, "bent_pieces": 0.0, "rmse": float("nan")}
 log = logging.getLogger(__name__)
@@ -133,6 +135,7 @@ def build_candidates(
     if scorer is not None:
         closely += [k for k in select_testified(ranked, scorer) if k not in closely]
     near = [ranked[k] for k in closely]
+    # Bending is half of the time of a registration: it is not done again when rooms propose further poses (docs/adr/0021).
     new = [h for h in near if id(h) not in bent]
     built = run_side_by_side(lambda h: build_candidate(a, b, h, scaled, scorer), new)
     bent |= {id(h): candidate for h, candidate in zip(new, built, strict=True)}
@@ -222,6 +225,7 @@ def register(
         raise InputError(f"scale must be fixed or free, not {scale!r}")
     clock = Stopwatch()
     tell_step(0.0, "draw plans")
+    # More than half of the pose's time goes into each map by itself (docs/adr/0050).
     a, b = run_side_by_side(lambda k: _prepare_completely((a, b)[k], free[k]), (0, 1))
     clock.lap("plans")
     if b.order < a.order:  # so that nothing depends on which comes first
@@ -230,11 +234,14 @@ def register(
         return replace(_invert_registration(swapped), seconds={**swapped.seconds, **clock.seconds})
     pair = _Pair(a, b, scale == "free", clock)
     fallback, first = (proposed, ()) if isinstance(proposed, FallbackProposals) else (None, proposed)
+    # Without the search rivals are missing, and wrong places are believed (docs/adr/0021).
     if searched:
         pair.search([*first, *pair.propose_by_landmarks()])
     else:
         pair.add(first)
     probability = pair.score_candidates(same)
+    # Walls first: on 800 rooms their search takes 1.3 s, rows and matching of rooms 55 s, and rooms hardly ever decide
+    # (docs/adr/0021).
     if fallback is not None and probability < fallback.below:
         tell_step(0.6, "match rooms")
         pair.add(fallback.make())

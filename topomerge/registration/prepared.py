@@ -92,6 +92,7 @@ class Prepared:
         large for that."""
         if sum(fields.plan.wall.size for fields in self.storeys) > SENT_COLUMNS:
             return None
+        # Drawn beside the cloud's extraction, in its process: after it one process would work alone (docs/adr/0050).
         known = {name: value for name, value in vars(self.complete()).items() if name not in ("load", "make_surface")}
         sliced = any(fields.plan.sliced for fields in self.storeys)
         return {**known, "surface": None if sliced else self.make_surface()}

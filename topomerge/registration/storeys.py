@@ -188,6 +188,7 @@ def build_plans(map: TopometricMap | VoxelGrid, free: VoxelGrid | None = None, c
         lattice = (heights, -HEIGHT_BANDS.below * HEIGHT_BANDS.step, HEIGHT_BANDS.step)
         occupied = compute_column_bits(ix, iy, z, *lattice)
         crossed = compute_column_bits(*crossing, *lattice) if crossing else np.zeros(shape, np.uint32)
+        # Without the limit the highest thing of a room below another storey was the floor above (docs/adr/0015).
         high = _estimate_ceiling(ix, iy, np.where(z < next_floor - SLAB, z, np.nan), base, ceiling, shape)
         rasters = (occupied, crossed, heights, high - heights)
         storeys_seen.append(_build_plan(rasters, corner, cell, (floor, ceiling), bool(layers)))

@@ -27,8 +27,10 @@ from topomerge.types import Array
 
 DOOR_CHANCE, LIKELY_DOOR = 0.35, 0.5  # probability of a door of every place of a doorway, and of one of them
 LEAST_WIDTH = 0.45  # m
+# Floor that goes on where nothing was seen is no door (docs/adr/0018).
 SEEN_AROUND, LEAST_ELEMENTS = 10, 12  # places to both sides of a doorway, and elements with points that its wall has there
 LEAF_BANDS = slice(2, 10)  # 0.3 to 1.9 m
+# The network cannot tell a set-back leaf from a niche with a decimetre of wall behind it (docs/adr/0018).
 SURFACE_FILL, EMPTY_FILL, THICKEST_LEAF = 0.3, 0.1, 0.08  # of the elements of a surface, and between two; m between them
 HALF_WALL = 0.06  # m from the face of a wall to its middle, where one face was seen only
 SAME_DOORWAY = 0.45  # m between what two faces show of one doorway
@@ -138,6 +140,7 @@ def merge_openings(doorways: Array) -> tuple[Array, Array]:
     rooms = np.sort(doorways["rooms"], axis=1)
     along = np.column_stack([-doorways["out"][:, 1], doorways["out"][:, 0]])
     apart = doorways["centre"][None] - doorways["centre"][:, None]
+    # Not two doorways with floor between them, however far apart: that joined two doors in a wall of glass (docs/adr/0018).
     gap = np.abs((apart[..., :2] * along[:, None]).sum(axis=2)) - (doorways["width"][:, None] + doorways["width"]) / 2
     off = np.abs((apart[..., :2] * doorways["out"][:, None]).sum(axis=2))
     meet = (gap < SAME_DOORWAY) & (off < SAME_DOORWAY) & (np.abs(along @ along.T) > STRAIGHT)

@@ -249,6 +249,7 @@ class _LinkScorer:
                 support = max(support, self._check(source.pair, self.move).log_odds)
             supports.append(max(support, 0.0) if source.pair != self.pair or not source.direct else 0.0)
             odds += [float(np.log(share / source.none))] if share is not None and source.direct else []
+        # Not their sum: pairs share the gaps and the noise of a map, and four wrong ones of .7 would make .97 (docs/adr/0022).
         return max(odds, default=0.0) + min(sum(supports), CLOSING_GAIN)
 
     def _sum_contradictions(self, move: Sim3) -> tuple[float, dict[tuple[int, int], float]]:
@@ -314,6 +315,7 @@ class _LinkScorer:
             named.append((odds, shares[loser] is not None or (seen[loser] and not source.named), seen[loser]))
             if source.direct and odds < loudest[0]:
                 loudest = odds, source.pair
+        # Not their mean: true links would lose by each pair that hardly overlaps (docs/adr/0022).
         gains = [weigh(((sign * odds, both, seen) for odds, both, seen in named)) for sign in (1.0, -1.0)]
         return gains[0] - gains[1], loudest
 

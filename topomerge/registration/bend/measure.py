@@ -13,8 +13,10 @@ from topomerge.registration.bend.pieces import Pieces
 from topomerge.types import Array, Sim3
 
 SECTORS = 4  # of the directions that walls face; what faces none, or away from all, is compared with all walls
+# Without sides, pieces snap to the other face of a wall, 0.15 m off (docs/adr/0014).
 FACES_ALIKE = -0.3  # cosine, below which two faces are two sides of a wall
 PIECE_POINTS = 200  # wall columns that a piece is registered by
+# Furniture is moved between sessions: pieces go by what is higher, where the map looked that high (docs/adr/0014).
 LEAST_TALL = 0.2  # share of the walls around a piece, below which all of them are taken
 CONTEXT = 1.0  # m around the walls of a piece that are registered with it
 MISSED = 0.05  # of a wall's likelihood, where no wall is near

@@ -16,6 +16,7 @@ from topomerge.matching.poses import PlanFields
 from topomerge.registration.storeys import find_slices, is_extruded
 from topomerge.types import Array, TopometricMap, VoxelGrid
 
+# Blocks, not rooms alone: corridors and halls bend within themselves, and maps without rooms must bend, too (docs/adr/0014).
 PIECE_SIZE = 5.0  # m, of a piece along a main direction; rooms up to `WHOLE_SIZE` are not cut
 WHOLE_SIZE = 7.5
 ROOM_WALL_REACH = 0.6  # m around a room's floor: the walls there are its walls
