@@ -65,7 +65,7 @@ def cloud(millions: int = 20) -> None:
 
 
 def compute_offset(number: int, beside: int) -> Array:
-    """(3,) float32 m, where a floor lies among others that lie beside each other without a gap wider than a wall."""
+    """Return (3,) float32 m, where a floor lies among others that lie beside each other without a gap wider than a wall."""
     return np.array([number % beside * (WIDTH + 0.5), number // beside * (DEPTH + 0.5), 0.0], np.float32)
 
 
@@ -136,7 +136,7 @@ def extract_signature(cloud: PointCloud) -> bytes:
 
 
 def compute_signature(map: TopometricMap) -> bytes:
-    """The tables of a map, as bytes."""
+    """Return the tables of a map, as bytes."""
     return b"".join(np.ascontiguousarray(table).tobytes() for table in (map.rooms, map.edges, map.room, map.navigable_room))
 
 

@@ -90,7 +90,7 @@ class GraphRewriter:
         return name
 
     def _find_source(self, name: str, kind: str) -> Any:
-        """The node of a kind that makes a tensor which nothing else uses; None where there is no such."""
+        """Return the node of a kind that makes a tensor which nothing else uses; None where there is no such."""
         node = self.producer.get(name)
         return node if node is not None and node.op_type == kind and len(self.users[name]) == 1 else None
 
@@ -160,7 +160,7 @@ class GraphRewriter:
         return self.shapes[node.input[1]][0]
 
     def _find_last(self, name: str) -> Any:
-        """The convolution of 1 x 1 that alone uses a tensor; None where there is none."""
+        """Return the convolution of 1 x 1 that alone uses a tensor; None where there is none."""
         users = self.users[name]
         if len(users) != 1 or users[0].op_type != "Conv" or self.shapes[users[0].input[1]][2:] != (1, 1):
             return None

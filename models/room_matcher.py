@@ -196,7 +196,7 @@ def build_stages(network: RoomMatcher) -> Branches:
 
 
 def compute_relative_positions(places: Tensor, heights: Tensor) -> Tensor:
-    """(R, R, WAY_FACTS) from each room of a map to each of its rooms: direction, distance in rings, climb."""
+    """Return (R, R, WAY_FACTS) from each room of a map to each of its rooms: direction, distance in rings, climb."""
     off = places[None] - places[:, None]
     far = (off**2).sum(dim=2, keepdim=True).sqrt()
     ring = [(-(((far - at) / (RING_WIDTH[0] + RING_WIDTH[1] * at)) ** 2)).exp() for at in RING_DISTANCES]

@@ -102,7 +102,7 @@ def find_data_files(path: Path, package: Path = HERE) -> list[Path]:
 
 
 def _list_data_lines(files: dict[str, Path], package: Path) -> list[str]:
-    """A line for each data file: its place and its hash."""
+    """Return a line for each data file: its place and its hash."""
     lines = set()
     for name, path in files.items():
         above = name if path.name == "__init__.py" else name.rpartition(".")[0]

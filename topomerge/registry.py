@@ -122,7 +122,7 @@ def load_plugins(modules: Sequence[str]) -> list[Path]:
 
 
 def _locate(entry: Any) -> tuple[str, str]:
-    """The module and the name of a function, a class, or the class of an object."""
+    """Return the module and the name of a function, a class, or the class of an object."""
     named = entry if hasattr(entry, "__qualname__") else type(entry)
     return named.__module__, named.__qualname__
 

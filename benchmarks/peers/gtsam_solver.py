@@ -107,12 +107,12 @@ def build_problem(rooms: int) -> Problem:
 
 
 def compute_effect(place: Array) -> Array:
-    """(3, 3) what a small motion of the plane is at a place: shift there and turn."""
+    """Return (3, 3) what a small motion of the plane is at a place: shift there and turn."""
     return np.array([[1.0, 0.0, -place[1]], [0.0, 1.0, place[0]], [0.0, 0.0, 1.0]])
 
 
 def solve_with_gtsam(gtsam: Any, given: Problem) -> Array:
-    """(n, 3) shift and turn of each piece at its anchor."""
+    """Return (n, 3) shift and turn of each piece at its anchor."""
     anchors, joints, measured, prior = given
     graph, start, sure = gtsam.NonlinearFactorGraph(), gtsam.Values(), []
 

@@ -40,7 +40,7 @@ def add_noise(rng: np.random.Generator, vectors: Array, noise: float) -> Array:
 
 
 def draw_table(rng: np.random.Generator, rooms: int) -> Array:
-    """(rooms, VECTOR) vectors."""
+    """Return (rooms, VECTOR) vectors."""
     looks = add_noise(rng, np.zeros((max(rooms // ALIKE, 1), VECTOR), np.float32), 1.0)
     table = np.empty((rooms, VECTOR), np.float32)
     for k in range(0, rooms, MADE_AT_ONCE):

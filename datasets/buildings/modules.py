@@ -126,7 +126,7 @@ def replace_things(building: Building, gone: Array, added: Sequence[AddedThing])
 def _build_floor(
     building: Building, room: int, taken: list[shapely.Polygon], rng: np.random.Generator
 ) -> tuple[FurnishedFloor, Array]:
-    """A room's floor with what is taken there, and where its doors are."""
+    """Return a room's floor with what is taken there, and where its doors are."""
     shape = shapely.orient_polygons(shapely.Polygon(building.rooms[room].polygon))
     things, doors = building.things, building.doors
     columns = things[(things["room"] == room) & (things["kind"] == "column")]

@@ -80,8 +80,8 @@ def make_arrays(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array]
 
 
 def build_several_maps(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array]:
-    """The arrays of an item of three or more maps of a building: those of each map, and under "matches.ac", "transform.ac" and so
-    on what is true of each two; "matches" and "transform" are those of the first two.
+    """Return the arrays of an item of three or more maps of a building: those of each map, and under "matches.ac", "transform.ac"
+    and so on what is true of each two; "matches" and "transform" are those of the first two.
 
     Raises:
         InputError: no candidate has such walks, or a map has hardly a room.

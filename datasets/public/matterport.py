@@ -105,7 +105,7 @@ def _read_points(path: Path) -> Array:
 
 
 def _find_rooms(points: Array, rooms: list[TrueRoom]) -> Array:
-    """(n,) room whose prism holds a point, -1: none."""
+    """Return (n,) room whose prism holds a point, -1: none."""
     out = np.full(len(points), -1)
     for storey in sorted({room.storey for room in rooms}):
         here = [k for k, room in enumerate(rooms) if room.storey == storey]

@@ -245,7 +245,7 @@ def _spread_labels(labels: Array, reach: float) -> Array:
 
 
 def _find_most_common(truth: FloorTruth, places: Array, room: Array) -> Array:
-    """(rows, columns) int32 the commonest room of each column, -1 none."""
+    """Return (rows, columns) int32 the commonest room of each column, -1 none."""
     out = np.full(truth.raster.shape[1:], -1, np.int32)
     ij, inside = truth.compute_columns(places)
     if inside.any():

@@ -154,7 +154,7 @@ def _find_sides(layers: StoreyLayers, parts: Array, ends: Array) -> set[int]:
 
 
 def _trace_box(layers: StoreyLayers, mask: Array) -> Array:
-    """(4, 2) m of the rectangle around a mask, in the axes of the raster."""
+    """Return (4, 2) m of the rectangle around a mask, in the axes of the raster."""
     pixels = np.argwhere(mask)
     low, high = pixels.min(axis=0) - 0.5, pixels.max(axis=0) + 0.5
     return layers.compute_points(np.array([low, [high[0], low[1]], high, [low[0], high[1]]]))[:, :2]

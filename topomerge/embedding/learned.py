@@ -234,7 +234,8 @@ class LearnedEmbedder:
         return rows
 
     def compute_matchability(self, map: TopometricMap) -> Array:
-        """(R,) float64: how alike a room of another map must at least be, as a cosine, before it is rather this one than none."""
+        """Return (R,) float64: how alike a room of another map must at least be, as a cosine, before it is rather this one than
+        none."""
         return self.temperature * self.embed_graph(self.build_views(map)[0])[1]
 
     def compute_probabilities(self, a: TopometricMap, b: TopometricMap) -> tuple[Array, Array]:

@@ -69,7 +69,8 @@ Rows = Array | TurnedRows
 
 
 def compute_room_features(x: Array, dustbin: Array, heights: Array) -> Array:
-    """(R, FACTS) the numbers of rooms (`schema`) as logarithms, the logits of having no partner (R,), and heights (R,) m."""
+    """Return (R, FACTS) the numbers of rooms (`schema`) as logarithms, the logits of having no partner (R,), and heights (R,)
+    m."""
     out: Array = np.column_stack([np.sign(x) * np.log1p(np.abs(x)), dustbin, heights]).astype(np.float64)
     return out
 
@@ -167,7 +168,8 @@ def _score_turn(turn: Turn) -> tuple[float, complex]:
 
 
 def compute_similarity(a: Rows, b: Rows) -> Array:
-    """(R_a, R_b) cosines of rows of length 1; where these depend on turns, the mean over all turns of b (`estimate_turns`)."""
+    """Return (R_a, R_b) cosines of rows of length 1; where these depend on turns, the mean over all turns of b
+    (`estimate_turns`)."""
     if not isinstance(a, TurnedRows) or not isinstance(b, TurnedRows):
         plain: Array = np.asarray(a) @ np.asarray(b).T
         return plain

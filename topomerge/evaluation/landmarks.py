@@ -338,7 +338,7 @@ def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
 
 
 def _format_line(name: str, rows: Sequence[Row]) -> list[object]:
-    """A line under `HEADS`."""
+    """Return a line under `HEADS`."""
     apart, repeated = [r for r in rows if not r["again"]], [r for r in rows if r["again"]]
     wrong, with_landmarks = sum(map(is_false, apart)), [r for r in apart if min(r["landmarks"])]
     low, high = compute_exact_interval(wrong, len(apart)) if apart else (0.0, 1.0)

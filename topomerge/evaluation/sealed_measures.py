@@ -291,7 +291,7 @@ def rank_robot_rooms(data: Path) -> list[Row]:
 
 
 def _build_grid_pair(pair: Pair) -> GridPair:
-    """A pair as the registration takes it."""
+    """Return a pair as the registration takes it."""
     a, b = build_grid(pair.a), build_grid(pair.b)
     free = [c.free if c.poses is None else compute_free_grid(c, g) for c, g in ((pair.a, a), (pair.b, b))]
     about: dict[str, object] = {key: getattr(pair, key) for key in ("kind", "building", "source", "overlap")}

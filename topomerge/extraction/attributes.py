@@ -41,7 +41,7 @@ def select_distinct_doors(map: TopometricMap) -> TopometricMap:
 
 
 def _is_between_rooms(map: TopometricMap, doors: Array) -> Array:
-    """(n,) bool: do the rooms of each door lie before and behind it?"""
+    """Return (n,) bool: do the rooms of each door lie before and behind it?"""
     normal = np.column_stack([np.cos(doors["direction"]), np.sin(doors["direction"]), np.zeros(len(doors))])
     requested, out = np.sort(doors["rooms"], axis=1), np.zeros(len(doors), bool)
     for reach in SIDES_AT:
@@ -51,7 +51,8 @@ def _is_between_rooms(map: TopometricMap, doors: Array) -> Array:
 
 
 def find_rooms_at(map: TopometricMap, floor: Array) -> Array:
-    """(n,) int64 room of the map at each place (n, 3) m of a floor, -1 none. Floors of two maps differ by up to two cells."""
+    """Return (n,) int64 room of the map at each place (n, 3) m of a floor, -1 none. Floors of two maps differ by up to two
+    cells."""
     cells = map.navigable.locate(floor)
     out = np.full(len(cells), -1, np.int64)
     for up in (0, 1, -1, 2, -2):
@@ -187,7 +188,7 @@ def _find_edge_at(edges: Array, rooms: tuple[int, int], place: Array) -> int:
 
 
 def _find_obstacles(map: TopometricMap, a: Array, b: Array) -> Array:
-    """(k, 3) m: where the straight way between two places of the sensor, at its height, is in occupied cells."""
+    """Return (k, 3) m: where the straight way between two places of the sensor, at its height, is in occupied cells."""
     steps = max(int(np.ceil(np.linalg.norm(b - a) / (map.grid.edge / 2))), 2)
     way = a + np.linspace(0, 1, steps)[:, None] * (b - a)
     inside: Array = way[map.grid.contains(map.grid.locate(way))]
@@ -195,7 +196,7 @@ def _find_obstacles(map: TopometricMap, a: Array, b: Array) -> Array:
 
 
 def _build_door(map: TopometricMap, rooms: tuple[int, int], a: Array, b: Array) -> Array:
-    """An edge halfway between two places of the sensor, on the lower of the floors beneath."""
+    """Return an edge halfway between two places of the sensor, on the lower of the floors beneath."""
     out = np.zeros(1, EDGE_DTYPE)
     floor = min(float(map.storeys["floor"][map.rooms["storey"][r]]) for r in rooms)
     out["rooms"], out["centre"], out["width"] = rooms, (*((a + b) / 2)[:2], floor), USUAL_WIDTH
@@ -215,8 +216,8 @@ PATCH_AREA = 3.0  # m2, below which floor without a door is a patch
 
 
 def remove_patches(map: TopometricMap, places: Array) -> TopometricMap:
-    """The map in which patches of floor are of no room. Those that the sensor was on, and rooms that are alone on their storey,
-    stay.
+    """Return the map in which patches of floor are of no room. Those that the sensor was on, and rooms that are alone on their
+    storey, stay.
 
     Args:
         places: (n, 3) m, where the sensor was; may be empty.

@@ -76,7 +76,7 @@ def find_passages(storeys: Sequence[SegmentedStorey], walls: StoreyWalls | None,
 
 
 def score_passages(x: Array, passages: Sequence[Passage], weights: Array) -> Array:
-    """(n,) calibrated probability that a door parts the two sides of each passage, by all evidence.
+    """Return (n,) calibrated probability that a door parts the two sides of each passage, by all evidence.
 
     Args:
         x: (n, 17) `DOOR_FEATURES` of the sides as they have grown.
@@ -106,7 +106,7 @@ def choose_scorer(walls: bool) -> Scorer:
 
 
 def compute_inputs(plan: Array, shown: Array) -> Array:
-    """(n, 3) `SCORE_INPUTS` of passages.
+    """Return (n, 3) `SCORE_INPUTS` of passages.
 
     Args:
         plan: (n,) log odds of a door by the plan alone.

@@ -93,5 +93,5 @@ def resolve_parameters(preset: str | Parameters, overrides: dict[str, Any]) -> P
 
 
 def _get_preset_name(parameters: object) -> str:
-    """The preset of which an instance is a variant; its type's name where it is none."""
+    """Return the preset of which an instance is a variant; its type's name where it is none."""
     return next((name for name, p in PRESETS.items() if type(p) is type(parameters)), type(parameters).__name__)

@@ -120,7 +120,7 @@ def read_scan(
 
 
 def _build_cloud(points: Array) -> PointCloud:
-    """A cloud of an array from the user."""
+    """Return a cloud of an array from the user."""
     try:
         return PointCloud(points)
     except ValueError as error:

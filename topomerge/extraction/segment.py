@@ -107,7 +107,7 @@ class SegmentedStorey:
         return measure_seen_outline(self.segment, self.plan.inside, self.plan.wall, self.plan.edge)
 
     def locate_centre(self, passage: Passage) -> Array:
-        """(3,) m, where a passage lies."""
+        """Return (3,) m, where a passage lies."""
         at = self.plan.origin + (np.array(passage.place) + 0.5) * self.plan.edge
         return np.append(at, self.plan.floor[passage.place])
 
@@ -192,7 +192,7 @@ def find_segments(storeys: Sequence[SegmentedStorey], places: Array) -> Array:
 
 
 def score_by_plan(x: Array, passages: Sequence[Passage]) -> Array:
-    """(n,) probability of a door in each passage by the plan, and by what the maps say that were joined.
+    """Return (n,) probability of a door in each passage by the plan, and by what the maps say that were joined.
 
     Args:
         x: (n, 17) `DOOR_FEATURES` of the sides as they have grown.
@@ -202,7 +202,7 @@ def score_by_plan(x: Array, passages: Sequence[Passage]) -> Array:
 
 
 def log_odds(probability: Array) -> Array:
-    """(n,) of probabilities, which are taken for no surer than `SUREST_DOOR`."""
+    """Return (n,) of probabilities, which are taken for no surer than `SUREST_DOOR`."""
     sure = np.clip(probability, SUREST_DOOR, 1 - SUREST_DOOR)
     return np.log(sure / (1 - sure))
 
@@ -353,7 +353,7 @@ def find_too_small(rooms: GrowingRooms, least: float) -> Pair | None:
 
 
 def find_rooms_of_segments(storeys: Sequence[PartitionedStorey], numbers: Array) -> Array:
-    """(n,) room of the map of each segment of all storeys, -1 none.
+    """Return (n,) room of the map of each segment of all storeys, -1 none.
 
     Args:
         numbers: (R,) of the rooms that have a floor, as they are numbered on from storey to storey

@@ -125,7 +125,7 @@ def _faces_of(grid: VoxelGrid, rasters: RasterisedStoreys, storey: SegmentedStor
 
 
 def _sides_before(elevations: Elevations, locate: Locate) -> Array:
-    """(n / 2, 3) int64 what lies under spots before each place along all strips, -1 none."""
+    """Return (n / 2, 3) int64 what lies under spots before each place along all strips, -1 none."""
     sizes = np.diff(elevations.first) // PLACES
     face = elevations.faces[np.repeat(np.arange(len(sizes)), sizes)]
     along = (np.arange(len(face)) - np.repeat(elevations.first[:-1] // PLACES, sizes) + 0.5) * (PLACES * ALONG)
@@ -134,7 +134,7 @@ def _sides_before(elevations: Elevations, locate: Locate) -> Array:
 
 
 def _sample_places_behind(way: Array) -> Array:
-    """(k, 3) m, behind a doorway as its first side sees it."""
+    """Return (k, 3) m, behind a doorway as its first side sees it."""
     steps = np.arange(BEYOND[0], BEYOND[1] + 0.05, 0.1)
     aside = np.array([-way["out"][1], way["out"][0]]) * float(way["width"]) / 4
     places = way["centre"][:2] + aside * np.array([[-1.0], [0.0], [1.0]]) + steps[:, None, None] * way["out"]

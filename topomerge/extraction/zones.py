@@ -127,7 +127,7 @@ class _ZonePlaces:
 
 
 def _measure_zones(map: TopometricMap, floor: Array, cells: Array, owner: Array) -> Array:
-    """(Z,) ROOM_DTYPE: what is known of the room of each zone, with the measures of its own floor and cells."""
+    """Return (Z,) ROOM_DTYPE: what is known of the room of each zone, with the measures of its own floor and cells."""
     rooms, lowest = map.rooms[owner].copy(), select_lowest_of_column(map.navigable)
     middles, edge = map.navigable.compute_centroids(), map.grid.edge
     floors = np.bincount(floor[lowest][floor[lowest] >= 0], minlength=len(owner))

@@ -214,21 +214,23 @@ class _JoinedCells:
         self.means = np.where(self.points[:, None] > 0, total / np.maximum(self.points, 1e-9)[:, None], 0.5)
 
     def convert_means(self) -> Array:
-        """(n, 3) where the points of each cell lie on average, never on its border: rounding may take that for the next cell."""
+        """Return (n, 3) where the points of each cell lie on average, never on its border: rounding may take that for the next
+        cell."""
         steps = np.minimum(self.means * OFFSET_STEPS, OFFSET_STEPS - 1).astype(np.int64)
         middles: Array = self.origin + (decode_cells(self.codes) + (steps + 0.5) / OFFSET_STEPS) * self.edge
         return middles
 
     def _is_occupied(self, cells: Array) -> Array:
-        """(n,) bool: is a cell there already?"""
+        """Return (n,) bool: is a cell there already?"""
         return np.isin(encode_cells(cells), self.codes)
 
     def _is_seen_through(self, cells: Array) -> Array:
-        """(n,) bool: do cells lie where rays went?"""
+        """Return (n,) bool: do cells lie where rays went?"""
         return np.isin(encode_cells(cells // 2), self.free_codes)
 
     def _is_surveyed(self, cells: Array) -> Array:
-        """(n,) bool: have the columns of cells, at the heights between the lowest and the highest of them, anything near?"""
+        """Return (n,) bool: have the columns of cells, at the heights between the lowest and the highest of them, anything
+        near?"""
         occupied = decode_cells(self.codes)
         low, high = cells[:, 2].min(), cells[:, 2].max()
         occupied = occupied[(occupied[:, 2] >= low - 3) & (occupied[:, 2] <= high + 3)]
@@ -317,7 +319,7 @@ def _carry_rooms(grid: VoxelGrid, label: Array, floors: Sequence[PartFloor], par
 
 
 def _number_anew(old: Array, new: Array) -> Array:
-    """(n + 1,) new number of each old one, -1 where there is none."""
+    """Return (n + 1,) new number of each old one, -1 where there is none."""
     out = np.full(int(old.max(initial=-1)) + 2, -1)
     out[old] = new
     out[-1] = -1

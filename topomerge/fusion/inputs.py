@@ -66,8 +66,8 @@ def resolve_threshold(threshold: float | None) -> float:
 
 
 def resolve_link_threshold(threshold: float | None, maps: int = 2) -> float:
-    """The probability from which a link of an atlas is believed: at least `LINK_BELIEVED` where none is asked for, as a wrong
-    link drags all that hangs on it.
+    """Return the probability from which a link of an atlas is believed: at least `LINK_BELIEVED` where none is asked for, as a
+    wrong link drags all that hangs on it.
 
     Args:
         maps: how many the atlas holds.
@@ -80,8 +80,8 @@ def resolve_link_threshold(threshold: float | None, maps: int = 2) -> float:
 
 
 def find_risk_threshold(risk: float) -> float:
-    """The probability from which a merge is believed so that at most `risk` of a thousand pairs, drawn by the stated priors
-    (docs/method.md), are merged falsely, as left-out training pairs show it.
+    """Return the probability from which a merge is believed so that at most `risk` of a thousand pairs, drawn by the stated
+    priors (docs/method.md), are merged falsely, as left-out training pairs show it.
 
     Raises:
         InputError: a risk that no threshold can promise.

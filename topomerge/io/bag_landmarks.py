@@ -347,7 +347,7 @@ class LandmarkReader:
         return place_box(corners, Picture(np.zeros((1, 1, 3), np.uint8), camera, depth, small, pose))
 
     def _find_frame_camera(self, frame: str) -> Camera | None:
-        """The camera of the only CameraInfo of a frame."""
+        """Return the camera of the only CameraInfo of a frame."""
         if frame not in self.frame_cameras:
             fitting = []
             for topic in self.bag.find_topics(CAMERA_INFO):

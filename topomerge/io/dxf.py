@@ -111,7 +111,7 @@ class Content:
     unit: str | None = None
 
     def measure_box(self) -> Array:
-        """(2, 2) lowest and highest x and y of all lines."""
+        """Return (2, 2) lowest and highest x and y of all lines."""
         points = np.concatenate([line.points for line in self.lines])
         return np.stack([points.min(axis=0), points.max(axis=0)])
 

@@ -79,12 +79,12 @@ class _LineRaster:
         self.pixel, self.shape, self.corner = pixel, (rows, columns), (float(low[0]), float(low[1]))
 
     def place(self, points: Array) -> Array:
-        """(n, 2) columns and rows of points (n, 2)."""
+        """Return (n, 2) columns and rows of points (n, 2)."""
         places = (points - self.corner) / self.pixel
         return np.stack([places[:, 0], self.shape[0] - places[:, 1]], axis=1)
 
     def draw(self, lines: list[tuple[Array, float]]) -> Array:
-        """(h, w) bool: lines (n, 2) of a width (m)."""
+        """Return (h, w) bool: lines (n, 2) of a width (m)."""
         from PIL import Image, ImageDraw
 
         image = Image.new("1", self.shape[::-1])
@@ -112,7 +112,7 @@ class _LineRaster:
         return part.size
 
     def sample(self, mask: Array, points: Array) -> Array:
-        """(n,) values of a mask at points (n, 2), those outside False."""
+        """Return (n,) values of a mask at points (n, 2), those outside False."""
         places = np.floor(self.place(points)).astype(int)
         inside = ((places >= 0) & (places < self.shape[::-1])).all(axis=1)
         out = np.zeros(len(points), bool)
@@ -160,7 +160,7 @@ def is_door_leaf(line: Line, swings: list[Swing]) -> bool:
 
 
 def _find_window_hulls(lines: list[Line]) -> list[Array]:
-    """The hulls of blocks of windows that are as thin as a wall."""
+    """Return the hulls of blocks of windows that are as thin as a wall."""
     from shapely import MultiPoint
 
     parts: dict[int, list[Array]] = {}
@@ -230,7 +230,7 @@ def _score_gap(raster: _LineRaster, occupied: Array, ends: Array) -> float:
 
 
 def _find_block_gap(raster: _LineRaster, occupied: Array, points: Array) -> list[Array]:
-    """The gap of a door without an arc: the line across its box whose ends meet walls; none where no line's do."""
+    """Return the gap of a door without an arc: the line across its box whose ends meet walls; none where no line's do."""
     from shapely import MultiPoint
 
     box = MultiPoint(points).minimum_rotated_rectangle
@@ -247,7 +247,7 @@ def _find_block_gap(raster: _LineRaster, occupied: Array, points: Array) -> list
 
 
 def _lengthen(ends: Array, length: float) -> Array:
-    """(2, 2) ends that lie so much farther out, m."""
+    """Return (2, 2) ends that lie so much farther out, m."""
     along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
     return ends + np.stack([-along, along]) * length
 

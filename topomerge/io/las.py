@@ -209,7 +209,7 @@ def _select_fields() -> Any:
 
 
 def _build_rows(data: Array, header: Any) -> Any:
-    """The records of unpacked bytes."""
+    """Return the records of unpacked bytes."""
     import laspy
 
     packed = laspy.PackedPointRecord.from_buffer(data, header.point_format)
@@ -311,7 +311,8 @@ def get_coordinates(rows: Any) -> Array:
 
 
 def _convert_classes(rows: Any) -> Array | None:
-    """(n,) int32 classes beyond those of the standard (ground, buildings, noise and such), -1 of others; None: there are none."""
+    """Return (n,) int32 classes beyond those of the standard (ground, buildings, noise and such), -1 of others; None: there are
+    none."""
     classes = np.asarray(rows.classification, np.int32)
     return np.where(classes > LAST_STANDARD_CLASS, classes, -1) if int(classes.max(initial=0)) > LAST_STANDARD_CLASS else None
 

@@ -215,7 +215,8 @@ def load_json(path: Path, kind: str) -> dict[str, Any]:
 
 
 def compute_deepest_level(root_spacing: float, options: ReadOptions) -> int:
-    """The level whose points are as close as `options.spacing` asks for; levels halve the distance. Not asked for: all levels."""
+    """Return the level whose points are as close as `options.spacing` asks for; levels halve the distance. Not asked for: all
+    levels."""
     if options.spacing is None or not root_spacing > 0:
         return sys.maxsize
     ratio = root_spacing * options.factor / options.spacing

@@ -455,7 +455,7 @@ def _read_readings(path: Path, base: sqlite3.Connection, columns: set[str]) -> l
 
 
 def _find_places(poses: Poses, nodes: list[int]) -> Array:
-    """(n, 3) m of nodes that have a pose."""
+    """Return (n, 3) m of nodes that have a pose."""
     places = [pose[:3, 3] for node in nodes if (pose := poses.get(node)) is not None]
     return np.array(places).reshape(-1, 3)
 

@@ -377,6 +377,6 @@ def _refine_group(
 
 
 def _place_point(transform: Sim3, point: Array) -> Array:
-    """(2,) m, where a transform puts a point (2,)."""
+    """Return (2,) m, where a transform puts a point (2,)."""
     out: Array = transform.apply(np.array([[*point, 0.0]]))[0, :2]
     return out

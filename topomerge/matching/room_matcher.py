@@ -197,7 +197,7 @@ def run_network(a: RoomsSeen, b: RoomsSeen, matcher: Matcher) -> RoomOdds:
 
 
 def compute_first_guess(cosine: Array) -> Array:
-    """(R_a, R_b) how likely each pair of rooms is by their rows alone: what votes in the first stage."""
+    """Return (R_a, R_b) how likely each pair of rooms is by their rows alone: what votes in the first stage."""
     from scipy.special import softmax
 
     likely: Array = np.sqrt(softmax(FIRST_SHARPNESS * cosine, axis=1) * softmax(FIRST_SHARPNESS * cosine, axis=0))
@@ -205,7 +205,7 @@ def compute_first_guess(cosine: Array) -> Array:
 
 
 def compute_agreement(likely: Array, a: RoomsSeen, b: RoomsSeen) -> Array:
-    """(R_a, R_b, 2) how much of a matching agrees with each pair of rooms on the way from one map to the other.
+    """Return (R_a, R_b, 2) how much of a matching agrees with each pair of rooms on the way from one map to the other.
 
     Args:
         likely: (R_a, R_b) how likely each pair is.

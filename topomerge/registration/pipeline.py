@@ -341,7 +341,7 @@ def _refine_candidate(a: Prepared, b: Prepared, best: Candidate, scaled: bool, r
 
 
 def _build_registration(ranked: Sequence[PoseHypothesis], examined: Sequence[Candidate], verdict: Verdict) -> Registration:
-    """The best of the candidates, with its probability and the reason in words."""
+    """Return the best of the candidates, with its probability and the reason in words."""
     best, probability = examined[0], verdict.each[0]
     margin = min(best.odds - examined[1].odds, MARGIN_CAP) if len(examined) > 1 else MARGIN_CAP
     features = {**verdict.features, "rigid_conflict_share": best.hypothesis.features["conflict_share"], "margin": margin}
@@ -375,7 +375,7 @@ def refine_by_surfaces(a: Prepared, b: Prepared, start: Sim3, scaled: bool = Fal
 
 
 def _invert_registration(registration: Registration) -> Registration:
-    """The same registration seen from the other map."""
+    """Return the same registration seen from the other map."""
     others = tuple(replace(h, transform=h.transform.inverse()) for h in registration.alternatives)
     transform = None if registration.transform is None else registration.transform.inverse()
     bent = registration.bend and registration.bend.inverse()

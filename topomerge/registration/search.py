@@ -239,7 +239,7 @@ def _sample(walls: Array) -> Array:
 
 
 def _compute_heap_profiles(at: Array, size: int) -> Array:
-    """(S, size) how much higher than around it the projections (n, S), m, are heaped up; unit norm."""
+    """Return (S, size) how much higher than around it the projections (n, S), m, are heaped up; unit norm."""
     columns = np.floor((at - at.min(axis=0)) / HEAP_BIN).astype(np.int64)
     flat = (columns + np.arange(at.shape[1]) * size).ravel()
     counts = np.bincount(flat, minlength=at.shape[1] * size).reshape(at.shape[1], size).astype(np.float64)

@@ -55,8 +55,8 @@ def is_extruded(grid: VoxelGrid) -> bool:
 
 
 def extract_lines(grid: VoxelGrid) -> tuple[VoxelGrid, VoxelGrid]:
-    """The lines of such a map at the height of the floor that it was given, where its sensor looked; and that floor, over which
-    it looked."""
+    """Return the lines of such a map at the height of the floor that it was given, where its sensor looked; and that floor, over
+    which it looked."""
     level = grid.cells[:, 2] - grid.cells[:, 2].min()
     lines, floor = grid.cells[level == 1] - (0, 0, 1), grid.cells[level == 0]
     drawn = VoxelGrid.from_cells(lines, grid.origin, grid.edge, grid.shape)
@@ -206,7 +206,7 @@ def _find_crossed_columns(free: VoxelGrid, corner: Array, cell: float) -> tuple[
 
 
 def _estimate_local_floor(ix: Array, iy: Array, z: Array, heights: Array) -> Array:
-    """The floor under each column: drift and a tilted map raise and lower it by a few centimetres."""
+    """Return the floor under each column: drift and a tilted map raise and lower it by a few centimetres."""
     near = np.abs(z - heights[ix, iy]) < 0.3
     lowest = np.full(heights.shape, np.inf)
     np.minimum.at(lowest, (ix[near], iy[near]), z[near])
@@ -219,7 +219,7 @@ def _estimate_local_floor(ix: Array, iy: Array, z: Array, heights: Array) -> Arr
 
 
 def _estimate_ceiling(ix: Array, iy: Array, z: Array, base: float, ceiling: float, shape: tuple[int, ...]) -> Array:
-    """(H, W) m: the highest cell of each column that may be this storey's ceiling; nan where none is."""
+    """Return (H, W) m: the highest cell of each column that may be this storey's ceiling; nan where none is."""
     high = np.full(shape, -np.inf)
     if np.isfinite(ceiling):
         near = (z > base + 2.0) & (z < ceiling + 1.0)
@@ -228,7 +228,7 @@ def _estimate_ceiling(ix: Array, iy: Array, z: Array, base: float, ceiling: floa
 
 
 def _build_plan(rasters: tuple[Array, ...], origin: Array, cell: float, levels: tuple[float, float], sliced: bool) -> StoreyPlan:
-    """The plan of a storey.
+    """Return the plan of a storey.
 
     Args:
         rasters: (nx, ny) each: bits of the bands that cells fill and that rays crossed; height of the floor, m, and of the

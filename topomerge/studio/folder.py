@@ -151,7 +151,7 @@ class StudioFolder:
                 yield path
 
     def _list_joined(self, folder: Path, kind: str) -> list[dict[str, Any]]:
-        """The joined maps of a merge or an atlas, which are opened like any other."""
+        """Return the joined maps of a merge or an atlas, which are opened like any other."""
         maps = [p for p in self._iter_paths(folder) if re.fullmatch(r"map(_\d+)?\.tmap", p.name)]
         described = [(p, _describe_entry(p, self._get_stamp(p))) for p in maps]
         return [{"path": self.name(p), **d, "of": kind} for p, d in described if d is not None]

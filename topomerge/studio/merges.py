@@ -173,7 +173,7 @@ class JobQueue:
 
 
 async def _read_line(stream: asyncio.StreamReader) -> bytes:
-    """The next line, or part of one that is longer than any should be; nothing at the end."""
+    """Return the next line, or part of one that is longer than any should be; nothing at the end."""
     try:
         return await stream.readuntil()
     except asyncio.IncompleteReadError as rest:

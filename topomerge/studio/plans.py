@@ -136,8 +136,8 @@ def _trace_storey(
 
 
 def _find_neighbours(map: TopometricMap, rasters: Sequence[Array], size: float) -> Array:
-    """(k, 2) int64 pairs of rooms, ascending, that a door or a wall's thickness parts; told by the plans, in a tenth of the time
-    that all cells of the floors would take."""
+    """Return (k, 2) int64 pairs of rooms, ascending, that a door or a wall's thickness parts; told by the plans, in a tenth of
+    the time that all cells of the floors would take."""
     count = max(len(map.rooms), 1)
     codes = [map.edges["rooms"].astype(np.int64) @ (count, 1)]
     for room in rasters:

@@ -303,8 +303,8 @@ def make_batch(
 def build_map_pair(
     pair: GraphPair, names: Sequence[str], augment: Augment | None = None, generator: torch.Generator | None = None
 ) -> MapPair:
-    """A pair as one graph; see `make_batch`. While training, maps whose turn matters stand alike, and b comes once more, turned
-    wrongly: none of its rooms there is one of a."""
+    """Return a pair as one graph; see `make_batch`. While training, maps whose turn matters stand alike, and b comes once more,
+    turned wrongly: none of its rooms there is one of a."""
     if augment is not None and augment.signs and LANDMARK_PART in names:
         assert generator is not None
         pair = add_invented_signs(pair, augment.signs, generator)

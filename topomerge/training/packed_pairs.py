@@ -240,7 +240,7 @@ def _unpack_pairs(arrays: dict[str, Array], extras: dict[str, Array]) -> list[Gr
 
 
 def _compute_extra(name: str, arrays: dict[str, Array], packed_file: Path, log_line: Callable[[str], None], limit: int) -> Array:
-    """A descriptor of all rooms, 0 of those beyond the limit; chunks that were reckoned before are read."""
+    """Return a descriptor of all rooms, 0 of those beyond the limit; chunks that were reckoned before are read."""
     from topomerge.embedding.engineered import compute_point_features, compute_point_spectra
 
     reckon = {"engineered": compute_point_features, "shapedna": compute_point_spectra}[name]
@@ -284,13 +284,13 @@ def hold_out(pairs: Sequence[GraphPair]) -> tuple[list[GraphPair], list[GraphPai
 
 
 def number_buildings(names: Sequence[str]) -> Array:
-    """(n,) number of each building, in the order in which they first come."""
+    """Return (n,) number of each building, in the order in which they first come."""
     numbers: dict[str, int] = {}
     return np.array([numbers.setdefault(name, len(numbers)) for name in names], np.int64)
 
 
 def mark_watched(buildings: Sequence[str], every: int) -> Array:
-    """(n,) bool: the scans of every n-th building are watched."""
+    """Return (n,) bool: the scans of every n-th building are watched."""
     return np.asarray(number_buildings(buildings) % every == 0)
 
 

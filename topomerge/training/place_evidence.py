@@ -60,8 +60,8 @@ class Places:
 
 
 def collect_places(paths: Sequence[Path], half: int = 0) -> Places:
-    """The squares of the hypotheses of pairs (`belief_hypotheses`) that are right or wrong; none of those that are neither, and
-    none of pairs that nobody can tell apart.
+    """Return the squares of the hypotheses of pairs (`belief_hypotheses`) that are right or wrong; none of those that are
+    neither, and none of pairs that nobody can tell apart.
 
     Raises:
         InputError: there is none.
@@ -96,8 +96,8 @@ def collect_places(paths: Sequence[Path], half: int = 0) -> Places:
 
 
 def balance_weights(weight: Array, right: Array, group: Array) -> Array:
-    """(n,) weights with which right and wrong ones of each group weigh alike; a group of one side only weighs nothing, and others
-    as much as the root of the weight of their smaller side."""
+    """Return (n,) weights with which right and wrong ones of each group weigh alike; a group of one side only weighs nothing, and
+    others as much as the root of the weight of their smaller side."""
     _, owner = np.unique(group, return_inverse=True)
     total = np.zeros((owner.max() + 1, 2))
     np.add.at(total, (owner, right.astype(int)), weight)

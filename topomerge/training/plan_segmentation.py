@@ -79,7 +79,7 @@ def _sample_smooth_field(shape: tuple[int, ...], sigma: float, rng: np.random.Ge
 
 
 def _sample_patches(shape: tuple[int, ...], share: float, rng: np.random.Generator) -> Array:
-    """(n, n) bool, smooth patches that cover a share of a crop."""
+    """Return (n, n) bool, smooth patches that cover a share of a crop."""
     field = _sample_smooth_field(shape, rng.uniform(1, 5), rng)
     return np.asarray(field > np.quantile(field, 1 - share))
 
@@ -110,7 +110,7 @@ def _add_furniture(inside: Array, wall: Array, room: Array, rng: np.random.Gener
 
 
 def _draw_seat_rows(floor: Array, rng: np.random.Generator) -> Array:
-    """(n, n) bool, parallel rows, whole or of single seats, somewhere on a large floor."""
+    """Return (n, n) bool, parallel rows, whole or of single seats, somewhere on a large floor."""
     places = np.argwhere(ndimage.binary_erosion(floor, SQUARE, 6))
     if not len(places):
         return np.zeros(floor.shape, bool)
@@ -204,7 +204,8 @@ class PlanJob(ExportedJob):
 
 
 def convert_to_grid(example: PlanExample, furnished: bool) -> PlanExample:
-    """The plan of a scan as a robot would leave it, or a draughtsman: walls alone, all raised alike. Grids stay as they are.
+    """Return the plan of a scan as a robot would leave it, or a draughtsman: walls alone, all raised alike. Grids stay as they
+    are.
 
     Args:
         furnished: with what a laser meets near the floor as walls.

@@ -84,7 +84,7 @@ def _pair_places(a: Mapping[str, Array], b: Mapping[str, Array], pairs: Array) -
 
 
 def _compute_candidates(places: MatchedPlaces) -> tuple[Array, Array, Array]:
-    """(C,) turn and move as complex numbers, and rise, m, of every two places that are as far apart in both maps."""
+    """Return (C,) turn and move as complex numbers, and rise, m, of every two places that are as far apart in both maps."""
     far = [np.linalg.norm(x[:, None, :2] - x[None, :, :2], axis=2) for x in (places.to, places.of)]
     alike = (np.minimum(*far) >= PLACES_APART) & (abs(far[0] - far[1]) <= LARGEST_STRETCH)
     p, q = np.nonzero(np.triu(alike, 1))

@@ -244,7 +244,7 @@ def _render_text_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> M
 
 
 def _count_observers(map: TopometricMap) -> Array:
-    """(n,) how many maps saw each cell, 3 for more."""
+    """Return (n,) how many maps saw each cell, 3 for more."""
     assert map.provenance is not None
     return np.minimum(np.bitwise_count(map.provenance), 3).astype(np.int64)
 

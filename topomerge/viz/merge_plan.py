@@ -87,7 +87,7 @@ def render_arrows(name: str, shifts: PieceShifts, storey: int, sheet: Sheet, fac
 
 
 def _format_arrow(x: int, y: int, u: int, v: int) -> str:
-    """A line to (u, v) with a head, which is a third of it long, 10 to 40 cm."""
+    """Return a line to (u, v) with a head, which is a third of it long, 10 to 40 cm."""
     length = max(float(np.hypot(u - x, v - y)), 1.0)
     head = min(max(length / 3, 10.0), 40.0)
     a, b = (u - x) / length * head, (v - y) / length * head
@@ -115,7 +115,7 @@ def deform_path(d: str, sheet: Sheet, bend: Deformation, height: float) -> tuple
 
 
 def _subdivide_ring(corners: Array) -> Array:
-    """(n, 2) int64 cm, of a ring none of whose edges is longer than `LONGEST_EDGE`."""
+    """Return (n, 2) int64 cm, of a ring none of whose edges is longer than `LONGEST_EDGE`."""
     edges = np.roll(corners, -1, axis=0) - corners
     parts = np.maximum(np.ceil(np.hypot(*edges.T) / LONGEST_EDGE), 1).astype(np.int64)
     first = np.repeat(np.cumsum(parts) - parts, parts)
@@ -312,7 +312,7 @@ def compute_sheet_transform(sheet: Sheet, paper: Sheet, pose: Sim3) -> Array:
 
 
 def _compute_enclosing_sheet(a: Sheet, b: Sheet, pose: Sim3) -> Sheet:
-    """A paper in a's frame, turned as a's, that holds what both show."""
+    """Return a paper in a's frame, turned as a's, that holds what both show."""
     ends = []
     for sheet, move in ((a, Sim3()), (b, pose)):
         width, height = sheet.size

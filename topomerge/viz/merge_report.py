@@ -321,7 +321,7 @@ def _render_maps(result: MergeResult, drawn: tuple[Drawn, Drawn], within: tuple[
 
 
 def _compute_colours(result: MergeResult, within: tuple[Array, Array]) -> tuple[Array, Array]:
-    """(R, 3) uint8 of the rooms of both maps: matched ones have the colour of the joined map's room in which they lie."""
+    """Return (R, 3) uint8 of the rooms of both maps: matched ones have the colour of the joined map's room in which they lie."""
     assert result.map is not None
     palette = assign_room_colours(result.map)
     of_maps = []
@@ -399,7 +399,7 @@ def _render_overlay(result: MergeResult, drawn: tuple[Drawn, Drawn], pose: Sim3)
 
 
 def _compute_observers(result: MergeResult) -> Array:
-    """(n,) 0 assumed, 1 seen by a only, 2 by b only, 3 by both; either may be joined of several maps already."""
+    """Return (n,) 0 assumed, 1 seen by a only, 2 by b only, 3 by both; either may be joined of several maps already."""
     assert result.map is not None and result.map.provenance is not None
     before = result.maps[0].provenance
     count = 1 if before is None else max(int(np.bitwise_or.reduce(before, initial=0)).bit_length(), 1)

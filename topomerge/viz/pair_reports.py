@@ -93,7 +93,7 @@ def _render_match_summary(matches: Sequence[RoomMatch], a: TopometricMap, b: Top
 
 
 def _compute_shades(map: TopometricMap, rooms: Array, probability: Array) -> Array:
-    """(R, 3) uint8, from grey (no match) to green (sure)."""
+    """Return (R, 3) uint8, from grey (no match) to green (sure)."""
     sure = np.zeros(len(map.rooms))
     np.maximum.at(sure, rooms, probability)
     return np.round(SILENT + sure[:, None] * (FOR - SILENT)).astype(np.uint8)

@@ -127,7 +127,7 @@ def paint_rooms(map: TopometricMap, cells: StoreyCells) -> StoreyView:
 
 
 def _rasterize_walls(map: TopometricMap, frame: Frame, storey: int, level: Array, at: Array) -> Array:
-    """(nx, ny) bool: the cut of the storey, at heights above its floor."""
+    """Return (nx, ny) bool: the cut of the storey, at heights above its floor."""
     if not len(level):
         return np.zeros(frame.shape, bool)
     lowest = map.grid.origin[2] + level.min() * map.grid.edge
@@ -242,7 +242,7 @@ def format_hex_colour(colour: Array) -> str:
 
 
 def _compute_corners(rooms: Array, origin: Array) -> list[list[float]] | None:
-    """The corners of the box around rooms, m from the scene's corner."""
+    """Return the corners of the box around rooms, m from the scene's corner."""
     if not len(rooms):
         return None
     low, high = rooms["lo"].min(axis=0) - origin, rooms["hi"].max(axis=0) - origin

@@ -374,7 +374,7 @@ def _render_label(map: TopometricMap, sheet: Sheet, room: int, place: Place, nam
 
 
 def _compute_jambs(edge: Any) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The two jambs of a door, seen from above, m."""
+    """Return the two jambs of a door, seen from above, m."""
     x, y = edge["centre"][:2].tolist()
     half = max(float(edge["width"]), 0.2) / 2
     u, v = -math.sin(edge["direction"]) * half, math.cos(edge["direction"]) * half

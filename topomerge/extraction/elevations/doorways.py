@@ -71,7 +71,8 @@ class StoreyWalls:
 
 
 def classify_places(walls: Elevations) -> Array:
-    """(n / 2, 7) float32 probability of each of `WALL_CLASSES` in each place along all strips, each read from both its ends."""
+    """Return (n / 2, 7) float32 probability of each of `WALL_CLASSES` in each place along all strips, each read from both its
+    ends."""
     bounds = list(iter_strip_bounds(walls))
     network = weights() if bounds else None  # once, before threads ask for it
     parts = run_side_by_side(lambda ends: read_both_ways(walls.strips[slice(*ends)], network), bounds)
@@ -79,7 +80,8 @@ def classify_places(walls: Elevations) -> Array:
 
 
 def read_both_ways(strip: Array, network: Run | None = None) -> Array:
-    """(n / 2, 7) float32 probability of each of `WALL_CLASSES`: a mirrored wall has the same doors, so two readings are averaged.
+    """Return (n / 2, 7) float32 probability of each of `WALL_CLASSES`: a mirrored wall has the same doors, so two readings are
+    averaged.
 
     Args:
         strip: (n, 32, 17), n even.
@@ -91,7 +93,7 @@ def read_both_ways(strip: Array, network: Run | None = None) -> Array:
 
 
 def compute_door_probabilities(walls: Elevations, classes: Array) -> Array:
-    """(n / 2, 3) float32 probability of an open, a shut and a half-open door in each place, of those of all classes."""
+    """Return (n / 2, 3) float32 probability of an open, a shut and a half-open door in each place, of those of all classes."""
     parts = [classes[low // PLACES : high // PLACES, [OPEN, SHUT, HALF_OPEN]] for low, high in iter_strip_bounds(walls)]
     return np.concatenate([np.zeros((0, 3), np.float32), *parts])
 
@@ -124,7 +126,7 @@ def detect_doorways(walls: Elevations, doors: Array, before: Array | None = None
 
 
 def _find_most_common(rooms: Array, otherwise: int) -> int:
-    """The room that occurs most often, `otherwise` where it is one of these or there is none (-1)."""
+    """Return the room that occurs most often, `otherwise` where it is one of these or there is none (-1)."""
     counts = np.bincount(rooms[rooms >= 0].astype(np.int64), minlength=otherwise + 1)
     if otherwise < 0:
         return int(counts.argmax()) if len(counts) else -1

@@ -56,7 +56,7 @@ def rasterise_part_rooms(plan: StoreyPlan, parts: Sequence[PartRooms]) -> list[P
 
 
 def find_boundary_columns(rooms: Sequence[PlacedRooms]) -> Array:
-    """(nx, ny) bool: where rooms of a part meet that somebody was in. Regions end there even if the cells show nothing."""
+    """Return (nx, ny) bool: where rooms of a part meet that somebody was in. Regions end there even if the cells show nothing."""
     out = np.zeros(rooms[0].room.shape, bool)
     for room, certainty in rooms:
         sure = np.where(np.append(certainty == 1, False)[room], room, -1)
@@ -107,7 +107,7 @@ def _score_separation(room: Array, certainty: Array, sides: tuple[Array, Array])
 
 
 def _find_column_rooms(plan: StoreyPlan, part: PartRooms) -> Array:
-    """(nx, ny) room of a part in each column of a storey, -1 none."""
+    """Return (nx, ny) room of a part in each column of a storey, -1 none."""
     at = np.floor((part.places[:, :2] - plan.origin) / plan.edge).astype(np.int64)
     here = np.flatnonzero(((at >= 0) & (at < plan.wall.shape)).all(axis=1))
     here = here[np.abs(part.places[here, 2] - plan.floor[tuple(at[here].T)]) < SAME_STOREY]

@@ -116,7 +116,8 @@ def build_storey_plan(
 
 
 def _find_box_around(inside: Array, first: Array, last: Array, margin: int) -> tuple[slice, slice]:
-    """The part of a raster from columns `first` to `last`, and `margin` columns beyond where what is inside reaches further.
+    """Return the part of a raster from columns `first` to `last`, and `margin` columns beyond where what is inside reaches
+    further.
 
     At its beginning it grows by whole strides of the plan network, which so sees all else as it would without.
     """
@@ -151,7 +152,8 @@ def _interpolate_heights(cells: Array, low: Array, size: Array, nominal: int = 0
 
 
 def _is_open_below(grid: VoxelGrid, lower: Array, low: Array, base: Array) -> Array:
-    """(nx, ny) bool: does the floor of the storey below, (n, 3) cells, see past the level of this one's? A hall through both."""
+    """Return (nx, ny) bool: does the floor of the storey below, (n, 3) cells, see past the level of this one's? A hall through
+    both."""
     out = np.zeros(base.shape, bool)
     lower = np.ascontiguousarray(lower[_is_within(lower[:, :2] - low, np.array(base.shape))])
     at = tuple((lower[:, :2] - low).T)
@@ -162,7 +164,7 @@ def _is_open_below(grid: VoxelGrid, lower: Array, low: Array, base: Array) -> Ar
 
 
 def _is_seen_through(crossed: VoxelGrid, grid: VoxelGrid, low: Array, base: Array) -> Array:
-    """(nx, ny) bool: did rays cross two free cells or more of a column at the height of a body?"""
+    """Return (nx, ny) bool: did rays cross two free cells or more of a column at the height of a body?"""
     count = np.zeros(base.size, np.int64)
     if crossed.edge > LONGEST_CROSSED:
         return count.reshape(base.shape) > 0
@@ -237,7 +239,7 @@ def _is_below_ceiling(profile: Array, ceiling: Array, edge: float) -> Array:
 
 
 def _remove_clutter(wall: Array, edge: float) -> Array:
-    """The walls without short pieces that stand free."""
+    """Return the walls without short pieces that stand free."""
     piece, count = ndimage.label(wall, np.ones((3, 3)))
     boxes = ndimage.find_objects(piece)
     length = np.array([max(b[0].stop - b[0].start, b[1].stop - b[1].start) for b in boxes]) * edge
@@ -286,9 +288,9 @@ OPEN_SHARE = 0.25  # of the outline with walls, and of the floor with a ceiling:
 
 
 def remove_upper_sides(grid: VoxelGrid, plan: StoreyPlan, region: Array, places: Array = NOWHERE) -> Array:
-    """The regions of an upper storey less those that are the upper side of a ceiling: nothing above, and either no walls around
-    or so thin that nobody is carried, with a storey right below. The flat roof of low rooms beside a hall has walls on one side:
-    those of the hall, which so becomes no storey of its own.
+    """Return the regions of an upper storey less those that are the upper side of a ceiling: nothing above, and either no walls
+    around or so thin that nobody is carried, with a storey right below. The flat roof of low rooms beside a hall has walls on one
+    side: those of the hall, which so becomes no storey of its own.
 
     Args:
         grid: occupied cells.

@@ -49,8 +49,8 @@ PLAN_SIGNATURE = Signature(
 
 
 def compute_evidence(plan: StoreyPlan) -> Array:
-    """(nx, ny, 11) float32 of what was seen in each column: known, wall, how full four bands of heights are, floor, lintel,
-    ceiling and its height, and how large a column is."""
+    """Return (nx, ny, 11) float32 of what was seen in each column: known, wall, how full four bands of heights are, floor,
+    lintel, ceiling and its height, and how large a column is."""
     levels = []
     for low, high in EVIDENCE_HEIGHTS:
         mask = np.uint64(plan.bands.build_mask(low, high))
@@ -66,7 +66,7 @@ def compute_evidence(plan: StoreyPlan) -> Array:
 
 
 def compute_column_probabilities(plan: StoreyPlan, network: Run | None = None, looks: int = LOOKS) -> Array:
-    """(nx, ny, 5) float32 probability of each of `COLUMN_CLASSES` in each column, by the weights that ship or by others.
+    """Return (nx, ny, 5) float32 probability of each of `COLUMN_CLASSES` in each column, by the weights that ship or by others.
 
     The mean over the plan turned by quarters: what the network says of a door hangs on how its walls lie on the columns, and
     where they do by chance, four looks err less than one (docs/adr/0005).
@@ -93,7 +93,7 @@ def compute_column_probabilities(plan: StoreyPlan, network: Run | None = None, l
 
 
 def _average_turns(x: Array, network: Run, looks: int) -> Array:
-    """(nx, ny, 5) mean probability over (11, nx, ny) evidence turned by the first `looks` quarters."""
+    """Return (nx, ny, 5) mean probability over (11, nx, ny) evidence turned by the first `looks` quarters."""
 
     def look(k: int) -> Array:
         return np.rot90(run_network(np.rot90(x, k, (1, 2)), network), -k, (1, 2))

@@ -149,7 +149,7 @@ WALL_RULE = WallRule()  # of the plans that poses are judged by
 
 
 def find_first_above(profile: Array, bands: HeightBands, height: float = UPRIGHT) -> Array:
-    """(nx, ny) float64 m above the local floor, lower side of the first thing above a height; nan where there is none."""
+    """Return (nx, ny) float64 m above the local floor, lower side of the first thing above a height; nan where there is none."""
     bit = find_lowest_bit(profile.ravel(), round(height / bands.step) + bands.below).reshape(profile.shape)
     return np.where(bit >= 0, (bit - bands.below) * bands.step, np.nan)
 
@@ -235,7 +235,7 @@ def _find_nearest_storey(storeys: Sequence[ClassifiedStorey], centre: Array) -> 
 
 
 def _crop_around(storey: ClassifiedStorey, centre: Array, reach: float) -> Array:
-    """(a, b, 5) of the columns at most `reach` m from a place, along each axis."""
+    """Return (a, b, 5) of the columns at most `reach` m from a place, along each axis."""
     columns = max(int(reach / storey.edge), 1)
     low = np.floor((np.asarray(centre)[:2] - storey.origin) / storey.edge).astype(np.int64) - columns
     box = tuple(slice(max(k, 0), max(k + 2 * columns + 1, 0)) for k in low.tolist())

@@ -77,7 +77,8 @@ class Contradiction:
 
 
 def find_conflict_columns(a: Sequence[PlanFields], b: Sequence[PlanFields], pose: Sim3) -> Array:
-    """(n, 4) place in a's frame and area (half of it, as both maps are asked) of the walls on free floor under T_ab, m and m2."""
+    """Return (n, 4) place in a's frame and area (half of it, as both maps are asked) of the walls on free floor under T_ab, m and
+    m2."""
     rows = [np.zeros((0, 4))]
     for v, w in pair_storeys(a, b, pose.translation[2], pose.scale):
         sides = ((w, v, pose, pose.scale**2), (v, w, pose.inverse(), 1.0))
@@ -339,7 +340,7 @@ def sample_common_points(a: Sequence[PlanFields], b: Sequence[PlanFields], pose:
 
 
 def locate_place(a: Sequence[PlanFields], b: Sequence[PlanFields], pose: Sim3) -> Array:
-    """(5, 3) points of b that stand for the place which both maps saw: its middle, and as far from it as it is wide."""
+    """Return (5, 3) points of b that stand for the place which both maps saw: its middle, and as far from it as it is wide."""
     points = sample_common_points(a, b, pose)
     if not len(points):
         points = np.append(b[0].middle, 0.0)[None]

@@ -94,7 +94,7 @@ def _check_links(whole: Array, places: Array, most: int, there: Array) -> None:
 
 
 def _read_integers(whole: Array, places: Array | list[int], count: int) -> Array:
-    """(n, count) whole numbers of 32 bits that begin at these bytes."""
+    """Return (n, count) whole numbers of 32 bits that begin at these bytes."""
     at = np.asarray(places)[:, None] + np.arange(4 * count)
     return np.ascontiguousarray(whole[at]).view("<u4").astype(np.int64)
 
@@ -308,7 +308,8 @@ class RoomsIndex:
 
 
 def prepare_rooms_index(stored: StoredAtlas, rows: RoomRows, signature: str, size: int) -> RoomsIndex | None:
-    """The index of an atlas, made or completed where it is not; None where exact search is better, or `usearch` is missing.
+    """Return the index of an atlas, made or completed where it is not; None where exact search is better, or `usearch` is
+    missing.
 
     Args:
         rows: of its maps.

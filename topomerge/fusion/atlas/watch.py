@@ -165,7 +165,8 @@ def find_longer_version(name: str, old: TopometricMap, new: TopometricMap, store
 
 
 def replace_map(stored: StoredAtlas, longer: LongerVersion, new: Entry) -> tuple[StoredAtlas, Proposed]:
-    """An atlas in which the new map stands where the one before stood, and where it may lie in those that were linked with it.
+    """Return an atlas in which the new map stands where the one before stood, and where it may lie in those that were linked with
+    it.
 
     Args:
         new: entry of the new map, under any name.

@@ -187,7 +187,7 @@ def _iter_objects(map: TopometricMap) -> Iterator[tuple[Json, list[Json]]]:
 
 
 def _compute_area_centres(map: TopometricMap, floors: list[Any]) -> tuple[Array, Array]:
-    """(A,) room and (A, 3) a point well inside of each area; a room without areas counts as one."""
+    """Return (A,) room and (A, 3) a point well inside of each area; a room without areas counts as one."""
     bare = np.setdiff1d(np.arange(len(map.rooms)), map.areas["room"])
     owner = np.concatenate([map.areas["room"], bare]).astype(np.int64)
     centres = np.concatenate([map.areas["centroid"], map.rooms["centroid"][bare]])

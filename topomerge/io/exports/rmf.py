@@ -210,7 +210,7 @@ def _describe_lift(map: TopometricMap, lift: _Lift) -> dict[str, Any]:
 
 
 def _format_graph(name: str, levels: Sequence[_Level], lifts: Sequence[_Lift]) -> str:
-    """The graph that fleet adapters read: lanes have one direction, and vertices of floors and doors are left out."""
+    """Return the graph that fleet adapters read: lanes have one direction, and vertices of floors and doors are left out."""
     lines = [f"building_name: {_dump(name)}", "levels:"]
     for level in levels:
         used = sorted({end for lane in level.lanes for end in lane})

@@ -125,7 +125,7 @@ def _renumber(graph: KartoGraph, first: KartoGraph) -> None:
 
 
 def _list_scans(graph: KartoGraph) -> list[Members]:
-    """The scans of both files: each has its own."""
+    """Return the scans of both files: each has its own."""
     return [scan for archive in graph.archives for scan in archive.found[SCAN]]
 
 

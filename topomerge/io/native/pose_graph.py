@@ -217,7 +217,7 @@ def _build_edge(graph: PoseGraph, a: int, b: int, doubt: Doubt) -> tuple[str, tu
 
 
 def _format_information(doubt: Doubt, flat: bool) -> str:
-    """The upper triangle of the inverse covariance; of SE3 the vector part of the quaternion counts, half of a turn."""
+    """Return the upper triangle of the inverse covariance; of SE3 the vector part of the quaternion counts, half of a turn."""
     information = doubt.build_information()
     if flat:
         information = information[np.ix_([0, 1, 5], [0, 1, 5])]

@@ -234,7 +234,7 @@ def _count(base: sqlite3.Connection, schema: str, table: str) -> int:
 
 
 def _get_most(base: sqlite3.Connection, schema: str, kind: str) -> int:
-    """The largest number of a kind that any table uses; of maps, one more, as they count from 0."""
+    """Return the largest number of a kind that any table uses; of maps, one more, as they count from 0."""
     most = -1 if kind == MAP else 0
     for table, columns in TABLES.items():
         for column in (c for c, counted in columns.items() if counted == kind):

@@ -65,7 +65,7 @@ class _Graph:
         return [k for k, node in self.nodes.items() if node["layer"] == layer and not node.get("partition", 0)]
 
     def get_places(self, ids: Sequence[int]) -> Array:
-        """(n, 3) m."""
+        """Return (n, 3) m."""
         return np.array([self.nodes[k]["attributes"]["position"] for k in ids], np.float64).reshape(-1, 3)
 
     def find_parents(self) -> dict[int, int]:
@@ -149,7 +149,7 @@ def _check_node(node: Any) -> None:
 
 
 def _move_graph(graph: _Graph, motion: Motion) -> _Graph:
-    """The graph in the joined frame: all that is a place or a turn in the world."""
+    """Return the graph in the joined frame: all that is a place or a turn in the world."""
     nodes = {k: {**node, "attributes": _move_attributes(node["attributes"], motion)} for k, node in graph.nodes.items()}
     about = dict(graph.about)
     mesh = about.get("mesh")

@@ -56,7 +56,8 @@ class Target:
         self._rasters = _build_rasters(fields, self.main)
 
     def compute_gain(self, sigma: float) -> tuple[Array, Array]:
-        """(5, nx, ny) float32 what a wall column that faces each sector, or none, gains there; the corner of the raster, m."""
+        """Return (5, nx, ny) float32 what a wall column that faces each sector, or none, gains there; the corner of the raster,
+        m."""
         likelihood = np.log(MISSED + (1 - MISSED) * np.exp(-(DISTANCE_STEPS**2) / (2 * sigma**2))) - np.log(INDIFFERENT)
         level, origin, on_free, seen = self._rasters
         table = np.zeros(256, np.float32)
@@ -214,8 +215,8 @@ def build_wall_lines(fields: PlanFields, middles: Array) -> WallLines:
 def measure_lines(
     pieces: Pieces, chosen: Array, lines: WallLines, moves: Array, into: Sim3, onto: tuple[PlanFields, WallLines], sigma: float
 ) -> tuple[Array, Array, Array, Array]:
-    """The chosen pieces of a storey that have partners (k,), their moves (k, 3) in their own frame, the information (k, 3, 3);
-    and (2,) sums of weights and of weighted squared distances, m2.
+    """Return the chosen pieces of a storey that have partners (k,), their moves (k, 3) in their own frame, the information (k, 3,
+    3); and (2,) sums of weights and of weighted squared distances, m2.
 
     Args:
         lines: of the pieces' storey, whose walls are rows of `pieces.walls` from the first one of the storey on.

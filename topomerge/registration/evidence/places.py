@@ -137,13 +137,13 @@ def _select_tiles(seen: Array) -> tuple[Array, Array]:
 
 
 def _cut(layer: Array, middle: Array) -> Array:
-    """(k, SIDE, SIDE) of a layer around middles (k, 2), pixels; 0 beyond its border."""
+    """Return (k, SIDE, SIDE) of a layer around middles (k, 2), pixels; 0 beyond its border."""
     padded = np.pad(layer, SIDE // 2)
     return np.stack([padded[i : i + SIDE, j : j + SIDE] for i, j in middle])
 
 
 def _detect_observed_heights(plan: StoreyPlan) -> Array:
-    """(LOOKED,) is the plan a slice, at which of `HEIGHTS` did the map look, and did it see ceilings?"""
+    """Return (LOOKED,) is the plan a slice, at which of `HEIGHTS` did the map look, and did it see ceilings?"""
     heights = [plan.observed & plan.bands.build_mask(*h) != 0 for h in HEIGHTS]
     return np.array([plan.sliced, *heights, np.isfinite(plan.ceiling).any()], float)
 
@@ -173,8 +173,8 @@ PLACE_SIGNATURE = Signature(
 
 
 def compute_planes(parts: Array, ceiling: Array, observed: Array) -> Array:
-    """(k, SIDE / 4, SIDE / 4, PLANES) float32 of squares as in `Crops`, each the mean over 4 x 4 pixels. Which map is the first
-    changes nothing.
+    """Return (k, SIDE / 4, SIDE / 4, PLANES) float32 of squares as in `Crops`, each the mean over 4 x 4 pixels. Which map is the
+    first changes nothing.
 
     What both show (walls, clutter, at three heights, lamps), what one shows where the other looked and saw nothing near, what
     either knows, how unlike the ceilings are; and the walls, clutter and ceilings themselves: a bare corridor tells little.
@@ -206,7 +206,7 @@ def compute_planes(parts: Array, ceiling: Array, observed: Array) -> Array:
 
 
 def _pool_mean(layer: Array) -> Array:
-    """(k, SIDE / 4, SIDE / 4) float32 mean over 4 x 4 pixels."""
+    """Return (k, SIDE / 4, SIDE / 4) float32 mean over 4 x 4 pixels."""
     total: Array = layer[:, ::POOLED].astype(np.uint8 if layer.dtype == bool else np.float32)
     for n in range(1, POOLED):
         total += layer[:, n::POOLED]
@@ -218,8 +218,8 @@ def _pool_mean(layer: Array) -> Array:
 
 
 def _compare_layers(there: Array, missing: Array, near: Array) -> list[Array]:
-    """(k, side, side) each: where both maps show something, and where one shows it and the other one misses it. All (k, 2, side,
-    side): `there` in a map, `missing` from it, there or `near` by."""
+    """Return (k, side, side) each: where both maps show something, and where one shows it and the other one misses it. All (k, 2,
+    side, side): `there` in a map, `missing` from it, there or `near` by."""
     both = (there[:, 0] & near[:, 1]) | (there[:, 1] & near[:, 0])
     one = (there[:, 0] & missing[:, 1]) | (there[:, 1] & missing[:, 0])
     return [both, one]
