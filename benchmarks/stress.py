@@ -1,4 +1,4 @@
-"""What happens at the limits: large clouds, many rooms, many maps, many merges, threads, processes, and kills.
+"""Stress tests at the limits: large clouds, many rooms, many maps, many merges, threads, processes, and kills.
 
 ``python -m benchmarks.stress CASE [NUMBER]`` runs one case and prints a line or a few: seconds of the processor, and the peak of
 the memory. The cases are the functions below; each has a default that takes minutes.
@@ -65,7 +65,7 @@ def cloud(millions: int = 20) -> None:
 
 
 def compute_offset(number: int, beside: int) -> Array:
-    """(3,) float32 m, where a floor lies among others that lie beside each other without a gap wider than a wall."""
+    """Return (3,) float32 m, where a floor lies among others that lie beside each other without a gap wider than a wall."""
     return np.array([number % beside * (WIDTH + 0.5), number // beside * (DEPTH + 0.5), 0.0], np.float32)
 
 
@@ -131,17 +131,17 @@ def merges(count: int = 300) -> None:
 
 
 def extract_signature(cloud: PointCloud) -> bytes:
-    """What tells two maps of a cloud apart: their tables, as bytes."""
+    """Serialise the tables of the map of a cloud: maps that differ give different bytes."""
     return compute_signature(tm.extract(cloud))
 
 
 def compute_signature(map: TopometricMap) -> bytes:
-    """The tables of a map, as bytes."""
+    """Return the tables of a map, as bytes."""
     return b"".join(np.ascontiguousarray(table).tobytes() for table in (map.rooms, map.edges, map.room, map.navigable_room))
 
 
 def summarise_merge(maps: Sequence[TopometricMap]) -> tuple[str, float]:
-    """What a merge says."""
+    """Summarise a merge: its verdict and its probability."""
     result = tm.merge(list(maps))
     return result.status, float(result.probability)
 

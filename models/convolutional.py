@@ -60,7 +60,7 @@ class PlanProbabilities(nn.Module):
         self.network = network
 
     def forward(self, evidence: Tensor) -> Tensor:
-        """(n, 11, nx, ny) to (n, 5, nx, ny)."""
+        """Return (n, 11, nx, ny) to (n, 5, nx, ny)."""
         probabilities: Tensor = self.network(evidence).softmax(dim=1)
         return probabilities
 
@@ -106,7 +106,7 @@ class WallProbabilities(nn.Module):
         self.network = network
 
     def forward(self, strips: Tensor) -> Tensor:
-        """(n, w, 32, 17) to (n, w / 2, 7)."""
+        """Return (n, w, 32, 17) to (n, w / 2, 7)."""
         probabilities: Tensor = self.network(strips.permute(0, 3, 1, 2)).transpose(1, 2).softmax(dim=2)
         return probabilities
 
@@ -146,7 +146,7 @@ class PlaceLogOdds(nn.Module):
         self.network = network
 
     def forward(self, planes: Tensor) -> Tensor:
-        """(n, side, side, PLANES) to (n,)."""
+        """Return (n, side, side, PLANES) to (n,)."""
         odds: Tensor = self.network(planes.permute(0, 3, 1, 2))
         return odds
 
@@ -189,6 +189,6 @@ class DrawingProbabilities(nn.Module):
         self.network = network
 
     def forward(self, picture: Tensor) -> Tensor:
-        """(n, 3, h, w) to (n, 8, h, w)."""
+        """Return (n, 3, h, w) to (n, 8, h, w)."""
         probabilities: Tensor = self.network(picture).softmax(dim=1)
         return probabilities

@@ -41,7 +41,7 @@ class Table(nn.Module):
 
 
 class LandmarkEncoder(nn.Module):
-    """What the landmarks of rooms say (R, n), the first columns of which are masks -> (R, width); 0 of a room without any."""
+    """Landmark features of rooms (R, n), the first columns of which are masks -> (R, width); 0 of a room without any."""
 
     def __init__(self, columns: int, width: int, dropout: float) -> None:
         super().__init__()
@@ -54,7 +54,7 @@ class LandmarkEncoder(nn.Module):
 
 
 class GeometryEncoder(nn.Module):
-    """What each room looks like by itself: (R, width). Landmarks are added to it."""
+    """Geometry of each room by itself -> (R, width). Landmarks are added to it."""
 
     def __init__(self, network: Network) -> None:
         super().__init__()

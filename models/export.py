@@ -90,7 +90,7 @@ class GraphRewriter:
         return name
 
     def _find_source(self, name: str, kind: str) -> Any:
-        """The node of a kind that makes a tensor which nothing else uses; None where there is no such."""
+        """Return the node of a kind that makes a tensor which nothing else uses; None where there is no such."""
         node = self.producer.get(name)
         return node if node is not None and node.op_type == kind and len(self.users[name]) == 1 else None
 
@@ -140,8 +140,8 @@ class GraphRewriter:
             kernel = self._add("MatMul", [kernel, columns], f"{name}_kernel")
             low = self._add("Conv", [x, kernel], f"{name}_low", pads=pads, kernel_shape=[2, 2])
             inputs = [skip, f"{out}_of_skip", node.input[2]]
-            beside = self._add("Conv", inputs, f"{name}_skip", pads=pads, kernel_shape=[3, 3], strides=[2, 2])
-            phase = self._add("Relu", [self._add("Add", [beside, low], f"{name}_sum")], name)
+            own = self._add("Conv", inputs, f"{name}_skip", pads=pads, kernel_shape=[3, 3], strides=[2, 2])
+            phase = self._add("Relu", [self._add("Add", [own, low], f"{name}_sum")], name)
             phases.append(
                 phase if last is None else self._add("Conv", [phase, *last.input[1:]], f"{name}_last", kernel_shape=[1, 1])
             )
@@ -160,7 +160,7 @@ class GraphRewriter:
         return self.shapes[node.input[1]][0]
 
     def _find_last(self, name: str) -> Any:
-        """The convolution of 1 x 1 that alone uses a tensor; None where there is none."""
+        """Return the convolution of 1 x 1 that alone uses a tensor; None where there is none."""
         users = self.users[name]
         if len(users) != 1 or users[0].op_type != "Conv" or self.shapes[users[0].input[1]][2:] != (1, 1):
             return None
@@ -368,7 +368,7 @@ def export_embedder(network: Embedder, folder: str | Path, about: Mapping[str, A
 
 
 def run_with_torch(module: nn.Module, signature: Signature) -> Run:
-    """A network as `topomerge.networks.Network` would run it: what training is scored with, before anything is exported."""
+    """Run a network as `topomerge.networks.network.Network` would: training is scored with it before anything is exported."""
 
     @torch.no_grad()
     def run(outputs: Sequence[str] | None = None, /, **inputs: Array) -> list[Array]:

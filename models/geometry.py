@@ -53,14 +53,16 @@ class LocalPointNet(nn.Module):
 
 
 def append_radius(points: Tensor) -> Tensor:
-    """(R, P, 4) coordinates over `COORDINATE_UNIT`, and the distance from the middle seen from above, which no turn changes."""
+    """Return (R, P, 4) coordinates over `COORDINATE_UNIT`, and the distance from the middle seen from above, which no turn
+    changes."""
     # The root of a sum that is never 0 has a gradient at the middle, too.
     radius = ((points[..., :2] ** 2).sum(dim=-1, keepdim=True) + 1e-6).sqrt()
     return torch.cat([points, radius], dim=-1) / COORDINATE_UNIT
 
 
 def sample_farthest(points: Tensor, number: int) -> Tensor:
-    """(R, number) rows of points (R, P, 3), each as far as possible from those before; the first is farthest from the middle."""
+    """Return (R, number) rows of points (R, P, 3), each as far as possible from those before; the first is farthest from the
+    middle."""
     chosen = [(points**2).sum(dim=2).argmax(dim=1)]
     apart = torch.full(points.shape[:2], torch.inf, dtype=points.dtype, device=points.device)
     for _ in range(number - 1):

@@ -45,7 +45,7 @@ class LossSettings:
 
 @dataclass(eq=False)  # not frozen: fabric fills a copy of it in half precision
 class Truth:
-    """What belongs together in a batch of N rooms.
+    """Rooms that belong together in a batch of N rooms.
 
     Args:
         pair: (N,) which pair of maps a room is of.
@@ -77,7 +77,7 @@ class Others:
 
 
 class RoomLosses(NamedTuple):
-    """What a loss gives.
+    """The values of a loss.
 
     Args:
         values: (N,) of each room.
@@ -93,7 +93,7 @@ class RoomLosses(NamedTuple):
 
 @dataclass(eq=False)
 class RoomBatch:
-    """What a loss is computed from.
+    """The inputs of a loss.
 
     Args:
         embedding: (N, D) of length 1.
@@ -108,7 +108,7 @@ class RoomBatch:
 
 
 class Processes(Protocol):
-    """What a loss asks of the processes that train together."""
+    """Collective operations of the processes that train together, as losses use them."""
 
     def gather_others(self, rows: Tensor) -> Tensor:
         """Return the rows (M, ...) of all other processes; gradients flow back to where they come from."""
@@ -187,9 +187,9 @@ def score_triplets(settings: LossSettings, batch: RoomBatch) -> RoomLosses:
 def compute_info_nce(
     embedding: Tensor, temperature: Tensor, truth: Truth, easy: float = 1.0, others: Others | None = None
 ) -> tuple[Tensor, Tensor]:
-    """(N,) -log(sum of exp(s) of partners / sum of exp(s) of partners and negatives), s being the cosine over the temperature;
-    and (N,) bool, which rooms have a partner; negatives of other pairs count `easy` times, and not at all where they are of the
-    same building (van den Oord et al. 2018)."""
+    """Return (N,) -log(sum of exp(s) of partners / sum of exp(s) of partners and negatives), s being the cosine over the
+    temperature; and (N,) bool, which rooms have a partner; negatives of other pairs count `easy` times, and not at all where they
+    are of the same building (van den Oord et al. 2018)."""
     logits = embedding @ embedding.T / temperature
     same_pair = truth.pair[:, None] == truth.pair[None]
     weight = torch.where(same_pair, 1.0, easy * (truth.building[:, None] != truth.building[None]))
@@ -205,8 +205,8 @@ def compute_info_nce(
 
 
 def compute_triplet_loss(embedding: Tensor, truth: Truth, margin: float) -> tuple[Tensor, Tensor]:
-    """(N,) mean over a room's partners of the mean of d(partner) - d(negative) + margin over the negatives of the same pair of
-    maps for which it is above 0; and (N,) bool, which rooms have both (Hermans et al. 2017, "batch all").
+    """Return (N,) mean over a room's partners of the mean of d(partner) - d(negative) + margin over the negatives of the same
+    pair of maps for which it is above 0; and (N,) bool, which rooms have both (Hermans et al. 2017, "batch all").
 
     With the hardest triplets alone all rooms come to one point: partners of which one map has a sliver are farther than the
     nearest others.
@@ -224,8 +224,8 @@ def compute_triplet_loss(embedding: Tensor, truth: Truth, margin: float) -> tupl
 
 
 def compute_dustbin_loss(embedding: Tensor, dustbin: Tensor, temperature: Tensor, truth: Truth) -> Tensor:
-    """(N,) -log(probability of its partners, or of having none where it has none), among the rooms of the other map of the pair
-    and the dustbin."""
+    """Return (N,) -log(probability of its partners, or of having none where it has none), among the rooms of the other map of the
+    pair and the dustbin."""
     logits = embedding @ embedding.T / temperature
     other = (truth.pair[:, None] == truth.pair[None]) & (truth.side[:, None] != truth.side[None])
     candidates = torch.cat([logits.masked_fill(~other, NEVER_LOGIT), dustbin[:, None]], dim=1).logsumexp(dim=1)

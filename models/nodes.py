@@ -277,7 +277,7 @@ class NodeEncoder(nn.Module):
     def _encode_edges(
         self, edge_attr: Tensor, pair_index: Tensor | None, pair_attr: Tensor | None, way: Tensor | None
     ) -> Tensor | None:
-        """(E, settings.width) of the edges, from their features and the doors beside them."""
+        """Return (E, settings.width) of the edges, from their features and the doors beside them."""
         if self.edges is None or self.edge is None:
             return None
         scaled = self.edges(edge_attr)

@@ -160,7 +160,9 @@ class RoomMatcher(nn.Module):
     def stage(self, k: int, maps: Sequence[Rooms], states: Sequence[Tensor], votes: Tensor) -> tuple[list[Tensor], Partners]:
         """States of the rooms of both maps after a stage, and their partners by them. The first stage reads no states."""
         if k:
-            after: list[Tensor] = self.layers[k - 1](states, [ways(m.places, m.heights) for m in maps], votes)
+            after: list[Tensor] = self.layers[k - 1](
+                states, [compute_relative_positions(m.places, m.heights) for m in maps], votes
+            )
         else:
             properties = [((m.facts - self.usual) / self.spread).clamp(-UNUSUAL, UNUSUAL) for m in maps]
             after = [self.rows(m.rows) + self.facts(f) for m, f in zip(maps, properties, strict=True)]
@@ -193,8 +195,8 @@ def build_stages(network: RoomMatcher) -> Branches:
     return Branches(MatcherStage(network, k) for k in range(len(network.head)))
 
 
-def ways(places: Tensor, heights: Tensor) -> Tensor:
-    """(R, R, WAY_FACTS) from each room of a map to each of its rooms: direction, distance in rings, climb."""
+def compute_relative_positions(places: Tensor, heights: Tensor) -> Tensor:
+    """Return (R, R, WAY_FACTS) from each room of a map to each of its rooms: direction, distance in rings, climb."""
     off = places[None] - places[:, None]
     far = (off**2).sum(dim=2, keepdim=True).sqrt()
     ring = [(-(((far - at) / (RING_WIDTH[0] + RING_WIDTH[1] * at)) ** 2)).exp() for at in RING_DISTANCES]

@@ -112,7 +112,7 @@ def pair(seed: int, rooms: int = 7) -> GraphPair:
 
 
 def write_set(folder: Path, name: str, pairs: int) -> Path:
-    """A cached set as `datasets.build` leaves it: a manifest and a file a pair."""
+    """A cached set as `datasets.pairs.build` leaves it: a manifest and a file a pair."""
     (folder / "pairs").mkdir(parents=True, exist_ok=True)
     rows = []
     for k in range(pairs):

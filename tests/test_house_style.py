@@ -5,8 +5,10 @@ from __future__ import annotations
 import ast
 import inspect
 import re
+import tokenize
 from collections import defaultdict
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import topomerge
@@ -91,3 +93,86 @@ def test_the_api_is_explained() -> None:
             members = [a for a in vars(thing) if not a.startswith("_")]
             unexplained += [f"{name}.{a}" for a in members if a not in words and not inspect.getdoc(getattr(thing, a, None))]
     assert not unexplained, unexplained
+
+
+# Still open with "What": somebody else edits these today. Remove a file from here with its last "What".
+OPENED_WITH_WHAT = {
+    *(f"topomerge/cli/{name}.py" for name in ("atlas", "completion", "console", "inputs", "locate", "merge", "options")),
+    *(f"topomerge/landmarks/{name}.py" for name in ("evidence", "fuse", "likelihood", "radio", "settle")),
+    *(f"topomerge/{name}.py" for name in ("fusion/atlas/folder", "fusion/bridge", "fusion/live", "io/streams")),
+    "datasets/pairs/pairs_file.py",
+}
+
+
+def test_docstrings_tell_what_a_thing_does() -> None:
+    """Not "What a pair shares", but "Return the rooms that both maps of a pair share"."""
+    opened = [
+        f"{identify(path)}:{node.body[0].lineno}: opens with 'What': say what it does, or is"
+        for path in product_files()
+        if identify(path) not in OPENED_WITH_WHAT
+        for node in [tree_of(path), *list_statements(tree_of(path))]
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        and (ast.get_docstring(node, clean=False) or "").startswith("What ")
+    ]
+    assert not opened, "\n".join(opened)
+
+
+# Names in single backticks are of code; double ones hold what somebody types, such as groups of entry points.
+PACKAGES = ("models", "datasets", "benchmarks")  # at the top of a checkout; all others stand below `topomerge`
+DOTTED = re.compile(r"(?<!`)`((?:[A-Za-z_]\w*\.)+[A-Za-z_]\w*)(?:\([^`]*\))?`")
+DATA_SUFFIXES = ("py", "csv", "json", "onnx")  # `landmarks.csv` is a file, not a name
+
+
+def iter_prose(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield (line, text) of the docstrings and comments of a file."""
+    for node in list_statements(tree_of(path)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            yield node.lineno, node.value.value
+    with path.open("rb") as file:
+        yield from ((t.start[0], t.string) for t in tokenize.tokenize(file.readline) if t.type == tokenize.COMMENT)
+
+
+@cache
+def list_names(path: Path) -> frozenset[str]:
+    """List the names that a module defines: of itself, of its classes, and what its lazy face gives."""
+    names: set[str] = set()
+    for node in ast.walk(tree_of(path)):
+        if isinstance(node, ast.ClassDef | ast.FunctionDef):
+            names.add(node.name)
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            names.add(node.id)
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+            names.add(node.attr)
+        elif isinstance(node, ast.alias):
+            names.add(node.asname or node.name)
+        elif isinstance(node, ast.Dict) and path.name == "__init__.py":
+            names |= {key.value for key in node.keys if isinstance(key, ast.Constant)}
+    return frozenset(names)
+
+
+def resolve_name(name: str) -> bool | None:
+    """Tell whether a dotted name is a module of ours, or stands in one; None where it begins with no package of ours."""
+    first, *parts = name.removeprefix("topomerge.").split(".")
+    place = ROOT / first if first in PACKAGES else ROOT / "topomerge" / first
+    if not place.is_dir() and not name.startswith("topomerge."):
+        return None
+    if not place.is_dir():
+        place, parts = place.parent, [first, *parts]
+    while place.is_dir():
+        if parts and ((place / parts[0]).is_dir() or (place / f"{parts[0]}.py").is_file()):
+            place, parts = place / parts[0], parts[1:]
+            place = place if place.is_dir() else place.with_suffix(".py")
+        elif parts:
+            place = place / "__init__.py"
+        else:
+            return True
+    return set(parts) <= list_names(place)
+
+
+def test_names_in_prose_exist() -> None:
+    stale = []
+    for path in product_files():
+        for line, text in iter_prose(path):
+            names = [n for n in DOTTED.findall(text) if n.rpartition(".")[2] not in DATA_SUFFIXES]
+            stale += [f"{identify(path)}:{line}: `{n}` is gone" for n in names if resolve_name(n) is False]
+    assert not stale, "\n".join(stale)

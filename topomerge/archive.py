@@ -92,7 +92,7 @@ def replace_on_success(path: str | Path) -> Iterator[Path]:
 
 @cache
 def _compute_machine_id() -> str:
-    """A short name of the machine, or the container, whose numbers of processes those of this process are."""
+    """Return a short name of the machine, or the container, whose numbers of processes those of this process are."""
     space = Path("/proc/self/ns/pid")
     numbers = os.readlink(space) if os.path.lexists(space) else ""
     return hashlib.sha256(f"{platform.node()} {numbers}".encode()).hexdigest()[:8]
@@ -174,7 +174,7 @@ def list_arrays(path: str | Path, kind: str = "archive") -> list[str]:
 
 
 class ArrayHeader(NamedTuple):
-    """What an array of an archive declares of itself."""
+    """Shape and type that an array of an archive declares."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
@@ -197,7 +197,7 @@ def read_array_headers(path: str | Path, kind: str = "archive") -> dict[str, Arr
 
 
 def _apply_to_archive(path: str | Path, kind: str, use: Callable[[zipfile.ZipFile, int], R]) -> R:
-    """What `use` makes of an archive and the size of its file; whatever goes wrong is told of the file."""
+    """Apply `use` to an archive and the size of its file; every error names the file."""
     path = Path(path)
     if path.is_dir():
         raise InputError(f"{path}: is a folder, not a {kind}; name a file")
@@ -247,7 +247,8 @@ def _read_header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> ArrayHeade
 
 
 def _parse_header(entry: zipfile.ZipInfo, stream: IO[bytes]) -> tuple[ArrayHeader, bytes]:
-    """The declared shape and type of one array, which must fill the entry to the byte; and what was read behind its header."""
+    """Return the declared shape and type of one array, which must fill the entry to the byte; and what was read behind its
+    header."""
     head = io.BytesIO(stream.read(LONGEST_ARRAY_HEADER))
     version = np.lib.format.read_magic(head)
     if version != (1, 0):

@@ -1,4 +1,4 @@
-"""What a cache depends on, as one short hash: the code that made its files, and the data that this code reads.
+"""Digest of all that a cache depends on, as one short hash: the code that made its files, and the data that this code reads.
 
     key = code_digest("topomerge.extraction.extract")     # of everything that `extract` may run
     key = data_digest("topomerge.extraction.extract")     # of its packaged weights and tables only
@@ -102,7 +102,7 @@ def find_data_files(path: Path, package: Path = HERE) -> list[Path]:
 
 
 def _list_data_lines(files: dict[str, Path], package: Path) -> list[str]:
-    """A line for each data file: its place and its hash."""
+    """Return a line for each data file: its place and its hash."""
     lines = set()
     for name, path in files.items():
         above = name if path.name == "__init__.py" else name.rpartition(".")[0]
@@ -131,7 +131,7 @@ def _find_module_file(module: str, package: Path) -> Path | None:
 
 @dataclass(frozen=True)
 class _Source:
-    """What a walk over a file needs: hash of its code, names that it takes from elsewhere, and its texts.
+    """A parsed file as the walk needs it: hash of its code, names that it takes from elsewhere, and its texts.
 
     Args:
         names: full names of modules, or of what stands in them; with ``*`` behind the dot: all modules of a package.
@@ -190,7 +190,7 @@ class _SourceReader:
 
 
 def _iter_imported_names(node: ast.AST) -> Iterator[str]:
-    """What a node of a syntax tree imports, or takes from the library's face."""
+    """Yield the names that a node of a syntax tree imports, or takes from the library's face."""
     if isinstance(node, ast.Import):
         yield from (alias.name for alias in node.names)
     elif isinstance(node, ast.ImportFrom) and node.module and not node.level:

@@ -110,7 +110,7 @@ def convert_to_dataclass(given: Any, schema: type[Schema]) -> Schema:
 
 
 def _shorten_error(error: Exception) -> str:
-    """What Hydra and OmegaConf say in many lines; the innermost reason is the one that names the key's fault."""
+    """Join the many lines of an error of Hydra or OmegaConf; the innermost reason is the one that names the key's fault."""
     texts = [str(error)]
     if error.__cause__ is not None and str(error.__cause__) not in texts[0]:
         texts.append(str(error.__cause__))

@@ -1,7 +1,7 @@
 """How well the rooms, doors and storeys of a map agree with the truth, or with another map.
 
 Everything here works on label arrays: one integer per place (cell or column of the floor), 0 and above for a room, -1 for
-none. `datasets.judge` makes such arrays from maps and from what is true about a scan.
+none. `datasets.simulation.floor_truth` makes such arrays from maps and from what is true about a scan.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def compute_overlaps(true: Array, extracted: Array, trues: int, extracted_rooms:
 
 
 def assign(iou: Array) -> Array:
-    """(T,) int64: the found room of each true one in the one-to-one assignment with the largest sum of IoU; -1: none that
+    """Return (T,) int64: the found room of each true one in the one-to-one assignment with the largest sum of IoU; -1: none that
     overlaps it."""
     out = np.full(len(iou), -1, np.int64)
     if iou.size:
@@ -131,8 +131,8 @@ def score_rooms(true: Array, extracted: Array, trues: int, counted: Array, expec
 
 
 def match_places(true: Array, extracted: Array, plan: float = PLAN, height: float = PLAN_HEIGHT) -> Array:
-    """(m, 2) int64 pairs (true, extracted) of places within `plan` metres from above and `height` metres in height, one to one:
-    as many as possible, and then the nearest.
+    """Return (m, 2) int64 pairs (true, extracted) of places within `plan` metres from above and `height` metres in height, one to
+    one: as many as possible, and then the nearest.
 
     Args:
         true, extracted: (n, 3), m.

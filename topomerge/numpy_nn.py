@@ -21,7 +21,7 @@ def softmax(logits: Array) -> Array:
 
 
 def apply_mlp(x: Array, layers: Sequence[tuple[Array, Array]]) -> Array:
-    """(n, in) -> (n, out): linear layers (weight (in, out), bias (out,)), rectified between each other."""
+    """Return (n, in) -> (n, out): linear layers (weight (in, out), bias (out,)), rectified between each other."""
     for k, (weight, bias) in enumerate(layers):
         x = (np.maximum(x, 0) if k else x) @ weight + bias
     return x

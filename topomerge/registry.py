@@ -1,5 +1,5 @@
-"""What can be swapped by name, and added from outside of the package: encoders, losses, optimizers, schedules,
-loggers, sets, tasks.
+"""Registries of parts that can be swapped by name, and added from outside of the package: encoders, losses, optimizers,
+schedules, loggers, sets, tasks.
 
 A registry knows what ships, what packages that are installed announce (entry points of its group, such as ``topomerge.losses``),
 and what a module registered that was imported, such as one that ``plugins=[my_package.my_module]`` names:
@@ -122,7 +122,7 @@ def load_plugins(modules: Sequence[str]) -> list[Path]:
 
 
 def _locate(entry: Any) -> tuple[str, str]:
-    """The module and the name of a function, a class, or the class of an object."""
+    """Return the module and the name of a function, a class, or the class of an object."""
     named = entry if hasattr(entry, "__qualname__") else type(entry)
     return named.__module__, named.__qualname__
 

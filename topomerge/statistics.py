@@ -62,9 +62,9 @@ def bootstrap_mean(values: Array, groups: Array, rounds: int = 2000, seed: int =
 
 
 def format_interval(values: Array, groups: Array, digits: int = 2, unit: float = 1.0) -> str:
-    """A mean with its interval by `bootstrap`, `0.62 [0.50, 0.71]`; of fewer than eight groups with the range of the groups'
-    means instead, `0.71, 0.62–0.91 (4 buildings)`; a dash where there is no value. A share that is 0 or 1 throughout has the
-    `compute_exact_interval` over groups: drawing equal values again says nothing.
+    """Return a mean with its interval by `bootstrap`, `0.62 [0.50, 0.71]`; of fewer than eight groups with the range of the
+    groups' means instead, `0.71, 0.62–0.91 (4 buildings)`; a dash where there is no value. A share that is 0 or 1 throughout has
+    the `compute_exact_interval` over groups: drawing equal values again says nothing.
 
     Args:
         values, groups: as of `bootstrap`.
@@ -132,7 +132,7 @@ def measure_calibration(probability: Sequence[float] | Array, right: Sequence[bo
 
 
 def _compute_reliability(p: Array, y: Array, bins: int) -> tuple[float, float, Array, Array, Array]:
-    """The error, and what it is by chance; number, mean, and share that is right of each bin."""
+    """Return the error, and what it is by chance; number, mean, and share that is right of each bin."""
     if not len(p):
         return float("nan"), float("nan"), np.zeros(0, int), np.zeros(0), np.zeros(0)
     which = np.searchsorted(np.sort(p), p, "left") * bins // len(p)  # of equal ones the rank of the first

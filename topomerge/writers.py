@@ -1,5 +1,5 @@
-"""What results save themselves with, by kind: reports stand above the results, so the face of the package puts their writers
-here (`topomerge/__init__.py`), and neither imports the other."""
+"""Writers that results save themselves with, by kind: reports stand above the results, so the face of the package puts their
+writers here (`topomerge/__init__.py`), and neither imports the other."""
 
 from __future__ import annotations
 

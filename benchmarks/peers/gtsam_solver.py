@@ -85,7 +85,7 @@ def build_cells(points: Array) -> VoxelGrid:
 
 
 def build_problem(rooms: int) -> Problem:
-    """What is solved when a storey of so many rooms and a bent copy of it are brought together."""
+    """Record the problem that bending solves when a storey of so many rooms meets a bent copy of itself."""
     points = np.concatenate(storey(rooms))
     maps = [prepare(g) for g in (build_cells(points), build_cells(POSE.inverse().apply(wave_points(points))))]
     problems: list[Problem] = []
@@ -107,12 +107,12 @@ def build_problem(rooms: int) -> Problem:
 
 
 def compute_effect(place: Array) -> Array:
-    """(3, 3) what a small motion of the plane is at a place: shift there and turn."""
+    """Return (3, 3) what a small motion of the plane is at a place: shift there and turn."""
     return np.array([[1.0, 0.0, -place[1]], [0.0, 1.0, place[0]], [0.0, 0.0, 1.0]])
 
 
 def solve_with_gtsam(gtsam: Any, given: Problem) -> Array:
-    """(n, 3) shift and turn of each piece at its anchor."""
+    """Return (n, 3) shift and turn of each piece at its anchor."""
     anchors, joints, measured, prior = given
     graph, start, sure = gtsam.NonlinearFactorGraph(), gtsam.Values(), []
 
@@ -145,7 +145,7 @@ def solve_with_gtsam(gtsam: Any, given: Problem) -> Array:
 
 
 def time_bending(solve: Callable[[], Array]) -> tuple[Array, float]:
-    """What it gives, and the median of its seconds."""
+    """Run a solver several times; return its moves and the median of its seconds."""
     seconds = []
     for _ in range(RUNS):
         began = time.perf_counter()

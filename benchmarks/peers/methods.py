@@ -37,7 +37,7 @@ Work = Callable[..., Iterator[tuple[str, Any]]]
 
 @dataclass(frozen=True)
 class PeerAnswer:
-    """What a method says of two clouds.
+    """The answer of a method about two clouds.
 
     Args:
         pose: (4, 4) maps b into a, as the solver returned it.
@@ -137,7 +137,7 @@ def _build_cloud(points: Array) -> Any:
 
 
 def _compute_features(points: Array) -> tuple[Any, Any]:
-    """A cloud at Open3D's voxel and its FPFH features."""
+    """Return a cloud at Open3D's voxel and its FPFH features."""
     import open3d as o3d
 
     cloud = _build_cloud(points).voxel_down_sample(OPEN3D_VOXEL)

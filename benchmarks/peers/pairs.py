@@ -51,7 +51,7 @@ def list_pair_files(split: str) -> list[Path]:
 
 
 def find_bin(value: float, bins: Mapping[str, tuple[float, float]] = AREA_BINS) -> str:
-    """The bin of a value; of the area that both maps saw if nothing else is said."""
+    """Return the bin of a value; of the area that both maps saw if nothing else is said."""
     return next(name for name, (low, high) in bins.items() if low <= value < high)
 
 
@@ -63,7 +63,7 @@ def find_cell(about: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def described(pair: GridPair) -> dict[str, Any]:
-    """What a line of results tells of a pair."""
+    """Select the properties of a pair that a line of results reports."""
     names = ("sensors", "building", "kind", "source", "overlap", "differs", "walls_differ", "lookalike", "tellable", "furniture")
     return {name: pair.about[name] for name in names if name in pair.about}
 
@@ -145,7 +145,7 @@ def thin_pair(pair: GridPair) -> PeerPair:
 
 
 def load_raw_items(names: set[str]) -> dict[str, tuple[GridItem, Library]]:
-    """The items of test pairs, which they can be simulated from again."""
+    """Return the items of test pairs, which they can be simulated from again."""
     items, plans = draw_grid_items(read_recipe("test").data)
     return {item.name: (item, plans) for item in items if item.name in names}
 
@@ -178,7 +178,7 @@ def iter_heldout_pairs() -> Iterator[GridPair]:
 
 
 def scale_pair(pair: GridPair) -> GridPair:
-    """The pair with b brought to the scale of a, to judge poses of methods that were given it."""
+    """Return the pair with b brought to the scale of a, to judge poses of methods that were given it."""
     size = pair.truth.scale if pair.truth is not None else 1.0
     if pair.truth is None or size == 1.0:
         return pair

@@ -63,14 +63,14 @@ class FloorGrid:
     floor: float
 
     def compute_centres(self, cells: Array) -> Array:
-        """(n, 3) m, of the marked cells."""
+        """Return (n, 3) m, of the marked cells."""
         rows, columns = np.nonzero(cells)
         x, y = self.origin[0] + (columns + 0.5) * CELL, self.origin[1] + (rows + 0.5) * CELL
         return np.column_stack([x, y, np.full(len(x), self.floor)])
 
 
 def build_floor_grids(scan: Scan) -> list[FloorGrid | None]:
-    """The grid of each true storey, by its true floor and ceiling; None where the scan has nothing of it.
+    """Return the grid of each true storey, by its true floor and ceiling; None where the scan has nothing of it.
 
     A cell is occupied where points lie in the band, else free where others do: floor, ceiling, lamps or a lintel.
     """
@@ -139,7 +139,7 @@ def segment_scan(scan: Scan, method: str, grids: list[FloorGrid | None]) -> tupl
 
 
 def _rasterise_labels(truth: FloorTruth, grid: FloorGrid, labels: Array) -> Array:
-    """(rows, columns) int32 labels of cells on the raster of the truth, -1 none."""
+    """Return (rows, columns) int32 labels of cells on the raster of the truth, -1 none."""
     cells = labels >= 0
     ij, inside = truth.compute_columns(truth.transform_to_building(grid.compute_centres(cells)))
     out = np.full(truth.raster.shape[1:], -1, np.int32)

@@ -110,7 +110,7 @@ METHODS: dict[str, Callable[[Array, float], Array]] = {
 
 
 def _label_pieces(mask: Array, cell: float, areas: tuple[float, float], structure: Array | None) -> tuple[Array, int]:
-    """(h, w) int32 connected pieces of a size between two areas (m2), numbered from 1, and how many there are."""
+    """Return (h, w) int32 connected pieces of a size between two areas (m2), numbered from 1, and how many there are."""
     pieces, count = ndimage.label(mask, structure)
     area = np.bincount(pieces.ravel(), minlength=count + 1) * cell**2
     fits = (area >= areas[0]) & (area <= areas[1])
@@ -120,7 +120,7 @@ def _label_pieces(mask: Array, cell: float, areas: tuple[float, float], structur
 
 
 def flood_seeds(seeds: Array, free: Array) -> Array:
-    """(h, w) int32 free cells by the seed (from 1) whose wave front reaches them first, from 0; -1: none does."""
+    """Return (h, w) int32 free cells by the seed (from 1) whose wave front reaches them first, from 0; -1: none does."""
     labels = np.pad(np.where(free, seeds, 0).astype(np.int32), 1)
     open_cells = np.pad(free, 1).ravel() & (labels.ravel() == 0)
     flat, width = labels.ravel(), labels.shape[1]
@@ -138,7 +138,7 @@ def flood_seeds(seeds: Array, free: Array) -> Array:
 
 
 def count_contacts(labels: Array, count: int) -> Array:
-    """(count + 1, count + 1) sides that cells of two pieces share; the last is what is not free."""
+    """Return (count + 1, count + 1) sides that cells of two pieces share; the last is what is not free."""
     padded = np.pad(np.where(labels < 0, count, labels), 1, constant_values=count)
     out = np.zeros((count + 1, count + 1), np.int64)
     for a, b in ((padded[:, 1:], padded[:, :-1]), (padded[1:], padded[:-1])):
@@ -211,7 +211,7 @@ def _wide(touch: Array, area: Array, i: int) -> list[int]:
 
 
 def build_graph(free: Array) -> tuple[Array, Array, Array]:
-    """The Voronoi graph of the occupied cells beside free ones, without its dead ends.
+    """Return the Voronoi graph of the occupied cells beside free ones, without its dead ends.
 
     Args:
         free: (h, w) bool.
@@ -239,7 +239,7 @@ def build_graph(free: Array) -> tuple[Array, Array, Array]:
 
 
 def _prune_dead_ends(ends: Array, count: int) -> Array:
-    """(e,) bool edges that remain when every dead end is taken back to the first crossing."""
+    """Return (e,) bool edges that remain when every dead end is taken back to the first crossing."""
     stay = np.ones(len(ends), bool)
     crossing = np.bincount(ends.ravel(), minlength=count) >= 3
     while True:

@@ -39,7 +39,8 @@ ANSWER_HEADS = (
 
 
 def build_answers(rows: Sequence[Row], verdicts: Mapping[str, PeerVerdict]) -> list[Row]:
-    """A row a pair and method: ``method``, ``err`` (of peers after ICP), ``err_solved``, ``score``, ``believed``, ``seconds``."""
+    """Return a row a pair and method: ``method``, ``err`` (of peers after ICP), ``err_solved``, ``score``, ``believed``,
+    ``seconds``."""
     out: list[Row] = []
     for row in rows:
         base = {k: v for k, v in row.items() if k != "methods"}
@@ -203,7 +204,7 @@ def _measure_believed(rows: Sequence[Row]) -> tuple[float, float]:
 
 
 def tabulate_verdicts(verdicts: Mapping[str, PeerVerdict]) -> str:
-    """What makes each peer's answer believed, and what that gives on training pairs."""
+    """Render the threshold from which each peer's answer is accepted, with its recall and precision on training pairs."""
     out = []
     for name, v in verdicts.items():
         solver = "" if not name.startswith("kiss") else ("yaw only (Quatro)" if v.variant.endswith("q") else "all rotations")
@@ -262,7 +263,7 @@ def tabulate_by_class(rows: Sequence[Row]) -> list[str]:
 
 
 def format_section(folder: Path) -> str:
-    """The whole section; the figure is written below the folder of the documents."""
+    """Return the whole section; the figure is written below the folder of the documents."""
     verdicts = load_verdicts()
     rows = load_answers("test", verdicts)
     ordinary = [r for r in rows if modality(r) == ORDINARY]

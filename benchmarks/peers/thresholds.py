@@ -54,7 +54,7 @@ class PeerVerdict:
     right: int
 
     def get_score(self, outcome: Row) -> float:
-        """The score of an answer; minus infinity where there is none, or its residual is too large."""
+        """Return the score of an answer; minus infinity where there is none, or its residual is too large."""
         scores = outcome["scores"]
         limit, residual = self.residual_at_most, SCORES[self.score]
         large = limit is not None and residual is not None and scores.get(residual, np.inf) > limit
@@ -66,7 +66,8 @@ class PeerVerdict:
 
 
 def apply_refinement(row: Row, variant: str) -> Row:
-    """A pair's row with the outcome of a peer's variant: ``err`` is of the refined pose, ``err_solved`` of the solver's."""
+    """Return a pair's row with the outcome of a peer's variant: ``err`` is of the refined pose, ``err_solved`` of the
+    solver's."""
     outcome = row["methods"][variant]
     return {**row, **outcome, "err": outcome.get("err_icp"), "err_solved": outcome["err"]}
 
@@ -77,7 +78,7 @@ def is_possible(row: Row) -> bool:
 
 
 def find_least_score(score: Array, right: Array, of: int) -> tuple[float | None, float, float]:
-    """The threshold of highest recall at `LEAST_PRECISION`, halfway to the best score below it (None: there is none), its
+    """Return the threshold of highest recall at `LEAST_PRECISION`, halfway to the best score below it (None: there is none), its
     precision and its recall.
 
     Args:
@@ -134,7 +135,7 @@ def load_verdicts(path: Path = THRESHOLDS_FILE) -> dict[str, PeerVerdict]:
 
 
 def serialise_verdicts(rows: Sequence[Row], verdicts: dict[str, PeerVerdict]) -> dict[str, Any]:
-    """What is committed: verdicts, where they are from, and what each variant had right."""
+    """Serialise the verdicts, the command and pairs that they are from, and how many pairs each variant had right."""
     fair = [r for r in rows if is_tellable(r) and not is_broken(r)]
     variants = {
         v: sum(is_good(apply_refinement(r, v)) for r in fair if v in r["methods"]) for names in VARIANTS.values() for v in names

@@ -30,7 +30,7 @@ POINT_BYTES = 16
 
 
 def simulate_office_walk(spacing: float) -> Walk:
-    """A lap through an office as a LiDAR sees it."""
+    """Return a lap through an office as a LiDAR sees it."""
     from topomerge.datasets.buildings.procedural import make_building
     from topomerge.datasets.simulation.scanner import scan_building
 

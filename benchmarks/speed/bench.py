@@ -52,7 +52,7 @@ def _build_walls() -> list[tuple[tuple[float, float], tuple[float, float]]]:
 
 
 def storey(points: int = 6_000_000, seed: int = 0, noise: float = 0.01) -> np.ndarray:
-    """(points, 3) float32 on the surfaces of 20 rooms on a corridor, 1,500 m2, evenly by area, with noise (m)."""
+    """Return (points, 3) float32 on the surfaces of 20 rooms on a corridor, 1,500 m2, evenly by area, with noise (m)."""
     rng = np.random.default_rng(seed)
     walls = [(np.array(a), np.array(b)) for a, b in _build_walls()]
     area = np.array([WIDTH * DEPTH] * 2 + [2 * STOREY_HEIGHT * float(np.linalg.norm(b - a)) for a, b in walls])

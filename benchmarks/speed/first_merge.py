@@ -1,5 +1,5 @@
-"""What the first import on a machine compiles: `python -m benchmarks.speed.first_merge` prints loops, seconds by the clock and of
-processors. Nothing that was compiled before is used, and nothing is kept."""
+"""Time the compilation at the first import on a machine: `python -m benchmarks.speed.first_merge` prints loops, seconds by the
+clock and of processors. Nothing that was compiled before is used, and nothing is kept."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ TURNED_POSE = Sim3(0.7, (12.3, -4.1, 0.2))
 
 
 def draw_floor_plan(rooms: int, seed: int = 0) -> tuple[Array, Array]:
-    """(H, W) bool: walls, and where doors are cut into them."""
+    """Return (H, W) bool: walls, and where doors are cut into them."""
     rng = np.random.default_rng(seed)
     corridors = max(round(rooms / (2 * ROW)), 1)
     each = min(ROW, max(rooms // 2, 1))
@@ -46,7 +46,7 @@ def draw_floor_plan(rooms: int, seed: int = 0) -> tuple[Array, Array]:
 
 
 def build_cells(wall: Array, door: Array) -> Array:
-    """(n, 3) cells of floor, ceiling and walls with open doors under lintels."""
+    """Return (n, 3) cells of floor, ceiling and walls with open doors under lintels."""
     x, y = np.indices(wall.shape).reshape(2, -1)
     level = [np.column_stack([x, y, np.full(x.size, z)]) for z in (0, CEILING_CELLS)]
     up = np.arange(CEILING_CELLS)

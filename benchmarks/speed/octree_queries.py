@@ -30,7 +30,7 @@ CSR = tuple[np.ndarray, np.ndarray]
 
 
 def build_floor_grid() -> VoxelGrid:
-    """A storey of 40 x 40 m: floor, ceiling at 2.8 m, walls around rooms of 5 x 4 m with doors, and furniture."""
+    """Return a storey of 40 x 40 m: floor, ceiling at 2.8 m, walls around rooms of 5 x 4 m with doors, and furniture."""
     volume = np.zeros((400, 400, 30), bool)
     volume[:, :, [0, 28]] = True
     for x in (*range(0, 400, 50), 399):

@@ -1,5 +1,6 @@
-"""What landmarks cost: `python -m benchmarks.speed.readers [PAGE]` reads recordings with their landmarks and without, and counts
-what maps without landmarks load and call when they are merged; with a page, it writes the blocks `readers` and `without` there.
+"""Measure the cost of landmarks: `python -m benchmarks.speed.readers [PAGE]` reads recordings with their landmarks and without,
+and counts what maps without landmarks load and call when they are merged; with a page, it writes the blocks `readers` and
+`without` there.
 
 Each recording is small, so that the costs of one picture, message or row are told. Seconds are of the processor, of all processes
 that read, and the least of some runs; memory is the most that the reading process held. Each measurement is a process of its own.
@@ -71,7 +72,7 @@ print(json.dumps([len(sys.modules), loaded, ", ".join(packages) or "none", calls
 
 @dataclass(frozen=True)
 class Recording:
-    """What is read with its landmarks and without.
+    """A recording that is read with its landmarks and without.
 
     Args:
         what: it is, in words.

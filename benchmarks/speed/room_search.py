@@ -1,4 +1,4 @@
-"""Nearest rooms among many: exact search beside the index of a large atlas (`fusion.atlas.neighbours`, `prepare_rooms_index`).
+"""Nearest rooms among many: exact search beside the index of a large atlas (`fusion.atlas.partners`, `prepare_rooms_index`).
 
 ``python -m benchmarks.speed.room_search [ROOMS ...]``: vectors of length 1 as of the embedder that ships (256
 numbers), noisy copies of a twentieth as many looks; what is looked for are noisy copies of some of them, as many as a map of 30
@@ -40,7 +40,7 @@ def add_noise(rng: np.random.Generator, vectors: Array, noise: float) -> Array:
 
 
 def draw_table(rng: np.random.Generator, rooms: int) -> Array:
-    """(rooms, VECTOR) vectors."""
+    """Return (rooms, VECTOR) vectors."""
     looks = add_noise(rng, np.zeros((max(rooms // ALIKE, 1), VECTOR), np.float32), 1.0)
     table = np.empty((rooms, VECTOR), np.float32)
     for k in range(0, rooms, MADE_AT_ONCE):

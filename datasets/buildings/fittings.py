@@ -1,4 +1,4 @@
-"""What is fitted into the shell: door leaves, panes, sloped ceilings, columns, beams, lamps, furniture."""
+"""Fittings of the shell: door leaves, panes, sloped ceilings, columns, beams, lamps, furniture."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def _make_table(w: float, d: float, h: float = 0.74) -> list[list[float]]:
 
 
 def _make_pile(w: float, d: float, h: float, g: np.random.Generator, most: int = 4) -> list[list[float]]:
-    """What lies about on a top: papers, boxes, bags."""
+    """Draw the things that lie on a top: papers, boxes, bags."""
     number = int(g.integers(most + 1))
     sizes = g.uniform([0.1, 0.1, 0.03], [0.35, 0.3, 0.35], (number, 3))
     sizes[:, 2] *= g.uniform(0.2, 1.0, number)

@@ -92,7 +92,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Size:
-    """What a layout is drawn from: metres of the main corridor, of the rows on its two sides, and of its width."""
+    """Sizes that a layout is drawn from: metres of the main corridor, of the rows on its two sides, and of its width."""
 
     length: float
     near: float
@@ -193,7 +193,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Profile:
-    """What a kind of building is drawn from; lengths in metres.
+    """Distributions that a kind of building is drawn from; lengths in metres.
 
     Args:
         rooms: deck of row rooms on the ground floor; a kind's share is how often it is named.

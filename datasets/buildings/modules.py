@@ -126,7 +126,7 @@ def replace_things(building: Building, gone: Array, added: Sequence[AddedThing])
 def _build_floor(
     building: Building, room: int, taken: list[shapely.Polygon], rng: np.random.Generator
 ) -> tuple[FurnishedFloor, Array]:
-    """A room's floor with what is taken there, and where its doors are."""
+    """Return a room's floor with what is taken there, and where its doors are."""
     shape = shapely.orient_polygons(shapely.Polygon(building.rooms[room].polygon))
     things, doors = building.things, building.doors
     columns = things[(things["room"] == room) & (things["kind"] == "column")]
@@ -140,7 +140,7 @@ def _compute_outline(thing: Array) -> shapely.Polygon:
 
 
 def _convert_item(item: Item, room: int, building: Building) -> AddedThing:
-    """What furnishing gave, as a thing of a room."""
+    """Convert an item of furniture to a thing of a room."""
     floor = building.rooms[room].floor
     vertices, triangles = triangulate_boxes(item.parts, np.array([*item.at, floor]), item.yaw)
     centre = (*item.at, floor + item.size[2] / 2)
@@ -188,7 +188,7 @@ class ModuleRow:
 
 @dataclass(frozen=True)
 class ModulePlan:
-    """What a row is drawn from; lengths in metres.
+    """Settings that a row of modules is drawn from; lengths in metres.
 
     Args:
         layout: of the rooms beside a bay, one of `MODULE_LAYOUTS`.

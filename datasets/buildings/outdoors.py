@@ -1,4 +1,4 @@
-"""What stands around a building: uneven ground, fences, hedges, houses across the street, trees, bushes and cars.
+"""Surroundings of a building: uneven ground, fences, hedges, houses across the street, trees, bushes and cars.
 
 Buildings are erected without it, so that scans of rooms end at the windows. Whoever wants to know what a sensor sees beyond them
 adds it.
@@ -67,7 +67,7 @@ def _add_ground(soup: TriangleSoup, box: Array, taken: shapely.Geometry, low: fl
 
 
 def _add_bound(soup: TriangleSoup, box: Array, side: int, low: float, rng: np.random.Generator) -> None:
-    """What ends a side of the ground: 0 west, 1 south, 2 east, 3 north."""
+    """Add a hedge, a wall or houses along a side of the ground (0 west, 1 south, 2 east, 3 north), or leave it open."""
     kind, axis = str(rng.choice(BOUNDS)), side % 2
     if kind == "open":
         return

@@ -220,7 +220,8 @@ def _estimate_unit(plans: Sequence[Plan], placed: Sequence[Plan]) -> float:
 
 
 def transform_plan(plan: Plan, scale: float, shift: Array) -> Plan:
-    """A plan scaled, then shifted. Doors keep their width (in a shrinking plan they shrink to 0.7 m), walls their thickness."""
+    """Return a plan scaled, then shifted. Doors keep their width (in a shrinking plan they shrink to 0.7 m), walls their
+    thickness."""
 
     def place(points: Array) -> Array:
         return np.round(np.asarray(points, float) * scale + shift, 4)

@@ -246,7 +246,7 @@ def _find_stairwells(low: Plan, high: Plan) -> list[tuple[int, int]]:
 
 
 def _find_doors(plan: Plan, room: shapely.Polygon) -> Array:
-    """(n, 2) middles of the doors of a room."""
+    """Return (n, 2) middles of the doors of a room."""
     passed = [o for o in plan.openings if o.kind in ("door", "opening")]
     middles = np.array([np.add(o.start, o.end) / 2 for o in passed]).reshape(-1, 2)
     reach = np.array([o.thickness / 2 + 0.2 for o in passed])

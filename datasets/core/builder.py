@@ -47,7 +47,7 @@ class TooLongError(InputError):
 
 @dataclass(frozen=True)
 class BuildRow:
-    """What became of an item: `reason` is empty where its file was made."""
+    """The outcome of an item: `reason` is empty where its file was made."""
 
     name: str
     reason: str
@@ -59,7 +59,7 @@ Work = Callable[[Any, Any, str], BuildRow]
 
 @dataclass(frozen=True)
 class BuildReport:
-    """What a build did; `refused` counts reasons."""
+    """The outcome of a build; `refused` counts reasons."""
 
     manifest: Path
     items: int
@@ -205,7 +205,7 @@ def _tidy(folder: Path) -> None:
 
 
 def _read_cached_row(path: Path) -> dict[str, Any] | None:
-    """What a file of the cache is; a damaged one is made again."""
+    """Read the description of a cached file; None where it is missing or damaged and has to be made."""
     try:
         return read_about(path) if path.exists() else None
     except InputError:

@@ -59,7 +59,7 @@ class TriangleSoup:
 
 
 def build_rotation(yaw: float | Array) -> Array:
-    """(2, 2) matrix that turns row vectors: `points @ rotation(yaw)`; (2, 2, n) for n angles."""
+    """Return (2, 2) matrix that turns row vectors: `points @ rotation(yaw)`; (2, 2, n) for n angles."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, s], [-s, c]])
 
@@ -150,7 +150,7 @@ def build_boundary(prisms: Sequence[Prism]) -> Faces:
 
 
 def _build_sides(layers: list[shapely.Geometry], levels: Array) -> Array:
-    """(n, 4, 3) upright rectangles; those that go on in the next layer are made one."""
+    """Return (n, 4, 3) upright rectangles; those that go on in the next layer are made one."""
     keys = []
     for k, layer in enumerate(layers):
         rings = shapely.get_rings(shapely.get_parts(shapely.orient_polygons(layer)))

@@ -119,7 +119,7 @@ def sample_drawing(shapes: Sequence[DrawingShapes], rng: np.random.Generator, si
 
 
 def _sample_centre(shapes: DrawingShapes, rng: np.random.Generator, window: float) -> Array:
-    """(2,) m: anywhere in the plan, its middle, or about an opening."""
+    """Return (2,) m: anywhere in the plan, its middle, or about an opening."""
     points = np.concatenate([r.polygon for r in shapes.rooms])
     low, high = points.min(axis=0), points.max(axis=0)
     kind = rng.random()

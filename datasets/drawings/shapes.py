@@ -1,4 +1,5 @@
-"""What is drawn of a storey: outlines of rooms, openings, walls and stairs, of real plans and of procedural buildings."""
+"""Shapes that a drawing of a storey shows: outlines of rooms, openings, walls and stairs, of real plans and of procedural
+buildings."""
 
 from __future__ import annotations
 
@@ -62,7 +63,7 @@ class OpeningShape:
 
 @dataclass(frozen=True)
 class DrawingShapes:
-    """What is drawn of a plan, m: rooms, openings, walls (w, 2, 2) with their thickness (w,), and rectangles (4, 2) of stairs."""
+    """Shapes of a plan, m: rooms, openings, walls (w, 2, 2) with their thickness (w,), and rectangles (4, 2) of stairs."""
 
     name: str
     rooms: tuple[RoomShape, ...]

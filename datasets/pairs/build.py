@@ -58,19 +58,19 @@ def build(settings: Build, log_line: Callable[[str], None] = lambda text: None, 
     return report
 
 
-def main(words: list[str] | None = None) -> int:
+def main(overrides: list[str] | None = None) -> int:
     """Read the settings with Hydra, build, and print what came of it."""
-    words = sys.argv[1:] if words is None else words
-    if {"-h", "--help"} & set(words):
+    overrides = sys.argv[1:] if overrides is None else overrides
+    if {"-h", "--help"} & set(overrides):
         print(f"{__doc__}\nKeys: configs/build.yaml and configs/data/*.yaml; for example data.pairs=100 cache=/tmp/cache jobs=2")
         return 0
-    return run_script("build", lambda: _build_and_print(words))
+    return run_script("build", lambda: _build_and_print(overrides))
 
 
-def _build_and_print(words: list[str]) -> None:
+def _build_and_print(overrides: list[str]) -> None:
     from topomerge.config import compose
 
-    settings = compose("build", Build, words)
+    settings = compose("build", Build, overrides)
     report = build(settings, lambda text: print(f"build: {text}", file=sys.stderr, flush=True))
     each = f", {report.seconds / report.made:.2f} s of work each" if report.made else ""
     print(f"{report.manifest}: {report.items} pairs, {report.made} made now{each}, {sum(report.refused.values())} refused")

@@ -1,4 +1,4 @@
-"""What truly stands in each column of a building's plan, and this plan as a map of its own: no furniture, no rays."""
+"""True classes of the columns of a building's plan, and this plan as a map of its own: no furniture, no rays."""
 
 from __future__ import annotations
 
@@ -44,7 +44,8 @@ def compute_plan_truth(building: Building, plan: StoreyPlan, places: Array, fram
 
 
 def rasterize_truth(building: Building, storey: int) -> tuple[Array, Array, Array]:
-    """(rows, columns) true room and index into `TRUE_CLASSES` of a storey, in cells of `RASTER_CELL`, and their origin (m)."""
+    """Return (rows, columns) true room and index into `TRUE_CLASSES` of a storey, in cells of `RASTER_CELL`, and their origin
+    (m)."""
     floor = building.storeys["floor"][storey]
     rooms = {i: r.polygon for i, r in enumerate(building.rooms) if abs(r.floor - floor) <= LEVEL_TOLERANCE}
     corners = np.concatenate(list(rooms.values()))
@@ -118,7 +119,7 @@ def draw(building: Building, storey: int = 0) -> FlatMap:
 
 
 def _build_drawing(building: Building, origin: Array, doors: Array, room: Array, ink: Array) -> FlatMap:
-    """The drawing of the cells (rows, columns) bool of rooms, with doors, and with lines that are no walls."""
+    """Return the drawing of the cells (rows, columns) bool of rooms, with doors, and with lines that are no walls."""
     door = np.zeros(room.shape, bool)
     for one in doors:
         _open(one, door, origin)
@@ -130,8 +131,9 @@ def _build_drawing(building: Building, origin: Array, doors: Array, room: Array,
 
 
 def simulate_drawing(building: Building, rooms: Array, storey: int, rng: np.random.Generator, frame: Sim3) -> PointCloud:
-    """The drawing of rooms and of what lies about them on a storey as an architect leaves it, in a frame, with the true rooms of
-    its points: leaves and arcs of doors, outlines of what stands there, and names of rooms, each on some of the drawings."""
+    """Return the drawing of rooms and of what lies about them on a storey as an architect leaves it, in a frame, with the true
+    rooms of its points: leaves and arcs of doors, outlines of what stands there, and names of rooms, each on some of the
+    drawings."""
     arcs, outlines, names = (rng.random(3) < SYMBOLS_SHARES).tolist()
     floors = rasterize_floors(building, DRAWING_CELL)
     visited = shapely.union_all([shapely.Polygon(building.rooms[i].polygon) for i in rooms.tolist()])
@@ -177,7 +179,7 @@ def _draw_leaf_and_arc(door: Array, rng: np.random.Generator) -> list[Array]:
 
 
 def _list_furniture_outlines(building: Building, storey: int) -> list[Array]:
-    """(4, 2) m, footprints of what stands in the rooms of a storey."""
+    """Return (4, 2) m, footprints of what stands in the rooms of a storey."""
     things = building.things[~np.isin(building.things["kind"], HUNG_KINDS) & (building.things["room"] >= 0)]
     here = [t for t in things if building.rooms[t["room"]].storey == storey]
     return [box for thing in here for box in compute_footprints(thing, legs=False)]
@@ -193,7 +195,7 @@ def _draw_letters(polygon: Array, rng: np.random.Generator) -> list[Array]:
 
 
 def _sample_line(line: Array) -> Array:
-    """(n, 2) points on a line through (k, 2) corners, no farther apart than half a cell."""
+    """Return (n, 2) points on a line through (k, 2) corners, no farther apart than half a cell."""
     parts = []
     for start, end in itertools.pairwise(line):
         count = int(np.hypot(*(end - start)) / (DRAWING_CELL / 2)) + 2

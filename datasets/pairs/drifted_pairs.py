@@ -63,7 +63,7 @@ NEAR_FLOOR = 0.3  # m below a floor at which a place is of that storey
 
 @dataclass(frozen=True, eq=False)
 class DriftCorrection:
-    """What undoes the drift of a map.
+    """The correction that undoes the drift of a map.
 
     Args:
         places: (n, 3) in the map's frame, one a cube of half a metre.

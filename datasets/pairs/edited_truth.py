@@ -1,4 +1,4 @@
-"""What corrections teach: true rooms, doors and matches out of maps that somebody corrected, and how much there was to correct.
+"""Truth from corrections: true rooms, doors and matches out of maps that somebody corrected, and how much there was to correct.
 
 Of each map with a journal that holds, the corrected map becomes a capture of a `pairs.yaml` (`data=folder`), and a truth for the
 evaluation of rooms (`evaluate.py task=rooms path=DIR`). Merges that were decided by hand become its pairs.
@@ -42,7 +42,7 @@ MERGE_FILE = f"merge{JOURNAL_SUFFIX}"
 
 @dataclass(frozen=True)
 class EditedTruth:
-    """What became of a folder: lines of a table, and how many maps, edits, rooms and pairs there are."""
+    """The outcome of a folder: lines of a table, and how many maps, edits, rooms and pairs there are."""
 
     lines: tuple[str, ...]
     maps: int
@@ -123,7 +123,8 @@ def _format_counts(name: str, rooms: int, ops: Counter[str]) -> tuple[str, str, 
 def _collect_pairs(
     decisions: Sequence[Path], edited: Mapping[Path, EditedMap], names: Mapping[Path, str], out: Path
 ) -> tuple[list[TriedPair], dict[str, Capture]]:
-    """The pairs that somebody decided, and the captures of all pairs; maps without corrections of their own are captures, too."""
+    """Return the pairs that somebody decided, and the captures of all pairs; maps without corrections of their own are captures,
+    too."""
     corrected = {file.resolve(): out / f"{names[file]}.tmap" for file in edited}
     pairs: dict[tuple[str, str], TriedPair] = {}
     captures: dict[str, Capture] = {}
@@ -153,7 +154,7 @@ def _list_maps(edit: Edit) -> list[int]:
 
 
 def _find_source(source: Path, folder: Path) -> Path | None:
-    """The .tmap that a merge was made of: as it is named, or beside the folder of the merge."""
+    """Return the .tmap that a merge was made of: as it is named, or beside the folder of the merge."""
     places = (source, folder / source.name, folder.parent / source.name)
     return next((p for p in places if p.suffix.lower() == ".tmap" and p.is_file()), None)
 

@@ -35,7 +35,7 @@ LAID_IOU = 0.4  # IoU from which rooms that lie over each other are one
 
 
 class HasTruth(Protocol):
-    """What has a true transform, or None."""
+    """Anything with a true transform, or None where it is not known."""
 
     @property
     def truth(self) -> Sim3 | None:
@@ -44,7 +44,7 @@ class HasTruth(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class EvaluationPair:
-    """What is true of an evaluation pair; `maps` reads the maps.
+    """A pair of maps with its truth, for evaluation; `maps` reads the maps.
 
     Args:
         name: of the files.
@@ -154,7 +154,7 @@ def build_evaluation_arrays(pair: Pair, maps: Sequence[TopometricMap], true: tup
 
 
 def find_twins(true: Array, other: Array, rooms: Sequence[TrueRoom], others: Sequence[TrueRoom], same: bool = True) -> Array:
-    """(R,) bool: does the other map hold a room, another than the true partner, whose plan has the same area and sides?
+    """Return (R,) bool: does the other map hold a room, another than the true partner, whose plan has the same area and sides?
 
     Args:
         true, other: true room of each extracted room of this map and of the other one, -1 none.
@@ -211,7 +211,7 @@ def compute_anchor(pair: HasTruth, maps: Sequence[TopometricMap]) -> Array:
 
 
 def match_overlapping_rooms(pair: Pair, maps: Sequence[TopometricMap]) -> Array:
-    """(M, 2) rooms of which most of both lies over each other under the true transform, one to one."""
+    """Return (M, 2) rooms of which most of both lies over each other under the true transform, one to one."""
     t = pair.truth
     if t is None or pair.kind != "overlap":
         return np.zeros((0, 2), np.int64)

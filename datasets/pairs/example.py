@@ -80,8 +80,8 @@ def make_arrays(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array]
 
 
 def build_several_maps(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array]:
-    """The arrays of an item of three or more maps of a building: those of each map, and under "matches.ac", "transform.ac" and so
-    on what is true of each two; "matches" and "transform" are those of the first two.
+    """Return the arrays of an item of three or more maps of a building: those of each map, and under "matches.ac", "transform.ac"
+    and so on what is true of each two; "matches" and "transform" are those of the first two.
 
     Raises:
         InputError: no candidate has such walks, or a map has hardly a room.
@@ -189,7 +189,7 @@ def _make_first_pair(item: Item, plans: Sequence[Sequence[Plan]]) -> tuple[Pair,
 
 
 def _make_first(item: Item, make: Callable[[int, np.random.Generator], Made]) -> Made:
-    """What is made of the first of an item's candidates that has it, from its number and a generator of its own."""
+    """Make an example of the first of an item's candidates that gives one, from its number and a generator of its own."""
     refused: InputError | None = None
     for k in range(len(item.buildings)):
         try:

@@ -58,7 +58,7 @@ class FlatMap:
 
 
 def _transform_points(frame: Sim3, points: Array) -> Array:
-    """(n, 2) points in another frame."""
+    """Return (n, 2) points in another frame."""
     c, s = frame.scale * np.cos(frame.yaw), frame.scale * np.sin(frame.yaw)
     x, y = points.T
     return np.column_stack([c * x - s * y + frame.translation[0], s * x + c * y + frame.translation[1]])
@@ -103,7 +103,8 @@ def build_from_masks(
 
 
 def extrude_flat(flat: FlatMap, z: float = 0.0) -> PointCloud:
-    """The cloud of a floor at height `z`, m: floor, walls of `WALL_HEIGHT` and, where the sensor's rays went, free cells."""
+    """Return the cloud of a floor at height `z`, m: floor, walls of `WALL_HEIGHT` and, where the sensor's rays went, free
+    cells."""
     spacing = max(flat.cell, 0.05)
     levels = np.linspace(0.0, WALL_HEIGHT, round(WALL_HEIGHT / spacing) + 1)
     free, walls = (thin(p, spacing) if flat.cell < 0.9 * spacing else p for p in (flat.free, flat.walls))
@@ -137,7 +138,7 @@ def thin(points: Array, cell: float) -> Array:
 
 
 def _repeat_at_heights(points: Array, levels: Sequence[float] | Array) -> Array:
-    """(n * k, 3) points at each of k heights."""
+    """Return (n * k, 3) points at each of k heights."""
     return np.column_stack([np.tile(points, (len(levels), 1)), np.repeat(levels, len(points))])
 
 
@@ -242,8 +243,9 @@ def simulate_robot_grid(
 
 
 def count_rays(starts: Array, ends: Array, met: Array | None = None) -> tuple[Array, Array, Array]:
-    """(rows, columns) bool of occupied and of free cells of `GRID_CELL`, and the corner (2,) m of the first: a cell is occupied
-    where at least `LEAST_HITS` of the rays that come to it end (occupancy grids: Elfes 1989), else free where any crosses it.
+    """Return (rows, columns) bool of occupied and of free cells of `GRID_CELL`, and the corner (2,) m of the first: a cell is
+    occupied where at least `LEAST_HITS` of the rays that come to it end (occupancy grids: Elfes 1989), else free where any
+    crosses it.
 
     Args:
         starts, ends: (n, 2) m.

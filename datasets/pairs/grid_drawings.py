@@ -168,33 +168,33 @@ def find_places(pair: GridPair, item: GridItem, plans: Plans) -> list[MapOrigin]
 
 
 def build_drawing_arrays(
-    path: Path, here: MapOrigin, there: MapOrigin, storey: int, kind: str, frame: Sim3, file: str
+    path: Path, here: MapOrigin, other: MapOrigin, storey: int, kind: str, frame: Sim3, file: str
 ) -> dict[str, Array]:
     """Build the cached arrays of a map of the pair at `path` and a drawing in `frame`: as `grid_pairs.build_pair_arrays`."""
     data = archive.read(path, "cached pair")
     about = json.loads(data["about"].tobytes())
     out = {f"a{key[1:]}": data[key] for key in data if key.startswith(f"{here.side}.")}
-    flat = draw(there.building, storey).transform(replace(frame, translation=(*frame.translation[:2], 0.0)))
-    floor = float(there.building.storeys["floor"][storey])
+    flat = draw(other.building, storey).transform(replace(frame, translation=(*frame.translation[:2], 0.0)))
+    floor = float(other.building.storeys["floor"][storey])
     grid = build_grid(extrude_flat(replace(flat, rooms=()), frame.translation[2] + frame.scale * floor))
     out |= {"b.cells": grid.cells.astype(np.int16), "b.origin": grid.origin, "b.shape": np.array(grid.shape)}
     out["b.mean"] = grid.properties["offset"]
     truth = here.frame @ frame.inverse() if kind in ("overlap", "other-storey") else None
     out["truth"] = np.full((4, 4), np.nan) if truth is None else truth.matrix
     sensor = about["sensors"]["ab".index(here.side)]
-    names = [here.building.name] + [there.building.name] * (there.building.name != here.building.name)
+    names = [here.building.name] + [other.building.name] * (other.building.name != here.building.name)
     description = {"sensors": [sensor, "drawing"], "kind": kind, "building": " + ".join(names), "source": about["source"]}
     description |= {"overlap": float(kind == "overlap"), "scaled": frame.scale != 1.0, "common": 0.0}
-    description |= measure_differences(here, there, storey) if kind in ("twin-wing", "other-storey") else {}
+    description |= measure_differences(here, other, storey) if kind in ("twin-wing", "other-storey") else {}
     out["about"] = np.frombuffer(json.dumps({**description, "file": file, "difficulty": about["difficulty"]}).encode(), np.uint8)
     return out
 
 
-def measure_differences(here: MapOrigin, there: MapOrigin, storey: int) -> dict[str, float]:
+def measure_differences(here: MapOrigin, other: MapOrigin, storey: int) -> dict[str, float]:
     """Measure how two plans differ where the map was taken: twin wings by ``differs`` (m, as
     `grid_pairs.measure_wing_difference`), storeys by ``walls_differ`` (m2 of walls that only one of them has)."""
-    if here.building is not there.building:
-        outlines = [[p.building.rooms[i].polygon for i in here.visited.tolist()] for p in (here, there)]
+    if here.building is not other.building:
+        outlines = [[p.building.rooms[i].polygon for i in here.visited.tolist()] for p in (here, other)]
         first = np.concatenate(outlines[0])
         return {"differs": min(measure_outline_misfit(first, np.concatenate([p[::k] for p in outlines[1]])) for k in (1, -1))}
     walls = [draw(here.building, k).walls for k in (here.storey, storey)]

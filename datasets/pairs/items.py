@@ -215,7 +215,7 @@ class Item:
 
     @property
     def pair_settings(self) -> PairSettings:
-        """What `make_pair` is asked for."""
+        """Return the settings for `make_pair`."""
         return PairSettings(self.overlap, self.sensors, self.rooms, self.scale, self.hard or None, self.over_stairs)
 
     @property

@@ -89,7 +89,8 @@ def simulate_single_scan(
 
 
 def _choose_walk_poses(walk: Walk, kind: str, room: int, rng: np.random.Generator) -> Array:
-    """(K, 4, 4) of the sensor: one in the room, looking anywhere, or all around; or those along `WALK_LENGTH` from there."""
+    """Return (K, 4, 4) of the sensor: one in the room, looking anywhere, or all around; or those along `WALK_LENGTH` from
+    there."""
     sensor = get_sensor(SENSOR_OF[kind])
     inside = np.flatnonzero(walk.free & (walk.room == room))
     if not len(inside):

@@ -133,7 +133,7 @@ def _furnish_row(row: ModuleRow, furniture: str, difficulty: Difficulty, rng: np
 
 
 def _sample_corridors(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> LookalikePlaces:
-    """A corridor with rooms beside it, and another one like it elsewhere: the same plan a second time."""
+    """Return a corridor with rooms beside it, and another one like it elsewhere: the same plan a second time."""
     a = make_building(str(rng.choice(CORRIDOR_KINDS)), seed, 1, difficulty, str(rng.choice(["single", "double"])))
     rooms = sample_part(a, int(rng.integers(4, 8)), rng, start=_find_largest_corridor(a))
     return LookalikePlaces((a, _vary_furniture(a, furniture, rooms, difficulty, rng)), (rooms, rooms), (Sim3(),))
@@ -287,7 +287,7 @@ def _vary_furniture(a: Building, furniture: str, rooms: Array, difficulty: Diffi
 
 
 def _sample_room(building: Building, rng: np.random.Generator) -> int:
-    """A room that is no corridor and not tiny."""
+    """Return a room that is no corridor and not tiny."""
     fits = [i for i, r in enumerate(building.rooms) if r.kind not in CONNECTING and shapely.Polygon(r.polygon).area > LEAST_AREA]
     return int(rng.choice(fits))
 

@@ -1,4 +1,4 @@
-"""What phones hear at look-alikes: the two places of a pair in one world, with access points, walls and floors between them.
+"""Radio readings at look-alikes: the two places of a pair in one world, with access points, walls and floors between them.
 
 Places with the same walls are put where such places are: on two storeys, in two wings or rooms of one row, or in two buildings
 that hear nothing of each other (`draw_relation`). Readings are a switch, as signs are: the arrays of the pair stay as they are.
@@ -104,7 +104,7 @@ def find_track(building: Building, rooms: Array) -> Array:
 
 @dataclass(frozen=True)
 class RadioPair:
-    """What two phones hear, each in the frame of its map; "" or how the second place lies to the first one."""
+    """The readings of two phones, each in the frame of its map; "" or how the second place lies to the first one."""
 
     readings: tuple[Landmarks, Landmarks]
     relation: str
@@ -128,7 +128,7 @@ def simulate_lookalike_radio(
     relation = draw_relation(item, places, rng)
     world = build_world(buildings, relation, rng)
     own = world if world.joined else RadioWorld((build_radio_plans(buildings[0])[0],)), world
-    heard = []
+    of_phones = []
     for session, (building, rooms, frame) in enumerate(zip(buildings, visited, frames, strict=True)):
         plans, shift = own[session].plans, np.array(world.shift if session else (0.0, 0.0))
         points = place_access_points(plans, settings, SEEDS * item.seed + 2 * draw + (session if not world.joined else 0))
@@ -138,5 +138,5 @@ def simulate_lookalike_radio(
         at[:, 2] = float(building.storeys["floor"][0]) + HELD
         readings.table["position"] = frame.apply(at)
         readings.table["sigma"] *= frame.scale
-        heard.append(readings)
-    return RadioPair((heard[0], heard[1]), relation)
+        of_phones.append(readings)
+    return RadioPair((of_phones[0], of_phones[1]), relation)

@@ -159,14 +159,14 @@ def _rasterize_place(shown: VisiblePlace, pose: Sim3, low: Array, shape: tuple[i
 
 
 def _build_doorway(door: Array) -> Array:
-    """(4, 2) floor of a doorway."""
+    """Return (4, 2) floor of a doorway."""
     half = np.array([door["thickness"] / 2 + 0.05, door["width"] / 2])
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
     return np.asarray(corners @ build_rotation(float(door["direction"])) + door["centre"][:2])
 
 
 def _sample_outline(polygon: Array) -> Array:
-    """(n, 2) points along a closed outline, a cell apart."""
+    """Return (n, 2) points along a closed outline, a cell apart."""
     ends = np.roll(polygon, -1, axis=0)
     pieces = []
     for p, q in zip(polygon, ends, strict=True):

@@ -60,7 +60,7 @@ class TriedPair:
 
 @dataclass(frozen=True)
 class MergedTruth:
-    """What became of a folder: the lines of a table, and how many pairs and captures were taken, of how many buildings."""
+    """The outcome of a folder: the lines of a table, and how many pairs and captures were taken, of how many buildings."""
 
     lines: tuple[str, ...]
     pairs: int

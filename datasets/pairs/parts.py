@@ -214,7 +214,7 @@ def _measure_height(cells: Array) -> float:
 
 
 def _find_most_common(row: Array, label: Array, count: int, rooms: int) -> Array:
-    """(count,) int32 label that is commonest in each row; -1: none. Rows below 0 are left out."""
+    """Return (count,) int32 label that is commonest in each row; -1: none. Rows below 0 are left out."""
     out = np.full(count, -1, np.int32)
     pair, votes = np.unique(row[row >= 0] * max(rooms, 1) + label[row >= 0], return_counts=True)
     order = np.argsort(votes, kind="stable")  # the last one written has most votes
@@ -235,7 +235,7 @@ def _label_by_outline(map: TopometricMap, cloud: PointCloud) -> Array:
 
 
 def _compute_iou(map: TopometricMap, label: Array, count: int) -> Array:
-    """(R, count) IoU of cells."""
+    """Return (R, count) IoU of cells."""
     rooms = len(map.rooms)
     inside = (map.room >= 0) & (label >= 0)
     both = np.zeros((rooms, count))

@@ -203,7 +203,7 @@ def plot_maps(building: Building, simulated: Pair | PointCloud, frame: Sim3) -> 
 
 
 def _transform_rooms(cloud: PointCloud, frame: Sim3) -> tuple[TrueRoom, ...]:
-    """The rooms of a cloud in the frame of its building."""
+    """Return the rooms of a cloud in the frame of its building."""
     from topomerge.datasets.simulation.scanner import transform_cloud
 
     return transform_cloud(cloud, frame.inverse()).rooms

@@ -76,7 +76,8 @@ def _parse_segments(text: bytes) -> Array:
 
 
 def _find_inside(distance: Array) -> Array:
-    """(h, w) bool: the building, after closing gaps of up to `FRONT_GAP` in its outer walls (glass is often not in the map)."""
+    """Return (h, w) bool: the building, after closing gaps of up to `FRONT_GAP` in its outer walls (glass is often not in the
+    map)."""
     closed = ndimage.binary_fill_holes(distance <= FRONT_GAP / 2)
     inside: Array = ndimage.distance_transform_edt(closed) * LINE_MAP_CELL > FRONT_GAP / 2
     return inside
@@ -90,7 +91,7 @@ def _find_outdoor_regions(labels: Array, free: Array, wall: Array) -> Array:
 
 
 def _rasterize_walls(lines: Array) -> tuple[Array, Array]:
-    """(h, w) bool raster of the walls, and its origin, m."""
+    """Return (h, w) bool raster of the walls, and its origin, m."""
     reach = float(np.abs(lines).max())
     if reach > LINE_MAP_REACH:
         raise InputError(f"absurd scale: a map that reaches {reach:.3g} m")

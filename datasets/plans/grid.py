@@ -111,7 +111,7 @@ def _cluster_points(points: Array) -> list[Array]:
 
 
 def _fit_line(points: Array) -> Array:
-    """(2, 2) ends of the points along their main direction, which is an axis where that is nearly right."""
+    """Return (2, 2) ends of the points along their main direction, which is an axis where that is nearly right."""
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     along = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][0] if len(points) > 1 else np.array([1.0, 0])
     if np.abs(along).max() > 0.97:
@@ -240,7 +240,7 @@ def read_bwi(path: Path) -> Sketch:
 
 
 def _rasterize_polygons(polygons: list[list[float]], shape: tuple[int, ...]) -> Array:
-    """(h, w) int32: number of the polygon in each cell, from 1, lowest row first."""
+    """Return (h, w) int32: number of the polygon in each cell, from 1, lowest row first."""
     image = Image.new("I", (shape[1], shape[0]), 0)
     for k, polygon in enumerate(polygons, 1):
         corners = np.array(polygon, float).reshape(-1, 2)
@@ -289,7 +289,7 @@ def _remove_outside(labels: Array, free: Array) -> Array:
 
 
 def _read_map(folder: Path) -> tuple[Array, float, Array]:
-    """The map of a folder: grey levels, m per cell, and origin, m."""
+    """Return the map of a folder: grey levels, m per cell, and origin, m."""
     listings = sorted(p for p in folder.glob("*.yaml") if p.stem not in ("locations", "doors", "objects", "connectivity"))
     for path in sorted(listings, key=lambda p: p.stem != folder.name):
         about = _read_yaml(path)
@@ -312,7 +312,7 @@ def _read_yaml(path: Path) -> Any:
 
 
 def _read_image(path: Path) -> Array:
-    """(h, w) uint8 grey levels, lowest row first; transparent is as dark as it is painted."""
+    """Return (h, w) uint8 grey levels, lowest row first; transparent is as dark as it is painted."""
     try:
         with Image.open(path, formats=IMAGE_FORMATS) as image:
             if image.width * image.height > MAX_PIXELS:

@@ -178,7 +178,8 @@ def _find_openings(model: Any, solids: ElementSolids) -> list[tuple[str, Array, 
 
 
 def _build_opening(kind: str, triangles: Array) -> tuple[str, Array, Array]:
-    """The long axis of the smallest rectangle around a hole that is as wide as it is: walls are thinner than doors are wide."""
+    """Return the long axis of the smallest rectangle around a hole that is as wide as it is: walls are thinner than doors are
+    wide."""
     around = shapely.oriented_envelope(shapely.multipoints(triangles.reshape(-1, 3)[:, :2]))
     corners = np.asarray(around.exterior.coords)[:4] if around.geom_type == "Polygon" else np.zeros((4, 2))
     if np.hypot(*(corners[1] - corners[0])) < np.hypot(*(corners[2] - corners[1])):

@@ -191,7 +191,7 @@ def _add_openings(result: Sketch, rows: Rows, scale: float, faces: list[shapely.
 
 
 def _snap_to_wall(ends: Array, walls: Array, lines: Array) -> Array:
-    """(2, 2) the opening moved onto the nearest wall that runs its way, if there is one within 0.2 m."""
+    """Return (2, 2) the opening moved onto the nearest wall that runs its way, if there is one within 0.2 m."""
     along = ends[1] - ends[0]
     if abs(along[0]) > 1e-9 and abs(along[1]) > 1e-9:  # a slanted opening stays where it is
         return ends

@@ -138,7 +138,7 @@ def _compute_placement(site: dict[str, Any], order: list[str], name: str) -> tup
 
 
 def _compute_points(level: Level, site: dict[str, Any], order: list[str]) -> Array:
-    """(n, 2) vertices, m, y up."""
+    """Return (n, 2) vertices, m, y up."""
     name = next(name for name in order if site["levels"][name] is level)
     scale, shift = _compute_placement(site, order, name)
     pixels = np.array([v[:2] for v in level.get("vertices", [])], float).reshape(-1, 2)
@@ -171,7 +171,7 @@ def _transform_from_cabin(site: dict[str, Any], order: list[str], lift: dict[str
 
 
 def _list_lift_doors(site: dict[str, Any], order: list[str], k: int) -> Array:
-    """(n, 2, 2) doors of the lifts at level k."""
+    """Return (n, 2, 2) doors of the lifts at level k."""
     out = []
     for _, lift in sorted((site.get("lifts") or {}).items()):
         for name in lift.get("level_doors", {}).get(order[k], []):
@@ -184,7 +184,8 @@ def _list_lift_doors(site: dict[str, Any], order: list[str], k: int) -> Array:
 
 
 def _find_gaps(lines: Array, walls: Array) -> Array:
-    """(n, 2, 2) openings without doors: where a wall's loose end looks along the wall at other lines, `OPENING_WIDTHS` away."""
+    """Return (n, 2, 2) openings without doors: where a wall's loose end looks along the wall at other lines, `OPENING_WIDTHS`
+    away."""
     every = shapely.linestrings(lines)
     tree = shapely.STRtree(every)
     gaps: list[Array] = []
@@ -245,7 +246,7 @@ def _assign_names(result: Sketch, level: Level, points: Array, shafts: list[Arra
 
 
 def _build_flight(corners: Array) -> Flight:
-    """A lift's cabin."""
+    """Return a lift's cabin."""
     ahead = corners[3] - corners[0]
     size = np.linalg.norm(corners[1] - corners[0]), np.linalg.norm(ahead)
     heading = float(np.arctan2(ahead[1], ahead[0]))

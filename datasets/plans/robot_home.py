@@ -67,13 +67,13 @@ def read_robot_home(path: Path) -> Sketch:
 
 
 def spread_rooms(drawn: RobotMap) -> tuple[Array, Array]:
-    """(h, w) the robot's rooms of `SMALLEST_HOME_ROOM` and more, spread over the floor around them, 0: none; and the numbers (k,)
-    of these rooms."""
+    """Return (h, w) the robot's rooms of `SMALLEST_HOME_ROOM` and more, spread over the floor around them, 0: none; and the
+    numbers (k,) of these rooms."""
     sizes = np.bincount(drawn.rooms.ravel())[1:] * drawn.resolution**2
     large = 1 + np.flatnonzero(sizes >= SMALLEST_HOME_ROOM)
     return flood(np.where(np.isin(drawn.rooms, large), drawn.rooms, 0), drawn.free), large
 
 
 def _remove_islands(shape: shapely.Polygon) -> shapely.Polygon:
-    """A room without the islands that a robot drove around."""
+    """Return a room without the islands that a robot drove around."""
     return shapely.Polygon(shape.exterior, [ring for ring in shape.interiors if shapely.Polygon(ring).area >= ISLAND])

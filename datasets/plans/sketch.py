@@ -302,7 +302,7 @@ def _check_overlap(shapes: Sequence[shapely.Polygon], names: Sequence[str]) -> N
 
 
 def _check_doors(sketch: Sketch) -> Array:
-    """(n,) bool: can one walk through the opening? Refuses a plan whose doors have no width or an absurd one."""
+    """Return (n,) bool: can one walk through the opening? Refuses a plan whose doors have no width or an absurd one."""
     walked = np.array([o.kind in ("door", "opening") for o in sketch.openings], bool)
     width = np.array([np.hypot(o.end[0] - o.start[0], o.end[1] - o.start[1]) for o in sketch.openings])
     if not walked.any():
@@ -322,7 +322,7 @@ def _check_scale(shapes: Sequence[shapely.Polygon]) -> None:
 
 
 def _find_connected_rooms(sketch: Sketch, shapes: Sequence[shapely.Polygon], passable: Array) -> Array:
-    """(R,) bool: rooms of the largest part that doors join; ties go to the larger area."""
+    """Return (R,) bool: rooms of the largest part that doors join; ties go to the larger area."""
     count = len(shapes)
     if count < 2:
         raise InputError(f"too few rooms: {count}")
@@ -344,7 +344,7 @@ def _find_connected_rooms(sketch: Sketch, shapes: Sequence[shapely.Polygon], pas
 
 
 def _verify_openings(sketch: Sketch, shapes: Sequence[shapely.Polygon]) -> Array:
-    """(n,) bool: does one find the two rooms of an opening on its two sides?"""
+    """Return (n,) bool: does one find the two rooms of an opening on its two sides?"""
     joined_rooms = find_side_rooms(
         np.array([o.start for o in sketch.openings]),
         np.array([o.end for o in sketch.openings]),

@@ -91,10 +91,10 @@ def read_regions(path: Path) -> dict[int, TrueRoom]:
         raise InputError(f"{path}: is no .house file, or damaged ({error}); copy it again") from error
 
 
-def _build_room(words: list[str], outline: list[list[float]] | None) -> TrueRoom:
-    x0, y0, z0, x1, y1, z1 = (float(v) for v in words[9:15])
+def _build_room(columns: list[str], outline: list[list[float]] | None) -> TrueRoom:
+    x0, y0, z0, x1, y1, z1 = (float(v) for v in columns[9:15])
     polygon = np.array(outline or [[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
-    return TrueRoom(f"region{words[1]}", polygon, z0, z1, int(words[2]), REGION_KINDS.get(words[5], ""))
+    return TrueRoom(f"region{columns[1]}", polygon, z0, z1, int(columns[2]), REGION_KINDS.get(columns[5], ""))
 
 
 def _read_points(path: Path) -> Array:
@@ -105,7 +105,7 @@ def _read_points(path: Path) -> Array:
 
 
 def _find_rooms(points: Array, rooms: list[TrueRoom]) -> Array:
-    """(n,) room whose prism holds a point, -1: none."""
+    """Return (n,) room whose prism holds a point, -1: none."""
     out = np.full(len(points), -1)
     for storey in sorted({room.storey for room in rooms}):
         here = [k for k, room in enumerate(rooms) if room.storey == storey]

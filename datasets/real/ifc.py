@@ -65,8 +65,8 @@ def _load_pair(path: Path) -> Pair:
 
 
 def load_model_building(path: Path) -> Building:
-    """The model's own triangles, with the rooms, doors and stairs of its plans, in the model's frame but for the height: the
-    lowest floor is at 0.
+    """Return the model's own triangles, with the rooms, doors and stairs of its plans, in the model's frame but for the height:
+    the lowest floor is at 0.
 
     Raises:
         InputError: what `plan_ifc` and the reader of IFC refuse; floors of the plans that are not at the model's heights.
@@ -91,7 +91,7 @@ def load_model_building(path: Path) -> Building:
 
 
 def _load_triangles(path: Path) -> tuple[Array, Array]:
-    """(t, 3, 3) corners in metres of all that is built, and (t,) uint8 index into `SURFACES`."""
+    """Return (t, 3, 3) corners in metres of all that is built, and (t,) uint8 index into `SURFACES`."""
     import ifcopenshell
     from topomerge.datasets.plans.ifc import ElementSolids
 

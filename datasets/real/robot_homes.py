@@ -24,8 +24,8 @@ INSIDE = 0.01  # m, from a corner of a column into it
 
 
 def compute_home_truth(path: Path, points: Array) -> tuple[FloorTruth, tuple[TrueRoom, ...]]:
-    """The robot's rooms as what is true, and a door wherever two of them touch, in the frame in which the map is read; and what
-    its owner calls them.
+    """Return the robot's rooms as what is true, and a door wherever two of them touch, in the frame in which the map is read; and
+    what its owner calls them.
 
     Args:
         points: (n, 3) of the map.
@@ -66,7 +66,7 @@ def compute_home_truth(path: Path, points: Array) -> tuple[FloorTruth, tuple[Tru
 
 
 def _compute_columns(rooms: Array, resolution: float) -> Array:
-    """(rows, columns) int32 of the truth's columns: the room at the middle of each, or at one of its corners."""
+    """Return (rows, columns) int32 of the truth's columns: the room at the middle of each, or at one of its corners."""
     extent = np.array(rooms.shape[::-1]) * resolution
     columns, rows = np.ceil((extent + 2 * TRUTH_MARGIN) / TRUTH_CELL).astype(int)
     out = np.full((rows, columns), OUTSIDE_ROOMS, np.int32)

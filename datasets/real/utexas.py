@@ -65,13 +65,13 @@ def _load_part_pair(read: Callable[[str], FlatMap], part: str, seed: int) -> Pai
 
 
 def _build_pair(name: str, a: FlatMap, b: FlatMap, truth: Sim3, sensor: str, seed: int) -> Pair:
-    """A pair whose second map has the rooms of the first."""
+    """Return a pair whose second map has the rooms of the first."""
     b = replace(b, rooms=tuple(transform_room(room, truth.inverse()) for room in a.rooms))
     return build_flat_pair(name, a, b, truth, ("laser2d", sensor), "utexas", "gdc", seed)
 
 
 def _read_grid(folder: Path, name: str) -> FlatMap:
-    """The grid of a floor, with the rooms of BWI where it has them."""
+    """Return the grid of a floor, with the rooms of BWI where it has them."""
     path = folder / "maps" / "real" / name
     flat = read_flat(path / f"{name}.yaml")
     return replace(flat, rooms=_read_rooms(path / "locations.yaml", path / f"{name}.yaml")) if name in INTO_LINES else flat
@@ -119,7 +119,7 @@ def read_lines(path: Path) -> FlatMap:
 
 
 def _rasterize_lines(lines: Array, low: Array, high: Array) -> Array:
-    """(h, w) bool, lowest row first: cells on a line."""
+    """Return (h, w) bool, lowest row first: cells on a line."""
     columns, rows = np.ceil((high - low) / UTEXAS_CELL).astype(int) + 1
     count = (np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1) / UTEXAS_CELL * 2).astype(int) + 2
     t = np.concatenate([np.linspace(0, 1, n) for n in count])[:, None]
@@ -131,7 +131,7 @@ def _rasterize_lines(lines: Array, low: Array, high: Array) -> Array:
 
 
 def _find_floor(walls: Array) -> Array:
-    """(h, w) bool: what lies between walls, without the cavities in them."""
+    """Return (h, w) bool: what lies between walls, without the cavities in them."""
     far = ndimage.distance_transform_edt(~walls) * UTEXAS_CELL
     closed = ndimage.binary_fill_holes(far <= FRONT_GAP / 2)
     inside = ndimage.distance_transform_edt(closed) * UTEXAS_CELL > FRONT_GAP / 2

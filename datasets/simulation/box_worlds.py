@@ -45,7 +45,7 @@ class World:
     things: list[Array]
 
     def clear_of(self, room: int) -> Array:
-        """(k, 2) doors of a room."""
+        """Return (k, 2) doors of a room."""
         return self.doors[self.doors[:, 2] == room, :2]
 
 
@@ -68,7 +68,7 @@ def draw_world(rng: np.random.Generator, count: int, width: float | None = None)
 
 
 def furnish_room(world: World, room: int, count: int, rng: np.random.Generator) -> Array:
-    """(k, 5) boxes on the floor of a room, clear of each other and of its doors, most of them along walls."""
+    """Return (k, 5) boxes on the floor of a room, clear of each other and of its doors, most of them along walls."""
     x0, y0, x1, y1 = world.rooms[room]
     things: list[list[float]] = []
     for _ in range(6 * count):
@@ -104,7 +104,7 @@ def move_things(world: World, share: float, rng: np.random.Generator) -> World:
 
 
 def scan_world(world: World, visited: list[int], rng: np.random.Generator) -> tuple[Array, Sim3]:
-    """(n, 3) points of the visited rooms in a frame of the map's own, and that frame: world -> map."""
+    """Return (n, 3) points of the visited rooms in a frame of the map's own, and that frame: world -> map."""
     parts = [scan_room(world, room, rng) for room in visited]
     for x, y, room in world.doors:
         if int(room) in visited or 0 in visited:
@@ -116,7 +116,7 @@ def scan_world(world: World, visited: list[int], rng: np.random.Generator) -> tu
 
 
 def scan_room(world: World, room: int, rng: np.random.Generator) -> Array:
-    """(n, 3) points on floor, ceiling, walls and things of a room; none where a door is, or under a thing."""
+    """Return (n, 3) points on floor, ceiling, walls and things of a room; none where a door is, or under a thing."""
     x0, y0, x1, y1 = world.rooms[room]
     wide, deep = (x1 - x0, 0, 0), (0, y1 - y0, 0)
     up = (0, 0, HEIGHT)
@@ -139,7 +139,7 @@ def scan_room(world: World, room: int, rng: np.random.Generator) -> Array:
 
 
 def sample_plane(corner: Sequence3, first: Sequence3, second: Sequence3, rng: np.random.Generator) -> Array:
-    """(n, 3) points of a parallelogram, `DENSITY` a square metre."""
+    """Return (n, 3) points of a parallelogram, `DENSITY` a square metre."""
     u, v = np.array(first, float), np.array(second, float)
     count = rng.poisson(float(np.linalg.norm(u) * np.linalg.norm(v)) * DENSITY)
     return np.array(corner) + rng.random((count, 1)) * u + rng.random((count, 1)) * v

@@ -253,7 +253,7 @@ def _add_masonry(building: Building, parts: Sequence[Masonry], room: int) -> Bui
 
 
 def _remove_things(building: Building, outline: shapely.Polygon) -> Building:
-    """The building without the movable things that stand in a place."""
+    """Return the building without the movable things that stand in a place."""
     away = np.array([t["movable"] and outline.buffer(0.05).intersects(_outline_thing(t)) for t in building.things], bool)
     return _keep_things(building, ~away)
 

@@ -1,4 +1,4 @@
-"""What is true of a simulated floor and its rooms."""
+"""The truth about a simulated floor and its rooms."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ OUTSIDE_ROOMS, NOT_JUDGED = -1, -2  # true labels: of no true room but judged; n
 
 @dataclass(frozen=True, eq=False)
 class FloorTruth:
-    """What is true about a scan, in the frame of its building.
+    """The truth about a scan, in the frame of its building.
 
     Args:
         raster: (L, rows, columns) int32 true room of each judged column, `OUTSIDE_ROOMS` or `NOT_JUDGED`.
@@ -245,7 +245,7 @@ def _spread_labels(labels: Array, reach: float) -> Array:
 
 
 def _find_most_common(truth: FloorTruth, places: Array, room: Array) -> Array:
-    """(rows, columns) int32 the commonest room of each column, -1 none."""
+    """Return (rows, columns) int32 the commonest room of each column, -1 none."""
     out = np.full(truth.raster.shape[1:], -1, np.int32)
     ij, inside = truth.compute_columns(places)
     if inside.any():

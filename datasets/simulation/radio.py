@@ -166,7 +166,7 @@ def simulate_readings(
 
 
 def _compute_shadows(track: Array, points: AccessPoints, level: int) -> Array:
-    """(n, m) standard normal shadows, alike over `SHADOW_REACH` and the same at every visit: sums of waves."""
+    """Return (n, m) standard normal shadows, alike over `SHADOW_REACH` and the same at every visit: sums of waves."""
     out = np.zeros((len(track), len(points.level)))
     waves = 24
     for j in range(len(points.level)):

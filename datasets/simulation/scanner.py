@@ -19,7 +19,8 @@ from topomerge.types import Array, PointCloud, Sim3, TrueRoom
 
 
 def simulate_sensor_poses(walk: Walk, sensor: Sensor, visited: Sequence[int], rng: np.random.Generator) -> tuple[Array, Array]:
-    """(K, 4, 4) true poses of the sensor, in the order of the walk, and metres walked to each; only in the rooms asked for."""
+    """Return (K, 4, 4) true poses of the sensor, in the order of the walk, and metres walked to each; only in the rooms asked
+    for."""
     along = walk.along
     at = list(walk.stops) * sensor.turns
     turn = [k * 2 * np.pi * sensor.look / sensor.turns for k in range(sensor.turns) for _ in walk.stops]
@@ -94,7 +95,7 @@ RAYS_AT_A_TIME = 2_000_000  # rays at a time
 
 @dataclass(frozen=True, eq=False)
 class RayHits:
-    """What rays met, row by row.
+    """Hits of rays, row by row.
 
     Args:
         pose: (n,) int64 from where.
@@ -335,7 +336,8 @@ def _corrupt_hits(building: Building, poses: Array, hits: RayHits, sensor: Senso
 
 
 def _find_hit_rooms(building: Building, poses: Array, hits: RayHits) -> Array:
-    """(n,) int32 true room of each point: the room on the sensor's side of the surface; -1: outdoors, or seen in a pane."""
+    """Return (n,) int32 true room of each point: the room on the sensor's side of the surface; -1: outdoors, or seen in a
+    pane."""
     floors = rasterize_floors(building, LABEL_CELL)
     near = [ndimage.distance_transform_edt(r < 0, return_distances=True, return_indices=True) for r in floors.room]
     filled = np.stack([np.where(d * LABEL_CELL < 0.3, r[i[0], i[1]], -1) for r, (d, i) in zip(floors.room, near, strict=True)])

@@ -17,7 +17,7 @@ from tests.fusion.atlas.test_watch import room
 from tests.scenes_map import building
 from tests.viz.chromium import Page
 from topomerge.fusion.atlas.store import add
-from topomerge.viz.plan import Frame, StoreyPlan, compute_frame, rasterize_storeys
+from topomerge.viz.plan import Frame, StoreyView, compute_frame, rasterize_storeys
 from topomerge.viz.svg import build_sheet, fill_rooms, lay_out
 
 
@@ -27,7 +27,7 @@ def test_walls_run_along_the_paper(degrees: float) -> None:
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     x, y = np.abs(c * i + s * j), np.abs(-s * i + c * j)
     walls = ((x < 80) & (y < 50)) & ~((x < 77) & (y < 47))
-    plan = StoreyPlan(np.where((x < 77) & (y < 47), 0, -1).astype(np.int32), (x < 80) & (y < 50), walls)
+    plan = StoreyView(np.where((x < 77) & (y < 47), 0, -1).astype(np.int32), (x < 80) & (y < 50), walls)
     sheet = build_sheet([plan], Frame(np.zeros(2), 0.1, (240, 240), np.zeros(2, np.int64), 1))
     assert (np.degrees(sheet.turn) + degrees + 45) % 90 - 45 == pytest.approx(0.0, abs=1.0)
 

@@ -1,1 +1,1 @@
-"""What has changed between two maps of one place, and between a building model and a scan of it."""
+"""Changes between two maps of one place, and between a building model and a scan of it."""

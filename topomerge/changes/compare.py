@@ -154,7 +154,7 @@ def _find_sides(layers: StoreyLayers, parts: Array, ends: Array) -> set[int]:
 
 
 def _trace_box(layers: StoreyLayers, mask: Array) -> Array:
-    """(4, 2) m of the rectangle around a mask, in the axes of the raster."""
+    """Return (4, 2) m of the rectangle around a mask, in the axes of the raster."""
     pixels = np.argwhere(mask)
     low, high = pixels.min(axis=0) - 0.5, pixels.max(axis=0) + 0.5
     return layers.compute_points(np.array([low, [high[0], low[1]], high, [low[0], high[1]]]))[:, :2]
@@ -240,7 +240,7 @@ class Change:
 
 @dataclass(frozen=True, eq=False)
 class Changes:
-    """What has changed from an old map to a new one.
+    """Changes from an old map to a new one.
 
     Args:
         changes: by storey, kind and falling probability.
@@ -337,7 +337,7 @@ def _find_storey_changes(layers: StoreyLayers, reader: DoorReader) -> Iterator[C
 
 
 def _find_corrections(layers: StoreyLayers, reader: DoorReader) -> Iterator[Change]:
-    """What was corrected in one of two maps of one scan: the walls and the furniture are the same."""
+    """Find doors and rooms that were corrected in one of two maps of one scan: the walls and the furniture are the same."""
     yield from (_build_door_change(layers, door) for door in find_door_corrections(layers, reader))
     yield from (_build_room_change(layers, room) for room in find_room_corrections(layers))
 

@@ -253,7 +253,7 @@ def _estimate_leaf(door: Array, own: Array | None, points: Array, floor: float) 
 
 
 def _find_faces(off: Array) -> list[float]:
-    """The two faces of a wall, m across it, of points that lie on it and beside it; one where only one was seen."""
+    """Return the two faces of a wall, m across it, of points that lie on it and beside it; one where only one was seen."""
     count = np.bincount(np.floor((off + FACE_SPAN) / FACE_BIN).astype(int), minlength=round(2 * FACE_SPAN / FACE_BIN))
     smooth = np.convolve(count, np.ones(3), "same")
     at = (np.arange(len(smooth)) + 0.5) * FACE_BIN - FACE_SPAN

@@ -143,7 +143,7 @@ def _merge_faces(lines: Sequence[Line]) -> list[tuple[float, float, Line]]:
 
 
 def _count_bins(mask: Array, line: Line, low: float, high: float) -> Array:
-    """(n,) bool: does a stretch of `SUPPORT_BIN` of a line, of which a mask knows, hold anything?"""
+    """Return (n,) bool: does a stretch of `SUPPORT_BIN` of a line, of which a mask knows, hold anything?"""
     steps = max(round(line.length / SUPPORT_BIN), 1)
     t = line.start + (np.arange(steps) + 0.5) * SUPPORT_BIN
     across = np.arange(low - 0.1, high + 0.11, CHANGE_CELL)
@@ -172,7 +172,7 @@ def _split_runs(changed: Array, line: Line, low: float, high: float) -> list[tup
 def _measure_wall(
     layers: StoreyLayers, kind: str, one: MapLayer, other: MapLayer, changed: Array, stretch: tuple[float, float, Line]
 ) -> WallChange:
-    """A wall with its probability: how long it is, how much of it was seen, how empty its ground was, how high it goes."""
+    """Return a wall with its probability: how long it is, how much of it was seen, how empty its ground was, how high it goes."""
     part = replace(stretch[2], start=stretch[0], end=stretch[1])
     own = _find_pixels(changed, part)
     off = ((own + 0.5) * CHANGE_CELL - part.middle) @ part.across
@@ -224,7 +224,7 @@ def _lengthen(one: MapLayer, other: MapLayer, line: Line, low: float, high: floa
 
 
 def _find_pixels(mask: Array, line: Line) -> Array:
-    """(n, 2) pixels of a mask that are at most `ONE_WALL` / 2 beside a line."""
+    """Return (n, 2) pixels of a mask that are at most `ONE_WALL` / 2 beside a line."""
     reach = ONE_WALL / 2
     low = np.floor((line.ends.min(axis=0) - reach) / CHANGE_CELL).astype(int).clip(0)
     high = np.ceil((line.ends.max(axis=0) + reach) / CHANGE_CELL).astype(int).clip(0)
@@ -277,7 +277,7 @@ def find_furniture_changes(
 
 
 def _draw_outlines(layers: StoreyLayers, outlines: Sequence[Array]) -> Array:
-    """(nx, ny) bool: pixels in polygons (n, 2) m, or beside them."""
+    """Return (nx, ny) bool: pixels in polygons (n, 2) m, or beside them."""
     taken = np.zeros(layers.slack.shape, bool)
     for outline in outlines:
         taken |= layers.rasterise(shapely.Polygon(outline).buffer(0.2, join_style="mitre"))

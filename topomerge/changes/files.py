@@ -169,12 +169,12 @@ def save_bcf(changes: Changes, path: str | Path) -> None:
         _fix_dates(temporary)
 
 
-def _make_guid(*words: str) -> str:
-    return str(uuid.uuid5(uuid.NAMESPACE_URL, ":".join(("topomerge", *words))))
+def _make_guid(*parts: str) -> str:
+    return str(uuid.uuid5(uuid.NAMESPACE_URL, ":".join(("topomerge", *parts))))
 
 
 def _build_camera(model: Any, change: Change) -> Any:
-    """A camera that stands back from a change, across its longer side, and looks down at it."""
+    """Return a camera that stands back from a change, across its longer side, and looks down at it."""
     span = np.ptp(change.shape, axis=0) if len(change.shape) > 2 else change.shape[1] - change.shape[0]
     along = np.array([1.0, 0.0]) if len(change.shape) > 2 and span[0] >= span[1] else np.array([0.0, 1.0])
     if len(change.shape) == 2 and np.hypot(*span) > 0:

@@ -34,7 +34,7 @@ FAR = 10.0  # m, of distances where nothing stands
 
 
 class PlacedMap(Protocol):
-    """What takes points (n, 3) of the new map into the frame of the old one, and back; `types.Placement` is one."""
+    """A transform of points (n, 3) of the new map into the frame of the old one, and back; `types.Placement` is one."""
 
     @property
     def pose(self) -> Sim3:
@@ -70,7 +70,7 @@ class RelativePlacement:
 
 @dataclass(frozen=True, eq=False)
 class MapLayer:
-    """What one map shows of a storey, (nx, ny) each.
+    """Rasters (nx, ny) of a storey as one map shows it.
 
     Args:
         wall, standing, tall: bool; a wall by the rule of plans, anything at the height of a body, and what reaches `HIGH_BAND`.
@@ -167,7 +167,7 @@ class StoreyLayers:
 
 
 def measure_distance(mask: Array) -> Array:
-    """(nx, ny) float32 m to the nearest pixel of a mask."""
+    """Return (nx, ny) float32 m to the nearest pixel of a mask."""
     if not mask.any():
         return np.full(mask.shape, FAR, np.float32)
     return (ndimage.distance_transform_edt(~mask) * CHANGE_CELL).astype(np.float32)
@@ -255,7 +255,7 @@ def _draw_map(
 
 
 def _draw_rooms(map: TopometricMap, plan: StoreyPlan) -> Array:
-    """(nx, ny) room of each column of a plan by the map's navigable cells, -1 none; small gaps are filled."""
+    """Return (nx, ny) room of each column of a plan by the map's navigable cells, -1 none; small gaps are filled."""
     room = np.full(plan.wall.shape, -1, np.int32)
     at = map.navigable.compute_centroids()
     near = (np.abs(at[:, 2] - plan.floor_guess) < 1.2) & (map.navigable_room >= 0)
@@ -289,7 +289,7 @@ def estimate_slack(old: MapLayer, new: MapLayer, scale: float = 1.0) -> Array:
 
 
 def _runs_along(wall: Array, axis: int) -> Array:
-    """(nx, ny) bool: does the wall of a pixel run along an axis rather than across it?"""
+    """Return (nx, ny) bool: does the wall of a pixel run along an axis rather than across it?"""
     long = round(WALL_RUN / CHANGE_CELL)
     along, across = (ndimage.uniform_filter1d(wall.astype(np.float32), long, axis=k) for k in (axis, 1 - axis))
     return np.asarray(along > across)

@@ -176,7 +176,7 @@ class PlaneShift:
 
 
 def _measure_planes(element: ModelElement, points: Array, layers: Sequence[StoreyLayers], edge: float) -> list[PlaneShift]:
-    """The shift of an element along the normals of its larger faces: one of a wall or a slab, two of a column."""
+    """Return the shift of an element along the normals of its larger faces: one of a wall or a slab, two of a column."""
     corners = element.vertices[element.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normals, axis=1) / 2
@@ -201,7 +201,7 @@ def _measure_planes(element: ModelElement, points: Array, layers: Sequence[Store
 
 
 def _build_frame(normal: Array) -> Array:
-    """(3, 3) rows: two axes in a plane, and its normal."""
+    """Return (3, 3) rows: two axes in a plane, and its normal."""
     axis = np.array([0.0, 0.0, 1.0]) if abs(normal[2]) < 0.5 else np.array([1.0, 0.0, 0.0])
     first = np.cross(axis, normal) / np.linalg.norm(np.cross(axis, normal))
     return np.stack([first, np.cross(normal, first), normal])
@@ -229,8 +229,8 @@ def _list_faced(points: Array, normal: Array, layers: Sequence[StoreyLayers]) ->
 def _measure_shift(
     corners: Array, sides: Array, area: Array, normal: Array, points: Array, faced: tuple[Array, Array]
 ) -> PlaneShift:
-    """The shift along a normal at which most cells of faces (t, 3, 3) are found; `sides` says which way each face looks, and
-    `faced` which points are of faces that look either way."""
+    """Return the shift along a normal at which most cells of faces (t, 3, 3) are found; `sides` says which way each face looks,
+    and `faced` which points are of faces that look either way."""
     frame = _build_frame(normal)
     samples = _sample_triangles(corners, area) @ frame.T
     owner = np.repeat(np.sign(sides), _count_samples(area))
@@ -274,7 +274,7 @@ def _measure_shift(
 
 
 def _spread(shown: Array) -> Array:
-    """(n, bins) bool: is anything within `SUPPORT_REACH` of a bin?"""
+    """Return (n, bins) bool: is anything within `SUPPORT_REACH` of a bin?"""
     out = shown.copy()
     for step in range(1, round(SUPPORT_REACH / SHIFT_BIN) + 1):
         out[:, step:] |= shown[:, :-step]
@@ -287,7 +287,7 @@ def _count_samples(area: Array) -> Array:
 
 
 def _sample_triangles(corners: Array, area: Array) -> Array:
-    """(n, 3) m: points spread evenly over triangles, the same ones each time (R2 sequence, Roberts 2018)."""
+    """Return (n, 3) m: points spread evenly over triangles, the same ones each time (R2 sequence, Roberts 2018)."""
     count = _count_samples(area)
     of = np.repeat(np.arange(len(area)), count)
     k = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
@@ -300,7 +300,7 @@ def _sample_triangles(corners: Array, area: Array) -> Array:
 
 
 def _number_cells(places: Array, of: Array) -> Array:
-    """(n,) int64 number of the cell of a face that each place (n, 2) lies in."""
+    """Return (n,) int64 number of the cell of a face that each place (n, 2) lies in."""
     low = of.min(axis=0) if len(of) else np.zeros(2)
     cells = np.floor((places - low) / FACE_BIN).astype(np.int64)
     out: Array = cells[:, 0] * 10**6 + cells[:, 1]
@@ -349,7 +349,7 @@ def _decide_elsewhere(shift: float, sigma: float) -> tuple[str, float]:
 def _judge_element(
     element: ModelElement, planes: Sequence[PlaneShift], layers: Sequence[StoreyLayers], correct: Correction
 ) -> ElementRow:
-    """What the scan says of a wall, a column or a slab."""
+    """Judge by the scan whether a wall, a column or a slab is where the model has it."""
     seen = [p for p in planes if np.isfinite(p.shift) and p.share >= LEAST_SEEN and p.cells >= LEAST_CELLS]
     normal = planes[0].normal if planes else np.array([1.0, 0.0, 0.0])
     if seen:
@@ -418,7 +418,7 @@ class _ModelDoors:
         return partner
 
     def judge(self, element: ModelElement) -> ElementRow:
-        """What the scan says of a door: a way through or a leaf is there, farther along its wall, or not at all."""
+        """Judge by the scan whether a door (a way through, or a leaf) is in place, farther along its wall, or missing."""
         door = self.doors[element.guid]
         normal = np.array([np.cos(door["direction"]), np.sin(door["direction"]), 0.0])
         k, shift = self.partner.get(element.guid, (-1, np.nan))
@@ -441,7 +441,7 @@ class _ModelDoors:
 
 
 def _build_door(element: ModelElement) -> Array:
-    """A door of a model as a row of EDGE_DTYPE."""
+    """Return a door of a model as a row of EDGE_DTYPE."""
     corners = np.asarray(_outline_element(element).exterior.coords)[:4] if element.faces.size else np.zeros((4, 2))
     sides = np.diff(corners[:3], axis=0)
     lengths = np.linalg.norm(sides, axis=1)
@@ -453,7 +453,7 @@ def _build_door(element: ModelElement) -> Array:
 
 
 def _build_change(row: ElementRow, layers: Sequence[StoreyLayers]) -> Change:
-    """The row of an element that is elsewhere or missing as a change."""
+    """Return the row of an element that is elsewhere or missing as a change."""
     outline = _outline_element(row.element)
     ring = outline.exterior.coords if outline.geom_type == "Polygon" else outline.buffer(0.02).exterior.coords
     shape = np.asarray(ring)[:-1]

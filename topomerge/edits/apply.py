@@ -191,7 +191,7 @@ def _add_door(
 
 
 def _find_sides(draft: Draft, at: Array, between: Array | None = None) -> tuple[tuple[int, int], float, float]:
-    """The two rooms of a door, the smaller number first, the direction between them, rad, and the height of its floor.
+    """Return the two rooms of a door, the smaller number first, the direction between them, rad, and the height of its floor.
 
     Args:
         between: (2, 3) m, places in these rooms where they are told.
@@ -228,7 +228,7 @@ def _find_sides(draft: Draft, at: Array, between: Array | None = None) -> tuple[
 
 
 def _find_rooms_along(draft: Draft, line: Array, among: list[int] | None) -> tuple[int, int]:
-    """The first room that a line (n, 3) m comes to, of some rooms or of all, and after how many steps; -1 none."""
+    """Return the first room that a line (n, 3) m comes to, of some rooms or of all, and after how many steps; -1 none."""
     cells = draft.navigable.locate(line)
     room = np.full(len(line), -1, np.int64)
     for up in (0, 1, -1, 2, -2):

@@ -247,13 +247,13 @@ class Draft:
         self.narrows = self.narrows[owners[:, 0] == owners[:, 1]]
 
     def _measure_area(self, room: int, rows: Array) -> tuple[Any, ...]:
-        """A row of AREA_DTYPE."""
+        """Return a row of AREA_DTYPE."""
         lowest = self.select_floor(rows)
         middle = self.navigable.compute_centroids(self.navigable.cells[lowest]).mean(axis=0)
         return room, middle, len(lowest) * self.navigable.edge**2
 
     def _find_area(self, place: Array, among: list[int]) -> int:
-        """The one of some areas whose floor is nearest to a place; -1 where none has any."""
+        """Return the one of some areas whose floor is nearest to a place; -1 where none has any."""
         rows = np.flatnonzero(np.isin(self.floor_area, among))
         if not len(rows):
             return -1
@@ -411,7 +411,7 @@ def _keep_connected(side: Array, part: Array, one: Array, other: Array) -> Array
 
 
 def _find_nearest(columns: Array, known: Array, shape: tuple[int, ...], number: Array) -> Array:
-    """(n,) which column is the nearest known one of each."""
+    """Return (n,) which column is the nearest known one of each."""
     unknown = np.ones(shape, bool)
     unknown[tuple(columns[known].T)] = False
     _, nearest = ndimage.distance_transform_edt(unknown, return_indices=True)

@@ -254,7 +254,7 @@ def read_journal(path: str | Path) -> Journal:
 
 
 def _parse_journal(path: Path, data: bytes) -> tuple[Journal, int]:
-    """A journal, and how many of its bytes are whole lines."""
+    """Return a journal, and how many of its bytes are whole lines."""
     whole = data.rfind(b"\n") + 1
     lines, rest = data[:whole].splitlines(), data[whole:]
     if len(lines) > MOST_EDITS:

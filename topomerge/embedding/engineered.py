@@ -135,7 +135,7 @@ def measure_roughness(points: Array) -> float:
 
 
 def _compute_graph_features(map: TopometricMap) -> Array:
-    """(R, 6) float64 in the order of `GRAPH_FEATURES`."""
+    """Return (R, 6) float64 in the order of `GRAPH_FEATURES`."""
     rooms, edges, count = map.rooms, map.open_edges, len(map.rooms)
     ends = edges["rooms"].reshape(-1, 2)
     pairs = np.unique(np.concatenate([ends, ends[:, ::-1]]), axis=0)
@@ -204,7 +204,7 @@ SPECTRUM_SPACING = 0.251  # m: cells lie 0.1 m apart, and with 0.25 m every fift
 
 
 def compute_point_features(points: Array) -> Array:
-    """(R, 12) float32 `THESIS_FEATURES` of points (R, P, 3), m. The first one counts different points: it stops at 256."""
+    """Return (R, 12) float32 `THESIS_FEATURES` of points (R, P, 3), m. The first one counts different points: it stops at 256."""
     out = np.zeros((len(points), len(THESIS_FEATURES)), np.float32)
     for room, sample in enumerate(_sample_points(points)):
         out[room] = compute_thesis_features(_find_cells(sample), FEATURE_CELL)
@@ -212,7 +212,7 @@ def compute_point_features(points: Array) -> Array:
 
 
 def compute_point_spectra(points: Array) -> Array:
-    """(R, 32) float32 smallest eigenvalues above 0, 1/m2, of the surface that points (R, P, 3), m, lie on; ascending."""
+    """Return (R, 32) float32 smallest eigenvalues above 0, 1/m2, of the surface that points (R, P, 3), m, lie on; ascending."""
     out = np.zeros((len(points), len(SPECTRUM_FEATURES)), np.float32)
     for room, sample in enumerate(_sample_points(points)):
         different = np.unique(np.round(sample.astype(np.float64), 3), axis=0)
@@ -235,7 +235,7 @@ def _sample_points(points: Array) -> Array:
 
 
 def _find_cells(points: Array) -> Array:
-    """(n, 3) int64 different cells, of which the lowest corner is 0."""
+    """Return (n, 3) int64 different cells, of which the lowest corner is 0."""
     away = points.astype(np.float64) - points.min(axis=0)
     return np.unique(np.floor(away / FEATURE_CELL + 0.5).astype(np.int64), axis=0)
 
@@ -269,7 +269,7 @@ def build_feather(features: Descriptor | None = None, steps: int = 2, points: in
 
 
 def compute_walk_matrix(map: TopometricMap) -> Array:
-    """(R, R) probability of each step of a lazy walk: to stay, or through one of the room's doors, alike often."""
+    """Return (R, R) probability of each step of a lazy walk: to stay, or through one of the room's doors, alike often."""
     count = len(map.rooms)
     ends = map.edges["rooms"].reshape(-1, 2)
     adjacent = np.eye(count)

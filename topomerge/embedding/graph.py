@@ -294,7 +294,7 @@ def _compute_edge_features(middle: Array, index: Array, doors: Array, floors: Ar
 
 
 def _find_door_pairs(source: Array) -> Array:
-    """(2, K) every two edges that leave the same room, in both orders."""
+    """Return (2, K) every two edges that leave the same room, in both orders."""
     if not len(source):
         return np.zeros((2, 0), np.int64)
     groups = _group_rows(source, int(source.max()) + 1)

@@ -55,7 +55,7 @@ STATE_FILE, STATE_SETTINGS = "embedder.safetensors", "embedder.json"  # of a tra
 
 @dataclass(frozen=True, eq=False)
 class EmbedderCard:
-    """What is known of an embedder.
+    """The card of an embedder.
 
     Args:
         path: of its network.
@@ -123,13 +123,13 @@ def read_embedder_card(path: str | Path | None = None) -> EmbedderCard:
 
 
 def describe_embedder(network: Network, about: Mapping[str, Any] | None) -> dict[str, Any]:
-    """What both kinds of files say of a network: of its architecture, of the features that it reads, and of its training."""
+    """Describe a network, as both kinds of files do: its architecture, the features that it reads, and its training."""
     features = {name: list(TABLES[name]) for name in list_tensors(network) if name in TABLES}
     return {"class": EMBEDDER_CLASS, "network": asdict(network), "features": features, "about": dict(about or {})}
 
 
 def build_card(network: Network, temperature: float, about: Mapping[str, Any] | None) -> dict[str, Any]:
-    """What the card of an embedder says, but for its file."""
+    """Build the card of an embedder, but for its file."""
     known = {"format": EMBEDDER_FORMAT, "temperature": temperature, **describe_embedder(network, about)}
     return build_embedder_signature(network).describe() | known
 
@@ -235,7 +235,8 @@ class LearnedEmbedder:
         return rows
 
     def compute_matchability(self, map: TopometricMap) -> Array:
-        """(R,) float64: how alike a room of another map must at least be, as a cosine, before it is rather this one than none."""
+        """Return (R,) float64: how alike a room of another map must at least be, as a cosine, before it is rather this one than
+        none."""
         return self.temperature * self.embed_graph(self.build_views(map)[0])[1]
 
     def compute_probabilities(self, a: TopometricMap, b: TopometricMap) -> tuple[Array, Array]:
@@ -270,6 +271,7 @@ class LearnedEmbedder:
         if "edge_way" in names:
             inputs["edge_way"] = compute_edge_positions(inputs)
         read = {name: inputs[name] for name in names}
+        # One call a turn: a graph with all four has four times as many nodes to export and to load (docs/adr/0025).
         computed = [self.run(**(rotate_graph(read, k) if k else read)) for k in range(turns)]
         rows, bins = ([array.astype(np.float64) for array in arrays] for arrays in zip(*computed, strict=True))
         if turns == 1:

@@ -1,4 +1,5 @@
-"""What a network is made of: plain dataclasses, stored as JSON beside its weights; and what of a map's graph it reads."""
+"""Settings of an embedding network: plain dataclasses, stored as JSON beside its weights; and the inputs that it reads of a map's
+graph."""
 
 from __future__ import annotations
 
@@ -47,11 +48,11 @@ class Node:
         layers: 1 to 4.
         heads: of the attention.
         edges: use the features of edges.
-        edge_values: attention sums values of neighbours and of edges (`models.edge_value_conv`); False: as in the paper, edges
-            change the weights of the neighbours only (`torch_geometric.nn.GATv2Conv`).
+        edge_values: attention sums values of neighbours and of edges (`models.nodes.EdgeValueConv`); False: as in the paper,
+            edges change the weights of the neighbours only (`torch_geometric.nn.GATv2Conv`).
         doors: layers over pairs of doors; needs `edges`.
-        near: pairs are all doors within 12 m (`embedding.door_layout`), not only those of one room.
-        around: m; rooms at most that far away are neighbours, too (`embedding.rooms_around`); 0: by doors only.
+        near: pairs are all doors within 12 m (`embedding.engineered.compute_door_layout`), not only those of one room.
+        around: m; rooms at most that far away are neighbours, too (`embedding.graph.add_proximity_edges`); 0: by doors only.
         ways: edges tell in which direction of the building their neighbour and its door are; needs `edges`.
         skip: add what goes into a layer to what comes out.
         jump: what the last layer says, or all of them joined or their maximum (jumping knowledge: Xu et al. 2018).

@@ -17,6 +17,8 @@ from topomerge.embedding.graph import count_columns
 from topomerge.embedding.surroundings import CROP_SHAPES, rotate_crops
 from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, Array, TopometricMap
 
+# Rows for each turn: a mean over turns could not tell a corridor with rooms to its left from one with rooms to its right
+# (docs/adr/0016).
 QUARTERS = 4
 FACTS = count_columns("x") + 2
 LIKENESS, EVEN = 20.0, 0.65  # log odds that rooms are one grow so fast with the cosine of their rows, and are even at this one
@@ -30,7 +32,7 @@ SAME_YAW = np.radians(10.0)  # turns that differ by less are one
 
 @dataclass(frozen=True, eq=False)
 class TurnedRows:
-    """What rooms look like in a map that is turned by 0 to 3 quarter turns, counter-clockwise seen from above.
+    """Descriptors of rooms in a map that is turned by 0 to 3 quarter turns, counter-clockwise seen from above.
 
     Args:
         rows: (R, 4, D) of length 1 each.
@@ -67,7 +69,8 @@ Rows = Array | TurnedRows
 
 
 def compute_room_features(x: Array, dustbin: Array, heights: Array) -> Array:
-    """(R, FACTS) the numbers of rooms (`schema`) as logarithms, the logits of having no partner (R,), and heights (R,) m."""
+    """Return (R, FACTS) the numbers of rooms (`schema`) as logarithms, the logits of having no partner (R,), and heights (R,)
+    m."""
     out: Array = np.column_stack([np.sign(x) * np.log1p(np.abs(x)), dustbin, heights]).astype(np.float64)
     return out
 
@@ -136,6 +139,7 @@ def estimate_turns(a: TurnedRows, b: TurnedRows) -> tuple[Turn, ...]:
         return tuple(replace(turn, probability=1 / len(turns)) for turn in turns)
     scored = [_score_turn(turn) for turn in turns]
     turns = [replace(turn, shift=shift) for turn, (_, shift) in zip(turns, scored, strict=True)]
+    # No turn is chosen: at the one with most votes a wrong choice lost every room of the pair (docs/adr/0016).
     shares = compute_shares(np.array([evidence for evidence, _ in scored]))
     return tuple(replace(turn, probability=float(share)) for turn, share in zip(turns, shares, strict=True))
 
@@ -164,7 +168,8 @@ def _score_turn(turn: Turn) -> tuple[float, complex]:
 
 
 def compute_similarity(a: Rows, b: Rows) -> Array:
-    """(R_a, R_b) cosines of rows of length 1; where these depend on turns, the mean over all turns of b (`estimate_turns`)."""
+    """Return (R_a, R_b) cosines of rows of length 1; where these depend on turns, the mean over all turns of b
+    (`estimate_turns`)."""
     if not isinstance(a, TurnedRows) or not isinstance(b, TurnedRows):
         plain: Array = np.asarray(a) @ np.asarray(b).T
         return plain

@@ -121,7 +121,8 @@ def build_shapedna(
 
 
 def compute_spectrum(cells: Array, edge: float, laplacian: str, values: int, spacing: float, largest: int) -> Array:
-    """(values,) smallest eigenvalues above 0 of one room's cells (n, 3); the last ones by Weyl's law if there are too few."""
+    """Return (values,) smallest eigenvalues above 0 of one room's cells (n, 3); the last ones by Weyl's law if there are too
+    few."""
     if laplacian == "graph":
         while len(cells) > largest:
             halved = cells // 2

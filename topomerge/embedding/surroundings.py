@@ -1,4 +1,4 @@
-"""What stands around a room: its storey seen from above, turned into the direction of the walls, and crops about each room.
+"""Surroundings of a room: its storey seen from above, turned into the direction of the walls, and crops about each room.
 
 All storeys of a map lie on one *sheet* of pixels (`embedding.sheets`) with an empty strip between them, so that no crop shows
 two. A crop has a room's middle in its own, reaches past the room's borders, and is empty where the map saw nothing. A wide crop

@@ -135,9 +135,9 @@ def make_small_set(signs: float, count: int, number: int, folder: Path) -> None:
     while len(truth) < count:
         place = len(set(places))
         kind, seed = ATLAS_KINDS[place % len(ATLAS_KINDS)], first_seed + 5_000 + 1_000 * number + place
-        wanted = min(int(rng.choice(OF_A_BUILDING)), max(count - len(truth), 2))
+        count_here = min(int(rng.choice(OF_A_BUILDING)), max(count - len(truth), 2))
         building = make_building(kind, seed)
-        atlas = make_atlas(building, rng.choice(SMALL_SENSORS, wanted).tolist(), rng, SMALL_ROOMS)
+        atlas = make_atlas(building, rng.choice(SMALL_SENSORS, count_here).tolist(), rng, SMALL_ROOMS)
         for cloud, frame, to_first, sensor in zip(atlas.maps, atlas.frames, atlas.truth, atlas.sensors, strict=True):
             name, read = f"map_{len(truth):04d}_{sensor}", rng.random() < signs
             landmarks = simulate_signs(building, cloud, READERS["good"], frame)[0] if read else Landmarks()
@@ -184,15 +184,15 @@ def load_set(folder: Path) -> AtlasSet:
     return AtlasSet(folder.name, tuple(sorted(folder.glob("map_*.tmap"))), truth, about)
 
 
-def errors(made: AtlasSet, result: AtlasResult) -> dict[int, tuple[float, float] | None]:
+def errors(atlas_set: AtlasSet, result: AtlasResult) -> dict[int, tuple[float, float] | None]:
     """Error of each map in its component's first map, m and rad; None for maps of two buildings in one component."""
     out: dict[int, tuple[float, float] | None] = {}
-    sensors: Any = made.about["sensors"]
-    places: Any = made.about.get("places", [0] * len(made.files))
+    sensors: Any = atlas_set.about["sensors"]
+    places: Any = atlas_set.about.get("places", [0] * len(atlas_set.files))
     for members in result.components:
         first = members[0]
         for k in members[1:]:
-            one, two = made.truth[first], made.truth[k]
+            one, two = atlas_set.truth[first], atlas_set.truth[k]
             if one is None or two is None or places[first] != places[k]:
                 out[k] = None
                 continue

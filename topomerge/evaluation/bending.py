@@ -38,7 +38,7 @@ ROOM_LIMITS = (0.1, 1.0)  # m, degrees
 
 
 class Bending(Protocol):
-    """What moves the points of a map (`fusion.bend.deformation.Deformation`)."""
+    """A transform that moves the points of a map (`types.placement.Deformation`)."""
 
     def apply(self, points: Array) -> Array: ...
 
@@ -92,7 +92,7 @@ def within(rooms: Sequence[dict[str, float]], limits: tuple[float, float] = ROOM
 
 
 def format_with_interval(statistic: Callable[[Array], float], groups: Sequence[str], digits: int) -> str:
-    """What a statistic of chosen rows is of all rows, with its 95 % interval by drawing whole groups (buildings) with
+    """Format a statistic of all rows with its 95 % interval by drawing whole groups (buildings) with
     replacement; without one where there are fewer than `FEWEST_GROUPS`.
 
     Args:

@@ -100,7 +100,7 @@ MARKS: dict[str, dict[str, tuple[tuple[float, float], ...]]] = {
 }  # fmt: skip
 
 
-def _words(difficulty: dict[str, float]) -> tuple[tuple[str, float], ...]:
+def _freeze(difficulty: dict[str, float]) -> tuple[tuple[str, float], ...]:
     return tuple(sorted(difficulty.items()))
 
 
@@ -128,7 +128,9 @@ def dev() -> list[Case]:
         ("office", 4, "depth", {}, "drift"),
         ("office", 5, "tls", {}, "noise"),
     )
-    out = [Case("dev", "procedural", k, sensor, seed, rooms=12, difficulty=_words(d), spoil=s) for k, seed, sensor, d, s in cases]
+    out = [
+        Case("dev", "procedural", k, sensor, seed, rooms=12, difficulty=_freeze(d), spoil=s) for k, seed, sensor, d, s in cases
+    ]
     out += [Case("dev", "procedural", "office", "lidar", 6, storeys=2, rooms=20)]
     out += [Case("dev", "procedural", "house", "tls", 7, storeys=2)]
     out += [Case("dev", "r2v", "00/02/09a30b61b563f93faf6a6466ffab/0001", "depth", 1)]
@@ -150,7 +152,7 @@ def hard() -> list[Case]:
     """Return the same five buildings made hard in one way after the other; and buildings of two to four storeys."""
     places = (("office", "tls"), ("school", "lidar"), ("hospital", "depth"), ("hotel", "tls"), ("lab", "depth"))
     out = [
-        Case(name, "procedural", kind, sensor, TEST + 100 + i, rooms=ROOM_NUMBERS, difficulty=_words(difficulty), spoil=spoil)
+        Case(name, "procedural", kind, sensor, TEST + 100 + i, rooms=ROOM_NUMBERS, difficulty=_freeze(difficulty), spoil=spoil)
         for name, (difficulty, spoil) in HARD.items()
         for i, (kind, sensor) in enumerate(places)
     ]
@@ -185,7 +187,7 @@ def grids() -> list[Case]:
     out += [Case("grids, furnished", "ipa", f"{name}_furnitures") for name in IPA]
     for k, (title, difficulty) in enumerate((("grids scanned, bare", BARE), ("grids scanned, furnished", {}))):
         sensors = ("tls", "lidar", "depth")
-        out += [Case(title, "ipa-plan", n, sensors[(i + k) % 3], TEST, difficulty=_words(difficulty)) for i, n in enumerate(IPA)]
+        out += [Case(title, "ipa-plan", n, sensors[(i + k) % 3], TEST, difficulty=_freeze(difficulty)) for i, n in enumerate(IPA)]
     return out + [Case("GDC's floors", "gdc", floor) for floor in "1234"]
 
 
@@ -203,7 +205,7 @@ def pairs() -> list[Case]:
     sets: tuple[tuple[str, dict[str, float], tuple[str, ...]], ...]
     sets = (("two sessions", {}, BUILDING_KINDS), ("two sessions, furniture moved", moved, BUILDING_KINDS[::2]))
     return [
-        Case(name, "procedural", kind, sensor, TEST + 300 + i, rooms=ROOM_NUMBERS, difficulty=_words(difficulty), day=day)
+        Case(name, "procedural", kind, sensor, TEST + 300 + i, rooms=ROOM_NUMBERS, difficulty=_freeze(difficulty), day=day)
         for name, difficulty, kinds in sets
         for i, kind in enumerate(kinds)
         for day, sensor in enumerate(sensors[i % 4], 1)
@@ -226,8 +228,8 @@ def list_marked() -> list[Case]:
 
 
 def peers() -> list[Case]:
-    """What the classic methods are compared on: every grid with true rooms, and scans from above of each sensor that sees more
-    than a slice."""
+    """List the cases that classic methods are compared on: every grid with true rooms, and scans from above of each sensor that
+    sees more than a slice."""
     scans = [*simulate_scan(), *(case for case in plans() if case.source == "campus")]
     return [*grids(), *(case for case in scans if case.sensor != "laser2d")]
 

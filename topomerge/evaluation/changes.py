@@ -1,4 +1,4 @@
-"""What has changed: sessions with known changes, sessions without any, and building models with planted deviations.
+"""Evaluation of detected changes: sessions with known changes, sessions without any, and building models with planted deviations.
 
 ``python evaluate.py task=changes`` scans buildings of the test seeds twice (``data=dev``: of training seeds, by which thresholds
 were chosen), extracts both maps, aligns them as `topomerge diff` does, and compares. A true change counts as found if a change of

@@ -26,7 +26,7 @@ NO_INPUTS = "none"
 
 @dataclass(frozen=True)
 class Stamp:
-    """What made a block.
+    """The command, code and data that made a block.
 
     Args:
         command: that writes it.

@@ -94,10 +94,10 @@ def score_doors(case: Case, scan: Scan, how: str) -> Row:
     row["right"] = [verdict.doors.right, verdict.doors.extracted]
     said_shut = ~edges["open"] & ~find_looked_into(map, edges)
     said_half = edges["half"] & ~find_looked_into(map, edges)
-    for name, said, true in (("said", said_shut, "shut"), ("said half", said_half, "half")):
+    for name, predicted, true in (("said", said_shut, "shut"), ("said half", said_half, "half")):
         really = np.zeros(len(edges), bool)
         really[pairs[:, 1]] = state[pairs[:, 0]] == true
-        row[name] = [int((said & really).sum()), int(said.sum())]
+        row[name] = [int((predicted & really).sum()), int(predicted.sum())]
     return row
 
 

@@ -180,8 +180,8 @@ def _sum_overlap(map: TopometricMap, truth: FloorTruth) -> float:
 
 
 def _count_overlap(map: TopometricMap, truth: FloorTruth) -> tuple[Array, Array, Array]:
-    """(T, R) m2 that each true and each found room share; (T,) m2 of each true room that is expected, else 0; (R,) m2 of each
-    found one."""
+    """Return (T, R) m2 that each true and each found room share; (T,) m2 of each true room that is expected, else 0; (R,) m2 of
+    each found one."""
     columns = predict_columns(map, truth)
     judged = (truth.raster >= 0) | ((truth.raster == OUTSIDE_ROOMS) & (columns >= 0))
     true, found = truth.raster[judged], columns[judged]
@@ -210,7 +210,8 @@ def _iter_splits(map: TopometricMap, truth: FloorTruth) -> Iterator[Edit]:
 
 
 def _propose_lines(truth: FloorTruth, room: Array, true: Array) -> list[Array]:
-    """(2, 3) m, lines that part the pieces of true rooms in a found one, those first that leave the fewest pieces in two."""
+    """Return (2, 3) m, lines that part the pieces of true rooms in a found one, those first that leave the fewest pieces in
+    two."""
     level, row, column = np.nonzero(room)
     k = int(np.bincount(level).argmax())
     row, column = row[level == k], column[level == k]

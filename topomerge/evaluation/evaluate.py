@@ -183,7 +183,7 @@ OF_MERGES = ("merging", "kinds", "decides", "sites", "independence", "reliabilit
 
 @dataclass(frozen=True)
 class Scores:
-    """What an evaluation found: rows of counts, a short report, and where everything lies."""
+    """The result of an evaluation: rows of counts, a short report, and where everything lies."""
 
     matches: list[Row]
     ranks: list[Row]
@@ -278,7 +278,8 @@ def claim(folder: Path, plain_settings: dict[str, Any]) -> None:
 
 
 def list_pairs(listed: Path, settings: Evaluation, log_line: LogFn) -> list[Path]:
-    """The pairs of `build_pairs`; once they are all made, a list of them is kept: reading all plans again takes its time."""
+    """Return the pairs of `build_pairs`; once they are all made, a list of them is kept: reading all plans again takes its
+    time."""
     if listed.exists():
         files = [Path(settings.cache) / name for name in json.loads(listed.read_text(encoding="utf-8"))]
         if all(file.exists() for file in files):

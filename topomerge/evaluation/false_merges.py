@@ -63,7 +63,7 @@ def get_physical_building(row: Row) -> str:
 
 
 def classify_negative(row: Row) -> str:
-    """What makes a pair one that must not merge: a key of `PRIOR`; empty where its maps share a room.
+    """Classify why a pair must not merge: a key of `PRIOR`; empty where its maps share a room.
 
     Look-alikes are all in, as those that share rooms must not merge a period away.
     """
@@ -122,7 +122,7 @@ def format_tally(name: str, rows: Sequence[Row]) -> list[object]:
 
 
 def iter_difficulties(row: Row) -> Iterator[str]:
-    """What is difficult beside the kind."""
+    """Yield the difficulties of a pair beside its kind."""
     yield from row.get("hard", ())
     for sensor, name in (("laser2d", "a 2D slice"), ("drawing", "a floor plan")):
         if sensor in row["sensors"]:

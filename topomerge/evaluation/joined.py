@@ -1,7 +1,7 @@
 """Joined maps, measured: rooms and doors of the joined map against those of the better of the two, and walls that it has twice.
 
 ``python evaluate.py task=joined data=test data.limit=30 write=docs/results/bending.md``: simulated pairs with the usual drift
-(`datasets.pairs.bent_pairs`, without drawings), from the true pose refined as registration does, rigid and bent. Set
+(`datasets.pairs.drifted_pairs`, without drawings), from the true pose refined as registration does, rigid and bent. Set
 ``validation`` to choose by, ``test`` for the table.
 """
 

@@ -209,12 +209,12 @@ def measure_wifi(item: LookalikeItem) -> Row:
     frames = draw_frames(2, item.scaled, np.random.default_rng([item.seed, item.number, LOOKALIKES.index(item.kind)]))
     grid, worlds = VoxelGrid.from_cells(np.zeros((1, 3), np.int64), np.zeros(3), 0.3), []
     for draw in range(WORLDS):
-        heard = simulate_lookalike_radio(item, places, draw=draw)
-        scorer = LandmarkScorer(*(build_bare_map(grid, None, of) for of in heard.readings))
-        said = [scorer.score(frames[0] @ pose @ frames[1].inverse()) for pose in ([Sim3()] if item.again else places.poses)]
-        left = [max(update_posterior(spread_belief(p), THRESHOLD, one)["here"] for one in said) for p in (BELIEVED, DOUBTED)]
-        readings = [len(np.unique(of.table["group"])) for of in heard.readings]
-        worlds.append({"relation": heard.relation, "scans": readings, "left": left})
+        radio = simulate_lookalike_radio(item, places, draw=draw)
+        scorer = LandmarkScorer(*(build_bare_map(grid, None, of) for of in radio.readings))
+        evidence = [scorer.score(frames[0] @ pose @ frames[1].inverse()) for pose in ([Sim3()] if item.again else places.poses)]
+        left = [max(update_posterior(spread_belief(p), THRESHOLD, one)["here"] for one in evidence) for p in (BELIEVED, DOUBTED)]
+        readings = [len(np.unique(of.table["group"])) for of in radio.readings]
+        worlds.append({"relation": radio.relation, "scans": readings, "left": left})
     return {"kind": item.kind, "again": item.again, "building": item.seed, "worlds": worlds}
 
 
@@ -237,11 +237,11 @@ def tabulate_wifi(rows: Sequence[Row]) -> str:
         if not some:
             continue
         buildings = np.array([w["building"] for w in some])
-        believed = np.array([[p >= THRESHOLD for p in w["left"]] for w in some], float)
-        share, low, high = bootstrap_mean(believed[:, 0], buildings)
-        heard = float(np.median([min(w["scans"]) for w in some]))
-        counts = [f"{100 * share:.1f} %", f"{100 * low:.1f} to {100 * high:.1f} %", f"{100 * believed[:, 1].mean():.1f} %"]
-        lines.append([name, len(np.unique(buildings)), len(some), f"{heard:.0f}", *counts])
+        accepted = np.array([[p >= THRESHOLD for p in w["left"]] for w in some], float)
+        share, low, high = bootstrap_mean(accepted[:, 0], buildings)
+        scans = float(np.median([min(w["scans"]) for w in some]))
+        counts = [f"{100 * share:.1f} %", f"{100 * low:.1f} to {100 * high:.1f} %", f"{100 * accepted[:, 1].mean():.1f} %"]
+        lines.append([name, len(np.unique(buildings)), len(some), f"{scans:.0f}", *counts])
     heads = ["places", "buildings", "pairs", "scans of the smaller map, median", "walls .95: still believed", "95 %"]
     return write_table([*heads, "walls .40: believed"], lines)
 
@@ -338,7 +338,7 @@ def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
 
 
 def _format_line(name: str, rows: Sequence[Row]) -> list[object]:
-    """A line under `HEADS`."""
+    """Return a line under `HEADS`."""
     apart, repeated = [r for r in rows if not r["again"]], [r for r in rows if r["again"]]
     wrong, with_landmarks = sum(map(is_false, apart)), [r for r in apart if min(r["landmarks"])]
     low, high = compute_exact_interval(wrong, len(apart)) if apart else (0.0, 1.0)

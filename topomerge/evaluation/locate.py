@@ -258,7 +258,7 @@ def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
     return {f"locate-{settings.data.set or 'validation'}": write_table(head, lines)}
 
 
-def tabulate_line(kind: str, stranger: bool, some: Sequence[tuple[int, Row]]) -> list[object]:
+def tabulate_line(kind: str, negative: bool, some: Sequence[tuple[int, Row]]) -> list[object]:
     """Tabulate some scans, each with the number of its building."""
     outcome = [classify_outcome(s) for _, s in some]
     counts = {name: outcome.count(name) for name in OUTCOMES}
@@ -270,11 +270,11 @@ def tabulate_line(kind: str, stranger: bool, some: Sequence[tuple[int, Row]]) ->
     of = sum(s["status"] == "ambiguous" and bool(s.get("told")) for _, s in some)
     good = (
         ["–", "–", "–"]
-        if stranger
+        if negative
         else [f"{share:.2f}", f"{low:.2f}–{high:.2f}", f"{sum(s['pose'] for s in text)} of {len(text)}"]
     )
     return [
-        kind, "no map" if stranger else "a map", len(some), *good, counts["wrong"], f"{worst[0]:.3f}–{worst[1]:.3f}",
-        "–" if stranger else f"{named} of {of}", counts["ambiguous"], counts["not here"], counts["unreadable"],
+        kind, "no map" if negative else "a map", len(some), *good, counts["wrong"], f"{worst[0]:.3f}–{worst[1]:.3f}",
+        "–" if negative else f"{named} of {of}", counts["ambiguous"], counts["not here"], counts["unreadable"],
         f"{np.median(seconds):.2f}", f"{max(seconds):.2f}",
     ]  # fmt: skip

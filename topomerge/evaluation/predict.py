@@ -40,7 +40,8 @@ def load_trained(run: str) -> Any:
 
 
 class Inputs:
-    """What networks read of the maps of a pair: made once, as several read the same; the seconds count for each that reads it."""
+    """Inputs of networks from the maps of a pair: made once, as several read the same; the seconds count for each that reads
+    it."""
 
     def __init__(self) -> None:
         self.views: dict[tuple[int, bool, bool], list[dict[str, Array]]] = {}

@@ -1,4 +1,4 @@
-"""What readings of radio tell: poses, storeys and verdicts, by real walks on storeys whose law was fitted on the others.
+"""Evaluation of radio readings: poses, storeys and verdicts, by real walks on storeys whose law was fitted on the others.
 
 ``python evaluate.py task=radio`` parts the walks on each storey of `wifi_malls` in two sets, in frames of their own, and asks for
 the pose from radio alone: of all walks, and of few. It asks which of five storeys readings are from, and how right poses and
@@ -228,8 +228,8 @@ def tabulate_left_out(rows: Sequence[Row]) -> str:
             cells += [f"{trials[:, 1].mean():.2f}", f"{(trials[:, 0] <= FAR).mean():.2f}", f"{z:.2f}"]
         lines.append([name, *cells])
     head = ["storey left out", "verdicts", "log loss", "other place: told", "was"]
-    for words in ("half of all walks", f"{WALKS[1]} walks"):
-        head += [f"{words}: pose told right", f"within {FAR:g} m", "error over sigma"]
+    for selection in ("half of all walks", f"{WALKS[1]} walks"):
+        head += [f"{selection}: pose told right", f"within {FAR:g} m", "error over sigma"]
     return write_table(head, lines)
 
 

@@ -130,7 +130,7 @@ def measure_named_partners(pairs: Sequence[tuple[Rows, Rows]]) -> float:
 
 
 def format_partners(pairs: Sequence[EvaluationPair], rows: Sequence[tuple[Rows, Rows]]) -> str:
-    """What atlases would register of the pairs with a room in common."""
+    """Report how many of the pairs with a room in common atlases would register."""
     common = [of for pair, of in zip(pairs, rows, strict=True) if len(pair.matches)]
     rng = np.random.default_rng(0)
     draws = [rng.permutation(len(common))[:PARTNER_PAIRS] for _ in range(PARTNER_DRAWS)]

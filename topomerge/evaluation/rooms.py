@@ -91,7 +91,7 @@ def list_cases(settings: Settings) -> list[Case]:
 
 
 def _list_edited_cases(settings: Settings) -> list[Case]:
-    """The corrected maps of a folder."""
+    """Return the corrected maps of a folder."""
     files = sorted(Path(settings.path).glob(f"*{TRUTH_SUFFIX}"))
     if settings.data.set or not files:
         reason = "is for corrected maps; leave data out" if settings.data.set else f"holds no *{TRUTH_SUFFIX}"

@@ -191,14 +191,14 @@ def make_scan(case: Case, data: Path | None) -> Scan:
 
 
 def _find_ipa_plan(name: str, data: Path) -> Path:
-    """The true rooms of a grid, furnished or not."""
+    """Return the true rooms of a grid, furnished or not."""
     stem = name.removesuffix("_trashbins").removesuffix("_furnitures")
     return data / IPA / f"{stem}_gt_segmentation.png"
 
 
 @lru_cache(maxsize=64)
 def find_plan(source: str, name: str, data: Path) -> Any:
-    """The plan of that name."""
+    """Return the plan of that name."""
     from topomerge.datasets.plans.floorplans import Refusal, iter_plans, read_plans
     from topomerge.datasets.plans.splits import FOLDERS
 

@@ -24,7 +24,7 @@ ROOM_NEAR = 0.1  # m within which every point of a room lies where it should
 
 
 def collect_room_floors(map: TopometricMap, rooms: Iterable[Sequence[tuple[int, int]]]) -> list[Array]:
-    """(n, 3) points of each shared room: its floor in map b, of all pieces; where none was seen, what stands in it.
+    """Return (n, 3) points of each shared room: its floor in map b, of all pieces; where none was seen, what stands in it.
 
     Args:
         map: b.
@@ -40,7 +40,7 @@ def collect_room_floors(map: TopometricMap, rooms: Iterable[Sequence[tuple[int, 
 
 
 def measure_displacements(pose: Sim3, truth: Sim3, rooms: Sequence[Array], flat: bool = False) -> Array:
-    """(R,) m, in the frame of a: how far an estimated pose of b puts the worst point of each room from its true place.
+    """Return (R,) m, in the frame of a: how far an estimated pose of b puts the worst point of each room from its true place.
 
     The distance is convex over the room, so its largest is that of the outline.
 
@@ -181,8 +181,8 @@ def find_shared_rooms(pair: EvaluationPair) -> dict[tuple[int, int], list[tuple[
 
 
 def rank_partners(cost: Array, matches: Array) -> tuple[Array, Array]:
-    """(Q,) rows that have a partner, and (Q,) rank of its best partner, from 1: columns that are no partner and cost as much
-    count before it.
+    """Return (Q,) rows that have a partner, and (Q,) rank of its best partner, from 1: columns that are no partner and cost as
+    much count before it.
 
     Args:
         cost: (R_a, R_b).
@@ -303,9 +303,9 @@ ACROSS = np.radians(55.0)  # between the wall and the way to its copy, at least:
 
 
 def find_doubled_columns(first: Array, second: Array, seen: Array, edge: float) -> Array:
-    """(nx, ny) bool columns of the walls of a map that another map shows a second time: a parallel wall of the other one stands
-    within `WITHIN` where this map has none, the other one has none here, and what lies between the two was looked into. (Where
-    it was not, the two are the faces of one thick wall, seen from its two sides.)
+    """Return (nx, ny) bool columns of the walls of a map that another map shows a second time: a parallel wall of the other one
+    stands within `WITHIN` where this map has none, the other one has none here, and what lies between the two was looked into.
+    (Where it was not, the two are the faces of one thick wall, seen from its two sides.)
 
     Args:
         first, second: (nx, ny) bool walls of the two maps, on one raster.
@@ -335,7 +335,7 @@ def find_doubled_columns(first: Array, second: Array, seen: Array, edge: float) 
 
 
 def _estimate_normals(walls: Array) -> Array:
-    """(nx, ny) rad, across the wall, modulo pi."""
+    """Return (nx, ny) rad, across the wall, modulo pi."""
     image = ndimage.gaussian_filter(walls.astype(np.float32), DIRECTION_BLUR)
     slope = ndimage.sobel(image, 0) + 1j * ndimage.sobel(image, 1)
     square = slope**2
@@ -365,7 +365,7 @@ def measure_doubled_walls(joined: TopometricMap) -> float:
 
 
 def _rasterise_walls(joined: TopometricMap, bit: int) -> Array:
-    """(S, nx, ny) bool walls of what one map saw."""
+    """Return (S, nx, ny) bool walls of what one map saw."""
     assert joined.provenance is not None
     chosen = (joined.provenance >> np.uint32(bit) & np.uint32(1)) > 0
     grid, room = joined.grid.select_cells(chosen), joined.room[chosen]

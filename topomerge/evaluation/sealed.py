@@ -74,18 +74,18 @@ def list_blocks(text: str) -> list[str]:
     return re.findall(r"(?m)^## \d{4}-\d\d-\d\d \d\d:\d\d UTC: version (\S+?)(?:,|$)", text)
 
 
-def check_page(page: Path, version: str, again: bool) -> None:
+def check_page(page: Path, version: str, repeated: bool) -> None:
     """Refuse to measure a version twice.
 
     Raises:
         InputError: it was measured, and nobody asks for it again.
     """
-    if not again and page.is_file() and version in list_blocks(page.read_text(encoding="utf-8")):
+    if not repeated and page.is_file() and version in list_blocks(page.read_text(encoding="utf-8")):
         raise InputError(f"{page}: has a block of version {version}; a version is measured once (--again does it once more)")
 
 
 def format_block(rows: Sequence[Row], version: str, command: str, seconds: float, before: int) -> str:
-    """What is appended.
+    """Format the block of a run, which is appended to the page.
 
     Args:
         before: blocks of the same version that are there.
@@ -105,14 +105,14 @@ def append_text(page: Path, text: str) -> None:
         temporary.write_bytes(before + text.encode())
 
 
-def parse_public_sets(words: Sequence[str]) -> list[tuple[str, Path]]:
+def parse_public_sets(values: Sequence[str]) -> list[tuple[str, Path]]:
     """Sources and folders of SOURCE=FOLDER.
 
     Raises:
         InputError: not of this form, or no such folder.
     """
     out = []
-    for word in words:
+    for word in values:
         source, _, folder = word.partition("=")
         if not folder or not Path(folder).is_dir():
             raise InputError(
@@ -122,8 +122,8 @@ def parse_public_sets(words: Sequence[str]) -> list[tuple[str, Path]]:
     return out
 
 
-def parse_arguments(words: Sequence[str]) -> argparse.Namespace:
-    """What the command line says."""
+def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
+    """Parse the command line."""
     parser = argparse.ArgumentParser(
         prog="python -m topomerge.evaluation.sealed", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -133,12 +133,12 @@ def parse_arguments(words: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--parts", nargs="+", choices=SEALED_PARTS, default=list(SEALED_PARTS), help="what is measured")
     parser.add_argument("--public", nargs="*", default=[], metavar="SOURCE=FOLDER", help="published sets")
     parser.add_argument("--page", type=Path, help="where the block goes; docs/results/sealed.md")
-    return parser.parse_args(words)
+    return parser.parse_args(arguments)
 
 
-def measure_and_append(words: Sequence[str]) -> None:
+def measure_and_append(arguments: Sequence[str]) -> None:
     """The whole run."""
-    options = parse_arguments(words)
+    options = parse_arguments(arguments)
     page = options.page or (None if options.small else PAGE)
     if page:
         check_page(page, __version__, options.again)
@@ -148,16 +148,16 @@ def measure_and_append(words: Sequence[str]) -> None:
     split, public = "train" if options.small else SEALED, parse_public_sets(options.public)
     rows = run(split, data, public, options.jobs, options.small, options.parts)
     text = format_block(
-        rows, __version__, shlex.join(["python", "-m", "topomerge.evaluation.sealed", *words]), time.time() - began, before
+        rows, __version__, shlex.join(["python", "-m", "topomerge.evaluation.sealed", *arguments]), time.time() - began, before
     )
     if page:
         append_text(page, text)
     print(text)
 
 
-def main(words: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run; the exit status."""
-    arguments = list(sys.argv[1:] if words is None else words)
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
     return run_script("sealed", lambda: measure_and_append(arguments), "nothing was written")
 
 

@@ -1,4 +1,4 @@
-"""What the sealed run measures, an item a call, and the tables of it. Of what split the items are is up to who calls.
+"""Measures of the sealed run, an item a call, and their tables. The caller chooses the split of the items.
 
 Rooms: procedural buildings by five sensors, and sealed plans of real buildings, scanned. Merges: pairs of grids as those that the
 belief in merges is judged on (`datasets.pairs.grid_pairs`), two scans of each sealed plan, both halves of each sealed robot grid
@@ -83,7 +83,7 @@ def count_pair_ranks(pair: Pair, place: str) -> list[Row]:
 
 
 def build_evaluation_pair(pair: Pair, maps: Sequence[TopometricMap]) -> EvaluationPair:
-    """What is true of two extracted maps; nothing is kept of them."""
+    """Build the truth of two extracted maps, without keeping the maps."""
     truths = [match_true_rooms(map, cloud) for map, cloud in zip(maps, (pair.a, pair.b), strict=True)]
     labelled = bool(pair.a.rooms)
     matches = find_true_matches(truths[0], truths[1], pair.shared) if labelled else match_overlapping_rooms(pair, maps)
@@ -291,7 +291,7 @@ def rank_robot_rooms(data: Path) -> list[Row]:
 
 
 def _build_grid_pair(pair: Pair) -> GridPair:
-    """A pair as the registration takes it."""
+    """Return a pair as the registration takes it."""
     a, b = build_grid(pair.a), build_grid(pair.b)
     free = [c.free if c.poses is None else compute_free_grid(c, g) for c, g in ((pair.a, a), (pair.b, b))]
     about: dict[str, object] = {key: getattr(pair, key) for key in ("kind", "building", "source", "overlap")}
@@ -302,7 +302,7 @@ def _build_grid_pair(pair: Pair) -> GridPair:
 
 
 def build_merge_row(pair: GridPair, place: str) -> Row:
-    """What became of a pair."""
+    """Register a pair; return its row of results."""
     outcome, registration = time_registration(pair.a, pair.b, bool(pair.about.get("scaled")), pair.free)
     pose = registration.transform
     about = {key: pair.about.get(key) for key in ("sensors", "kind", "overlap", "differs")}

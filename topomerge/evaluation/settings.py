@@ -1,4 +1,4 @@
-"""What an evaluation is told: the pairs, what predicts, and what is reported."""
+"""Settings of an evaluation: the pairs, the predictor, and the report."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ class Pairs(Recipe):
     """The pairs: simulated ones of a recipe, or real ones.
 
     Args:
-        real: sources of real pairs (`datasets.real.SOURCES`); the recipe then only gives the name, the folder and the voxel size.
+        real: sources of real pairs (`datasets.real.sources.REAL_SOURCES`); the recipe then only gives the name,
+            the folder and the voxel size.
         trained: sources that trained something; the others are reported apart.
     """
 

@@ -101,7 +101,7 @@ def sum_counts(rows: Sequence[Row], names: Iterable[str], buildings: Sequence[st
 
 @lru_cache(256)
 def draw_buildings(buildings: int, rounds: int, seed: int = 0) -> Array:
-    """(rounds, buildings) how often each building was drawn, with replacement."""
+    """Return (rounds, buildings) how often each building was drawn, with replacement."""
     drawn = np.random.default_rng(seed).integers(buildings, size=(rounds, buildings))
     rows = np.arange(rounds)[:, None] * buildings
     counts = np.bincount((drawn + rows).ravel(), minlength=rounds * buildings)

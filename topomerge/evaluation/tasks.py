@@ -56,7 +56,7 @@ MODULES = {
 
 @dataclass
 class Data:
-    """What is measured.
+    """The data that a task measures.
 
     Args:
         set: name of the set, or several with commas between them.
@@ -93,7 +93,7 @@ class TaskSettings:
 
 
 class EvaluationModule(Protocol):
-    """What a module of a task has."""
+    """The functions that the module of a task defines."""
 
     Settings: type[TaskSettings]
     MAKERS: tuple[str, ...]
@@ -113,7 +113,7 @@ class EvaluationModule(Protocol):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a task found."""
+    """The outcome of a task."""
 
     rows: list[Row]
     summary: str
@@ -125,15 +125,15 @@ def load_task(task: str) -> EvaluationModule:
     return cast(EvaluationModule, import_module(f"topomerge.evaluation.{MODULES[task]}"))
 
 
-def read_settings(task: str, words: Sequence[str]) -> Any:
-    """Read words like ``data=homes jobs=2 data.limit=3`` as the settings of a task.
+def read_settings(task: str, overrides: Sequence[str]) -> Any:
+    """Read overrides like ``data=homes jobs=2 data.limit=3`` as the settings of a task.
 
     Raises:
         InputError: names the key that is wrong.
     """
     from omegaconf import OmegaConf
 
-    plain = [f"data.set={w[5:]}" if w.startswith("data=") else w for w in words if not w.startswith("task=")]
+    plain = [f"data.set={w[5:]}" if w.startswith("data=") else w for w in overrides if not w.startswith("task=")]
     for word in plain:
         if "=" not in word:
             raise InputError(f"{word}: give KEY=VALUE, such as data=dev")
@@ -142,13 +142,13 @@ def read_settings(task: str, words: Sequence[str]) -> Any:
     return convert_to_dataclass(OmegaConf.from_dotlist(quoted), load_task(task).Settings)
 
 
-def run_task(task: str, words: Sequence[str], log_line: LogFn) -> Outcome:
+def run_task(task: str, overrides: Sequence[str], log_line: LogFn) -> Outcome:
     """Measure, tabulate, keep, and write where asked.
 
     Raises:
         InputError: settings that nothing can be made of, or data that is missing.
     """
-    module, settings = load_task(task), read_settings(task, words)
+    module, settings = load_task(task), read_settings(task, overrides)
     rows = module.measure(settings, log_line)
     blocks = module.tabulate(rows, settings)
     summary = "\n\n".join(blocks.values())
@@ -157,7 +157,7 @@ def run_task(task: str, words: Sequence[str], log_line: LogFn) -> Outcome:
     with replace_on_success(folder / "report.md") as temporary:
         temporary.write_text(f"# {folder.name}\n\n{summary}\n", encoding="utf-8")
     stamp = build_stamp(
-        shlex.join(["python", "evaluate.py", f"task={task}", *(w for w in words if not w.startswith("task="))]),
+        shlex.join(["python", "evaluate.py", f"task={task}", *(w for w in overrides if not w.startswith("task="))]),
         module.MAKERS,
         module.list_inputs(settings),
     )
@@ -342,7 +342,8 @@ def find_buildings(pair: GridPair, split: str) -> tuple[str, str]:
 
 
 def describe_places(names: tuple[str, str], sources: tuple[str, str] | None = None) -> dict[str, str]:
-    """What a row of results tells of where its maps are from: names, sources and physical buildings of a and of b.
+    """Return the columns of a row of results that tell where its maps are from: names, sources and physical buildings of a and of
+    b.
 
     Args:
         sources: None: as the names of cached pairs tell them.
@@ -354,7 +355,7 @@ def describe_places(names: tuple[str, str], sources: tuple[str, str] | None = No
 
 
 def list_difficulties(pair: GridPair) -> list[str]:
-    """What makes a cached pair hard beside its kind (`grid_pairs`: every sixth, every eighth)."""
+    """List the difficulties of a cached pair beside its kind (`grid_pairs`: every sixth, every eighth)."""
     difficulty: dict[str, float] = pair.about.get("difficulty", {})  # type: ignore[assignment]
     limits = {"much moved furniture": ("moved", 0.6), "glass walls": ("glass", 0.5)}
     return [title for title, (name, least) in limits.items() if difficulty.get(name, 0.0) >= least]
@@ -367,9 +368,9 @@ def find_source(name: str) -> str:
     return "campus" if name.startswith(("school/", "office/")) else "r2v"
 
 
-def read_recipe(split: str, words: tuple[str, ...] = ()) -> Any:
+def read_recipe(split: str, overrides: tuple[str, ...] = ()) -> Any:
     """Read the settings of the task that the pairs of a split are made with."""
-    return compose_settings(["task=merge_belief", f"data={SETS[split.removesuffix(DRAWN)]}", *words])
+    return compose_settings(["task=merge_belief", f"data={SETS[split.removesuffix(DRAWN)]}", *overrides])
 
 
 def find_places(pair: GridPair, split: str) -> dict[str, str]:

@@ -128,13 +128,13 @@ def find_height(scan: Scan, map: TopometricMap, wall: Array) -> float:
 
 
 def place_points(scan: Scan, points: Array, z: float) -> Array:
-    """(n, 2) points of the map in the frame of the building."""
+    """Return (n, 2) points of the map in the frame of the building."""
     assert scan.truth is not None
     return scan.truth.transform_to_building(np.column_stack([points, np.full(len(points), z)]))[:, :2]
 
 
 def sample_own_faces(scan: Scan, walls: Array, floor: float) -> tuple[Array, Array, Array]:
-    """(n, 2) places on the faces of walls that were seen, which way leads into the wall, and was its other face seen."""
+    """Return (n, 2) places on the faces of walls that were seen, which way leads into the wall, and was its other face seen."""
     places, outs, double = [np.zeros((0, 2))], [np.zeros((0, 2))], [np.zeros(0, bool)]
     for wall in walls:
         along = wall["end"] - wall["start"]
@@ -155,7 +155,7 @@ def sample_own_faces(scan: Scan, walls: Array, floor: float) -> tuple[Array, Arr
 
 
 def sample_true_faces(polygons: dict[int, Array]) -> tuple[Array, Array, Array]:
-    """(n, 2) places on the outlines of rooms, which way leads into the wall, and (n,) the room."""
+    """Return (n, 2) places on the outlines of rooms, which way leads into the wall, and (n,) the room."""
     places, outs, rooms = [np.zeros((0, 2))], [np.zeros((0, 2))], [np.zeros(0, int)]
     for i, polygon in polygons.items():
         ring = np.asarray(shapely.geometry.polygon.orient(shapely.Polygon(polygon)).exterior.coords)
@@ -170,7 +170,8 @@ def sample_true_faces(polygons: dict[int, Array]) -> tuple[Array, Array, Array]:
 
 
 def measure_distances(at: Array, out: Array, others: Array, outs: Array) -> Array:
-    """(n,) m across the face from each place to the nearest of others that look the same way; inf without any within 0.4 m."""
+    """Return (n,) m across the face from each place to the nearest of others that look the same way; inf without any within 0.4
+    m."""
     off = np.full(len(at), np.inf)
     if len(at) and len(others):
         far, rows = cKDTree(others).query(at, k=min(40, len(others)), distance_upper_bound=0.4)
@@ -202,7 +203,8 @@ def find_in_door(doors: Array, places: Array, floor: float) -> Array:
 
 
 def measure_thickness(scan: Scan, walls: Array, polygons: dict[int, Array], floor: float) -> Array:
-    """(n,) m by which walls seen from both sides are thicker or thinner than the gap between the true rooms at their middle."""
+    """Return (n,) m by which walls seen from both sides are thicker or thinner than the gap between the true rooms at their
+    middle."""
     union = shapely.union_all([shapely.Polygon(p) for p in polygons.values()])
     out = []
     for wall in walls[walls["faces"] == 2]:
@@ -217,7 +219,7 @@ def measure_thickness(scan: Scan, walls: Array, polygons: dict[int, Array], floo
 
 
 def check_openings(scan: Scan, map: TopometricMap, structure: Any, floor: float) -> Array:
-    """(n,) bool: of the doors of the map that are true ones, which are set into a wall at the right place."""
+    """Return (n,) bool: of the doors of the map that are true ones, which are set into a wall at the right place."""
     truth = scan.truth
     assert truth is not None
     right = []

@@ -23,7 +23,8 @@ MIDDLE = OFFSET_STEPS // 2  # offset of a cell whose points are not known
 
 
 def compute_cell_means(grid: VoxelGrid) -> Array:
-    """(n, 3) float64 m: the mean of the points of each cell where the grid has it (property ``offset``), else the centroids."""
+    """Return (n, 3) float64 m: the mean of the points of each cell where the grid has it (property ``offset``), else the
+    centroids."""
     offset = grid.properties.get("offset")
     if offset is None:
         return grid.compute_centroids()
@@ -168,7 +169,8 @@ def _squeeze_keys(keys: Array) -> Array:
 
 
 def _is_not_stray(cells: Array, edge: float) -> Array:
-    """(n,) bool: not in a small group of cells far from the rest. One stray return must not decide the size of the grid."""
+    """Return (n,) bool: not in a small group of cells far from the rest. One stray return must not decide the size of the
+    grid."""
     group = label_groups(cells, max(int(STRAY_DISTANCE / edge), 1), STRAY_CELLS)
     size = np.bincount(group)
     keep = (size >= STRAY_SHARE * len(cells))[group]
@@ -195,7 +197,7 @@ _neighbours: WeakKeyDictionary[VoxelGrid, Array] = WeakKeyDictionary()
 
 
 def _count_neighbours(grid: VoxelGrid) -> Array:
-    """(n,) occupied ones of the 26 cells around each; the count is kept for whoever asks next."""
+    """Return (n,) occupied ones of the 26 cells around each; the count is kept for whoever asks next."""
     if grid not in _neighbours:
         _neighbours[grid] = convolve(grid, build_moore())
     return _neighbours[grid]
@@ -222,6 +224,7 @@ def coarsen_until_dense(grid: VoxelGrid, neighbours: float, warnings: list[str])
 # At the edge of a door a laser or a depth camera averages what is in front and what is behind: points hang in the opening, and a
 # single one of them obstructs the body of the stick kernel.
 
+# By the median alone (26 of solid walls) the floor beside them was noise, and such plans were refused (docs/adr/0005).
 THICK_SURFACE = 17  # neighbours of a cell in a surface that is two cells thick
 
 

@@ -47,6 +47,7 @@ from topomerge.types import EDGE_DTYPE, LEVELLED, Array, PointCloud, TopometricM
 
 # What the score of a passage weighs: the log odds of a door by the plan, and by the walls, on average along a doorway that they
 # show there; 0 where they show none or speak against one.
+# The sensor's way is no evidence here: fitted, it got a weight of the wrong sign (docs/adr/0024).
 SCORE_INPUTS = ("constant", "plan", "shown")
 KINDS = ("walls",)  # of scans that have a model: walls show at heights
 PASSAGES_FILE = "passages.json"
@@ -75,7 +76,7 @@ def find_passages(storeys: Sequence[SegmentedStorey], walls: StoreyWalls | None,
 
 
 def score_passages(x: Array, passages: Sequence[Passage], weights: Array) -> Array:
-    """(n,) calibrated probability that a door parts the two sides of each passage, by all evidence.
+    """Return (n,) calibrated probability that a door parts the two sides of each passage, by all evidence.
 
     Args:
         x: (n, 17) `DOOR_FEATURES` of the sides as they have grown.
@@ -94,6 +95,7 @@ def choose_scorer(walls: bool) -> Scorer:
     Raises:
         InputError: the weights that ship are damaged.
     """
+    # Slices: a model of their own was fitted and was no better (log loss .265 with it, .248 without: docs/adr/0024).
     if not walls:
         return score_by_plan
     weights = np.array(read_weights_json("topomerge.extraction", PASSAGES_FILE).get("walls", ()), float)
@@ -104,7 +106,7 @@ def choose_scorer(walls: bool) -> Scorer:
 
 
 def compute_inputs(plan: Array, shown: Array) -> Array:
-    """(n, 3) `SCORE_INPUTS` of passages.
+    """Return (n, 3) `SCORE_INPUTS` of passages.
 
     Args:
         plan: (n,) log odds of a door by the plan alone.
@@ -250,6 +252,7 @@ def gather_evidence(
     watch.begin("segments", 0.4)
     looks = JOINED_LOOKS if parts else LOOKS
     rasters, places = rasterise_storeys(scan, navigable, p.standing_height, looks), scan.places
+    # Rather too many segments than too few: what is merged here, no later evidence can part (docs/adr/0024).
     narrow = min(p.narrow, p.slice_door if scan.flat else p.door)
     storeys = [segment_storey(rasters, i, narrow, parts, places) for i in range(len(rasters.numbers))]
     watch.begin("walls", 0.6)
@@ -270,8 +273,10 @@ def cut_rooms(
     """
     found = gather_evidence(scan, navigable, p, watch, parts)
     watch.begin("rooms", 0.75)
+    # Elevations of joined maps have no say: the faces of two maps differ by more than a leaf lies back (docs/adr/0014).
     weigh = p.walls and not parts
     score = choose_scorer(weigh and found.walls is not None)
+    # Of slices surer doors only: else their furniture cuts rooms (docs/adr/0026).
     door, least = (p.slice_door, LEAST_FLAT_ROOM) if scan.flat else (p.door, LEAST_ROOM)
     cut = [partition_rooms(storey, score, door, least) for storey in found.storeys]  # 2.6
     floor = build_floor(scan.grid, navigable, found.rasters.storey, found.rasters.storeys, cut, found.rasters.factor)
@@ -281,7 +286,7 @@ def cut_rooms(
 
 
 def list_warnings(map: TopometricMap) -> list[str]:
-    """What the user should know about the map as a whole."""
+    """List warnings about the map as a whole, for the user."""
     doubts = []
     if map.grid.edge > COARSE_CELL:
         doubts.append(f"cells of {map.grid.edge:g} m are coarse: doors may be lost, {COARSE_CELL} m or less finds them")

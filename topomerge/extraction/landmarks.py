@@ -61,7 +61,7 @@ def assign_landmarks(map: TopometricMap, landmarks: Landmarks) -> Landmarks:
 
 
 def _find_nearest_rooms(map: TopometricMap, storey: int, places: Array) -> Array:
-    """(n,) room of a storey whose floor is nearest to places (n, 2), -1 where none is within reach."""
+    """Return (n,) room of a storey whose floor is nearest to places (n, 2), -1 where none is within reach."""
     own = np.append(map.rooms["storey"] == storey, False)[map.navigable_room]
     if not own.any():
         return np.full(len(places), -1)
@@ -71,7 +71,8 @@ def _find_nearest_rooms(map: TopometricMap, storey: int, places: Array) -> Array
 
 
 def find_rooms_of_doors(map: TopometricMap, storey: int, places: Array, here: Array) -> Array:
-    """(n,) room to which the door beside each place (n, 2) leads; the room where it is, `here`, where no door is within reach."""
+    """Return (n,) room to which the door beside each place (n, 2) leads; the room where it is, `here`, where no door is within
+    reach."""
     level = np.isin(map.edges["kind"], LEVEL_KINDS)
     doors = map.edges[level & (map.rooms["storey"][map.edges["rooms"]] == storey).all(axis=1)]
     if not len(doors) or not len(places):

@@ -19,7 +19,7 @@ from topomerge.types import Array, PointCloud, VoxelGrid, transform_landmarks, t
 # ceilings, but no walls: a cloud is tilted only where its walls, too, lean by as much and to the same side.
 
 LEAST_TILT = 1.0  # degrees: of real scans that are level 0.7 at most were found; from there on merges suffer
-LARGEST_TILT = 25.0  # degrees: beyond, another axis is up, of which `io.checks` warns
+LARGEST_TILT = 25.0  # degrees: beyond, another axis is up, of which `io.point_warnings` warns
 SAMPLE = 300_000  # points that are looked at
 PATCH_EDGES = (0.4, 0.8)  # m, of the cubes in which planes are fitted; the larger ones where the smaller ones show too few
 LEAST_POINTS = 8  # of a patch
@@ -120,7 +120,7 @@ def _fit_planes(points: Array, edge: float) -> Array:
 
 
 def _count_agreement(normals: Array, ups: Array) -> Array:
-    """(k,) how many patches lie flat or stand upright along each of the directions (k, 3)."""
+    """Return (k,) how many patches lie flat or stand upright along each of the directions (k, 3)."""
     count = np.empty(len(ups))
     for first in range(0, len(ups), FEW_UPS):
         block = slice(first, first + FEW_UPS)
@@ -131,7 +131,7 @@ def _count_agreement(normals: Array, ups: Array) -> Array:
 
 
 def _find_most_agreed(normals: Array) -> Array:
-    """(3,) the direction within `LARGEST_TILT` of z with which most patches agree."""
+    """Return (3,) the direction within `LARGEST_TILT` of z with which most patches agree."""
     steps = np.tan(np.radians(np.arange(-LARGEST_TILT, LARGEST_TILT + SEARCH_STEP, SEARCH_STEP)))
     x, y = (v.ravel() for v in np.meshgrid(steps, steps))
     ups = np.column_stack([x, y, np.ones(len(x))])
@@ -142,8 +142,8 @@ def _find_most_agreed(normals: Array) -> Array:
 
 
 def _refine_up(normals: Array, up: Array) -> Array:
-    """(3,) the direction to which the normals of floors are parallel and those of walls perpendicular: least squares in which
-    what is far off has no say."""
+    """Return (3,) the direction to which the normals of floors are parallel and those of walls perpendicular: least squares in
+    which what is far off has no say."""
     for reach in REACHES:
         sine = np.clip(np.abs(normals @ up), 0, 1)
         off = np.degrees(np.arcsin(sine))
@@ -246,8 +246,8 @@ def transform_cloud(cloud: PointCloud, matrix: Array) -> PointCloud:
 
 
 def transform_grid(grid: VoxelGrid, matrix: Array) -> VoxelGrid:
-    """The cells of a lattice of the same edge length whose middles lie in cells of a grid that is moved by a rigid motion (4, 4);
-    without properties."""
+    """Return the cells of a lattice of the same edge length whose middles lie in cells of a grid that is moved by a rigid motion
+    (4, 4); without properties."""
     if not len(grid):
         return grid
     back, found = np.linalg.inv(matrix), []

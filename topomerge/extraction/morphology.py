@@ -70,7 +70,7 @@ def compute_horizontal_distance_field(grid: VoxelGrid) -> Array:
 
 
 def is_surrounded(grid: VoxelGrid, cells: Array, radius: int) -> Array:
-    """(m,) bool: does the grid hold all cells of the level that are at most so many cells away? As
+    """Return (m,) bool: does the grid hold all cells of the level that are at most so many cells away? As
     `compute_horizontal_distance_field` at
     or above the radius, of some cells and for a small radius."""
     disc = build_circle(radius * grid.edge, grid.edge)
@@ -138,8 +138,8 @@ def _find_steps(values: Array) -> Array:
 
 
 def _find_closing_columns(columns: Array, radius: float) -> Array:
-    """(k, 2) columns that closing by a disc of `radius` cells adds to the given ones, tile by tile: most of a building's box is
-    empty on most of its levels."""
+    """Return (k, 2) columns that closing by a disc of `radius` cells adds to the given ones, tile by tile: most of a building's
+    box is empty on most of its levels."""
     margin = 2 * int(np.ceil(radius)) + 1
     tile = columns.astype(np.int64) // CLOSING_TILE
     added = []

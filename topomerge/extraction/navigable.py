@@ -140,7 +140,7 @@ def has_floor(grid: VoxelGrid, navigable: VoxelGrid, body_height: float) -> bool
 
 
 def _measure_above_floor(grid: VoxelGrid, floor: Array) -> Array:
-    """(n,) cells by which each occupied one lies above the nearest column of a floor, (k, 3) of the same lattice."""
+    """Return (n,) cells by which each occupied one lies above the nearest column of a floor, (k, 3) of the same lattice."""
     level = np.full(grid.shape[:2], -1, np.int64)
     level[tuple(floor[:, :2].T)] = floor[:, 2]
     nearest = ndimage.distance_transform_edt(level < 0, return_distances=False, return_indices=True)
@@ -174,8 +174,8 @@ def add_assumed_floor(grid: VoxelGrid, rays: tuple[Array, Array] | None = None) 
 
 
 def _find_under_ceiling(grid: VoxelGrid, overhead: float = OVERHEAD) -> tuple[Array, Array, Array]:
-    """(nx, ny) columns that begin `overhead` m above the lowest ones around; that lowest level; the highest occupied one of
-    each."""
+    """Return (nx, ny) columns that begin `overhead` m above the lowest ones around; that lowest level; the highest occupied one
+    of each."""
     nx, ny = grid.shape[:2]
     bottom, top = np.full((nx, ny), np.iinfo(np.int64).max), np.full((nx, ny), -1)
     at = tuple(grid.cells[:, :2].T)
@@ -252,13 +252,13 @@ def add_crossed_cells(scan: Scan) -> Scan:
 
 
 def _allocate_crossed(grid: VoxelGrid) -> Array | None:
-    """(nx, ny, nz) bool of the free cells, none of them crossed; None where there are too many."""
+    """Return (nx, ny, nz) bool of the free cells, none of them crossed; None where there are too many."""
     nx, ny, nz = (-(-s // FREE_CELL) for s in grid.shape)
     return np.zeros((nx, ny, nz), bool) if nx * ny * nz <= LARGEST_VOLUME else None
 
 
 def _select_empty_cells(grid: VoxelGrid, crossed: Array) -> VoxelGrid:
-    """The crossed cells in which nothing stands."""
+    """Return the crossed cells in which nothing stands."""
     crossed[tuple((grid.cells // FREE_CELL).T)] = False
     nx, ny, nz = crossed.shape
     return VoxelGrid.from_cells(np.argwhere(crossed), grid.origin, grid.edge * FREE_CELL, (nx, ny, nz))
@@ -280,7 +280,8 @@ def _carve_views(grid: VoxelGrid, navigable: VoxelGrid, reach: float, crossed: A
 
 
 def select_tile_views(grid: VoxelGrid, navigable: VoxelGrid, spacing: float) -> Array:
-    """(v, 3) m, one view for each `spacing` x `spacing` m tile and storey-high layer: where it is farthest from the boundary.
+    """Return (v, 3) m, one view for each `spacing` x `spacing` m tile and storey-high layer: where it is farthest from the
+    boundary.
 
     A regular net of views sees rooms evenly, whatever the shape of their medial axis. None ends up in a ceiling.
     """
@@ -306,7 +307,7 @@ def _select_tile_maxima(grid: VoxelGrid, distance: Array, spacing: float) -> Arr
 
 
 def _sample_directions(count: int) -> Array:
-    """(count, 3) directions spread evenly: a Fibonacci lattice."""
+    """Return (count, 3) directions spread evenly: a Fibonacci lattice."""
     k = np.arange(count) + 0.5
     z = 1 - 2 * k / count
     turn = np.pi * (1 + np.sqrt(5)) * k
@@ -344,11 +345,14 @@ def compute_navigable_volume(scan: Scan, p: SharedParameters) -> tuple[Scan, Vox
 def _compute_navigable(grid: VoxelGrid, p: SharedParameters, places: Array = NOWHERE) -> VoxelGrid:
     """The steps of 2.3 in their order; those between them are beyond the thesis (docs/adr/0003)."""
     body = _build_stick_kernel(grid.edge, p)
+    # Points that fly in door openings shut nine of ten doors of simulated scans (docs/adr/0003).
     if p.noise:
         grid = remove_flying_cells(grid, p.noise)
     standing = select_unobstructed(grid, body)  # 2.3.1
+    # The upper side of the ceiling was often the largest component (docs/adr/0003).
     if not p.ceilings:
         standing = remove_ceilings(grid, standing, places)
+    # Sparse floors fell apart; more height in place of this turned beds into floor (docs/adr/0003).
     if p.bridge:
         standing = bridge_gaps(grid, standing, body, p.bridge)
     dilated = dilate_upwards(standing, p.dilation)  # 2.3.2
@@ -362,6 +366,6 @@ def _compute_navigable(grid: VoxelGrid, p: SharedParameters, places: Array = NOW
 
 
 def _build_stick_kernel(edge: float, p: SharedParameters) -> Kernel:
-    """The stick that the parameters describe, in cells of `edge` m; the body's width is the nearest odd number of them."""
+    """Return the stick that the parameters describe, in cells of `edge` m; the body's width is the nearest odd number of them."""
     width = 2 * int((p.body_width / edge - 1) / 2 + 0.5) + 1
     return build_stick(p.stem_height, width * edge, p.body_height, edge)

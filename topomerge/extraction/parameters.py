@@ -10,13 +10,15 @@ from topomerge.errors import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class SharedParameters:
-    """What both presets have: cells, navigable volume (seeds 2.3), free space. The defaults are ours; docs/adr/0003 says why."""
+    """Parameters of both presets: cells, navigable volume (seeds 2.3), free space. The defaults are ours; docs/adr/0003 says
+    why."""
 
     level: bool = True  # tilted clouds are levelled first
     noise: float = 0.4  # cells with a smaller share of the usual number of neighbours are in nobody's way; 0: all are
     sparse: float = 3.5  # cells are doubled until they have that many neighbours of 26 (median): fewer are no surface; 0: never
     stem_height: float = 0.25  # a step may stand beside the foot
     body_width: float = 0.30
+    # Higher than the thesis' body of 0.75 m: table tops under shelves are no floor (docs/adr/0003).
     body_height: float = 1.50  # with the stem 1.75: a grown-up
     dilation: float = 0.25
     bridge: float = 0.30  # half the gap in the floor that is bridged; 0: none
@@ -91,5 +93,5 @@ def resolve_parameters(preset: str | Parameters, overrides: dict[str, Any]) -> P
 
 
 def _get_preset_name(parameters: object) -> str:
-    """The preset of which an instance is a variant; its type's name where it is none."""
+    """Return the preset of which an instance is a variant; its type's name where it is none."""
     return next((name for name, p in PRESETS.items() if type(p) is type(parameters)), type(parameters).__name__)

@@ -149,7 +149,7 @@ def compute_pose_features(map: TopometricMap, rays: tuple[Array, Array] | None) 
 
 
 def _find_rooms_below(map: TopometricMap, places: Array) -> Array:
-    """(n,) room over whose floor each place is, -1 none."""
+    """Return (n,) room over whose floor each place is, -1 none."""
     rows = select_lowest_of_column(map.navigable)
     rows = rows[map.navigable_room[rows] >= 0]
     floor = map.navigable.compute_centroids(map.navigable.cells[rows])
@@ -200,7 +200,7 @@ def _iter_windows(storey: _StoreyFloor) -> Iterator[tuple[int, tuple[slice, slic
 
 
 def _measure_outline(storey: _StoreyFloor, room: int, window: tuple[slice, slice]) -> dict[str, float]:
-    """What the outline of a room tells.
+    """Measure the outline of a room: what it borders on.
 
     Args:
         window: the part of the raster from where others look into it; the outline itself is looked for in the room's own box.
@@ -229,7 +229,7 @@ def _measure_outline(storey: _StoreyFloor, room: int, window: tuple[slice, slice
 
 
 def _find_box(mask: Array, margin: int) -> tuple[tuple[slice, slice], Array]:
-    """The box around a mask (nx, ny) bool that has any, with a margin where there is room for it, and its corner (2,)."""
+    """Return the box around a mask (nx, ny) bool that has any, with a margin where there is room for it, and its corner (2,)."""
     x, y = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
     low = np.maximum([x[0] - margin, y[0] - margin], 0)
     return (slice(low[0], x[-1] + margin + 1), slice(low[1], y[-1] + margin + 1)), low
@@ -245,7 +245,7 @@ def measure_thin_share(own: Array, edge: float) -> float:
 
 
 class _Hulls:
-    """What lies between the rooms of a storey."""
+    """Convex hulls of the rooms of a storey."""
 
     def __init__(self, storey: _StoreyFloor) -> None:
         at = np.argwhere(storey.room >= 0)
@@ -337,8 +337,8 @@ def compute_probability(weights: dict[str, Any], family: Family, name: str, x: A
 
 
 def build_model_inputs(standard: dict[str, Any], family: Family, x: Array, poses: Array | None = None) -> Array:
-    """(R, 1 + k F) what the models weigh: 1, the features in units of their spread, those times the map's share of ceiling, for
-    where no ceiling is seen other things count (not of grids, which have none), and their squares."""
+    """Return (R, 1 + k F) what the models weigh: 1, the features in units of their spread, those times the map's share of
+    ceiling, for where no ceiling is seen other things count (not of grids, which have none), and their squares."""
     low, high, mean, scale = (np.asarray(standard[part], float) for part in STANDARD)
     z = (np.clip(x, low, high) - mean) / scale
     by_ceiling = [] if family is GRIDS else [z * (2 * x[:, [COVER]] - 1)]

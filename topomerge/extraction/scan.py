@@ -16,9 +16,11 @@ from topomerge.extraction.voxels import LatticeCells, voxelise
 from topomerge.types import Array, Landmarks, PointCloud, VoxelGrid, join_landmarks
 
 FINEST_CELL = 0.02  # m
+# In cells of 0.1 m doors show, their frames do not (docs/adr/0018).
 FINE_CELL = 0.05  # m: of the cells in which walls are looked at closely
 SHORTEST_ROW = 1.0  # m: the cells of any scan, laid in a row, are longer
 LEAST_FINE = 2.05  # times as long: a grid of such cells will do, if it has the means of its points
+# Clouds are read once, piece by piece: of their points nothing else is held until rooms are known (docs/adr/0018).
 MOST_FINE_CELLS = 12_000_000  # 0.7 GB; some 4,000 m2 of floor
 MOST_RAYS = 400_000  # of a portion of two million points
 MOST_RAYS_HELD = 4_000_000  # of all portions: 0.2 GB
@@ -95,6 +97,7 @@ def read_scan(
         raise InputError(f"voxel size must be {size} to find rooms and doors, not {edge!r}")
     if isinstance(source, VoxelGrid):
         return Scan(source, source if "offset" in source.properties and edge <= LEAST_FINE * FINE_CELL else None)
+    # Whole parts: cells are summed from the fine ones, so that points are looked at once (docs/adr/0044).
     parts = max(round(edge / FINE_CELL), 1)
     fine = LatticeCells(edge / parts, MOST_FINE_CELLS) if parts > 1 else None
     clouds = [_build_cloud(source)] if isinstance(source, np.ndarray) else [source] if isinstance(source, PointCloud) else source
@@ -117,7 +120,7 @@ def read_scan(
 
 
 def _build_cloud(points: Array) -> PointCloud:
-    """A cloud of an array from the user."""
+    """Return a cloud of an array from the user."""
     try:
         return PointCloud(points)
     except ValueError as error:

@@ -44,6 +44,7 @@ PLAN_CELL = 0.1  # m: finer grids are looked at with about this
 THINNEST_SLAB = 0.15  # m: a thinner one parts no storeys
 SAME_LEVEL = 1.0  # m between a place and the floor of the storey on which it is
 SUREST_DOOR = 1e-6  # probabilities are that far from 0 and 1 at least where other maps are weighed
+# Rules for small rooms that doors or walls part gained nothing beside one least size (docs/adr/0026).
 LEAST_ROOM, LEAST_FLAT_ROOM = 0.3, 0.8  # m2 of floor; smaller ones are parts of a neighbour. Flat: in slices legs look like walls
 
 
@@ -106,7 +107,7 @@ class SegmentedStorey:
         return measure_seen_outline(self.segment, self.plan.inside, self.plan.wall, self.plan.edge)
 
     def locate_centre(self, passage: Passage) -> Array:
-        """(3,) m, where a passage lies."""
+        """Return (3,) m, where a passage lies."""
         at = self.plan.origin + (np.array(passage.place) + 0.5) * self.plan.edge
         return np.append(at, self.plan.floor[passage.place])
 
@@ -124,6 +125,7 @@ def rasterise_storeys(scan: Scan, navigable: VoxelGrid, standing_height: float, 
     factor = max(round(PLAN_CELL / grid.edge), 1)
     coarse, floor, of_coarse = _coarsen(grid, navigable, storey, factor)
     numbers = [k for k in range(len(storeys)) if (of_coarse == k).any() and not _is_upper_side(storeys[k], storeys[:k])]
+    # Robots' grids and drawings have weights of their own: those of scans err more on real ones (docs/adr/0005).
     raised = not scan.flat and is_raised(grid)  # with a floor that was assumed, a scan of the upper half of rooms is none
     plans, probabilities = [], []
     for k in numbers:
@@ -149,6 +151,7 @@ def segment_storey(
     plan, probability, k = rasters.plans[i], rasters.probabilities[i], rasters.numbers[i]
     clearance, placed = compute_clearance(plan), rasterise_part_rooms(plan, parts)
     region = segment_regions(plan, probability, find_boundary_columns(placed) if placed else None)
+    # The lowest storey has none below it whose ceiling could look like its floor.
     if k > 0:
         region = remove_upper_sides(rasters.grid, plan, region, places)
     passages = find_passages(plan, clearance, region, probability)
@@ -156,6 +159,7 @@ def segment_storey(
         odds = compute_door_log_odds(region, plan.edge, passages, placed)
         passages = {pair: replace(passage, log_odds=odds[pair]) for pair, passage in passages.items()}
     growing = GrowingRooms(region, clearance, passages, plan.edge, score_by_plan)
+    # By the plan alone: walls are unrolled along the segments that this leaves (docs/adr/0024).
     while growing.door_probability and growing.door_probability[pair := growing.weakest()] <= narrow:
         growing.merge(pair)
     names = np.unique(growing.of_region[region[region >= 0]])
@@ -188,7 +192,7 @@ def find_segments(storeys: Sequence[SegmentedStorey], places: Array) -> Array:
 
 
 def score_by_plan(x: Array, passages: Sequence[Passage]) -> Array:
-    """(n,) probability of a door in each passage by the plan, and by what the maps say that were joined.
+    """Return (n,) probability of a door in each passage by the plan, and by what the maps say that were joined.
 
     Args:
         x: (n, 17) `DOOR_FEATURES` of the sides as they have grown.
@@ -198,7 +202,7 @@ def score_by_plan(x: Array, passages: Sequence[Passage]) -> Array:
 
 
 def log_odds(probability: Array) -> Array:
-    """(n,) of probabilities, which are taken for no surer than `SUREST_DOOR`."""
+    """Return (n,) of probabilities, which are taken for no surer than `SUREST_DOOR`."""
     sure = np.clip(probability, SUREST_DOOR, 1 - SUREST_DOOR)
     return np.log(sure / (1 - sure))
 
@@ -268,6 +272,7 @@ class GrowingRooms:
             del self.door_probability[old]
             known = self.passages.get(new)
             self.passages[new] = passage if known is None else joined(passage, known)
+        # The merger changed width and area of one side, by which its other doors are judged (docs/adr/0004).
         self._score(sorted(sort_pair(room, other) for other in self.neighbours[room]))
 
 
@@ -309,8 +314,10 @@ def partition_rooms(storey: SegmentedStorey, score: Scorer, door: float, least: 
     rooms = GrowingRooms(segment, storey.clearance, storey.passages, edge, score)
     merges: list[Merge] = []
     while rooms.door_probability and rooms.door_probability[pair := rooms.weakest()] <= door:
+        # Kept, as a lower cut of the same tree gives the zones (docs/adr/0047).
         merges.append((*pair, rooms.door_probability[pair]))
         rooms.merge(pair)
+    # Part of the cut: as a step after it, rooms of flats were lost (recall .862 to .807, docs/adr/0024).
     while (small := find_too_small(rooms, least)) is not None:
         merges.append((*small, rooms.door_probability[small]))
         rooms.merge(small)
@@ -346,7 +353,7 @@ def find_too_small(rooms: GrowingRooms, least: float) -> Pair | None:
 
 
 def find_rooms_of_segments(storeys: Sequence[PartitionedStorey], numbers: Array) -> Array:
-    """(n,) room of the map of each segment of all storeys, -1 none.
+    """Return (n,) room of the map of each segment of all storeys, -1 none.
 
     Args:
         numbers: (R,) of the rooms that have a floor, as they are numbered on from storey to storey

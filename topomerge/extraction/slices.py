@@ -23,6 +23,8 @@ FLOOR_SHARE = 0.7  # of the columns of a floor lie in such areas; of slices 0 to
 ENCLOSED_SHARE = 0.75  # of the directions in which a place inside sees a wall
 SIGHT_DIRECTIONS = 24
 SIGHT_RANGE = 15.0  # m
+# A slice has one point in a column where a scan has dozens: a single one at the edge of a leaf became a wall that shut the door.
+# Most missed doors of slices were shut so (docs/adr/0018).
 SEEN_THROUGH = 20  # rays through a column for each that ends in it: what hangs there is no wall
 FEW_POINTS = 0.25  # of the usual number in the columns around, where rays are unknown: likewise
 COLUMNS_AROUND = 0.3  # m
@@ -77,7 +79,7 @@ def is_raised(grid: VoxelGrid) -> bool:
 
 
 def _measure_extent(grid: VoxelGrid) -> tuple[int, int]:
-    """The lowest and the highest level, but for single points."""
+    """Return the lowest and the highest level, but for single points."""
     below = np.cumsum(np.bincount(grid.cells[:, 2]))
     low, high = np.searchsorted(below, (int(0.01 * len(grid)), int(0.99 * (len(grid) - 1))), side="right").tolist()
     return low, high
@@ -118,7 +120,7 @@ def _extrude_slice(grid: VoxelGrid, rays: tuple[Array, Array] | None) -> VoxelGr
 
 
 def _count_column_rays(grid: VoxelGrid, starts: Array, ends: Array) -> tuple[Array, Array]:
-    """(nx, ny) how many rays go through each column and how many end in it, seen from above."""
+    """Return (nx, ny) how many rays go through each column and how many end in it, seen from above."""
     passed, met = np.zeros(grid.shape[:2], np.int32), np.zeros(grid.shape[:2], np.int32)
     at, to = ((np.asarray(p, np.float64)[:, :2] - grid.origin[:2]) / grid.edge for p in (starts, ends))
     count_rays(np.ascontiguousarray(at), np.ascontiguousarray(to), 1.0, passed, met)
@@ -126,7 +128,7 @@ def _count_column_rays(grid: VoxelGrid, starts: Array, ends: Array) -> tuple[Arr
 
 
 def _find_filled_columns(points: Array, edge: float) -> Array:
-    """(nx, ny) columns that hold about as many points (nx, ny) as others around them: single ones hang in doorways."""
+    """Return (nx, ny) columns that hold about as many points (nx, ny) as others around them: single ones hang in doorways."""
     size = 2 * round(COLUMNS_AROUND / edge) + 1
     some = points > 0
     near = ndimage.uniform_filter(some.astype(float), size, mode="constant")

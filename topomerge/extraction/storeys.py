@@ -61,8 +61,8 @@ def find_storeys(navigable: VoxelGrid, floor_to_ceiling: Array) -> tuple[Array, 
 
 
 def _find_stacked_level(navigable: VoxelGrid, lowest: Array, storey: Array, floors: list[int]) -> int | None:
-    """The level of floor that lies above other floor of the same storey, as the half levels of one side of a house do; None where
-    there is less of it than of a gallery, or where it is not level."""
+    """Return the level of floor that lies above other floor of the same storey, as the half levels of one side of a house do;
+    None where there is less of it than of a gallery, or where it is not level."""
     x, y, z = navigable.cells[lowest].T.astype(np.int64)
     order = np.lexsort((z, y, x, storey))
     same = (np.diff(np.column_stack([storey, x, y])[order], axis=0) == 0).all(axis=1)
@@ -95,7 +95,8 @@ def _assign_storeys(
 
 
 def measure_floor_to_ceiling(grid: VoxelGrid, navigable: VoxelGrid, body_height: float, rows: Array | None = None) -> Array:
-    """(m,) m of empty space between each navigable cell, or those of some rows, and the first occupied one above; 0: none is."""
+    """Return (m,) m of empty space between each navigable cell, or those of some rows, and the first occupied one above; 0: none
+    is."""
     start = max(int(body_height / grid.edge), 1)
     limit = int(HIGHEST_CEILING / grid.edge)
     cells = navigable.cells if rows is None else navigable.cells[rows]
@@ -167,7 +168,7 @@ def find_rows_below(standing: VoxelGrid, places: Array) -> Array:
 
 
 def _is_on_wall(grid: VoxelGrid, cells: Array) -> Array:
-    """(m,) bool: is much of the metre below filled, here or in a neighbouring column?"""
+    """Return (m,) bool: is much of the metre below filled, here or in a neighbouring column?"""
     depth = max(int(1.0 / grid.edge), 1)
     return count_levels_below(*grid._bricks, cells, 1, depth) >= SOLID_SHARE * depth
 

@@ -116,7 +116,7 @@ def _measure_steepness(places: Array) -> float:
 
 
 def _select_distinct_doors(edges: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
-    """The edges of one pair of rooms, without those that lead through the same door as a wider one."""
+    """Return the edges of one pair of rooms, without those that lead through the same door as a wider one."""
     distinct: list[tuple[Any, ...]] = []
     for edge in sorted(edges, key=lambda e: (-e[2], e[1])):
         if all(np.linalg.norm(np.subtract(edge[1], other[1])) > max(SAME_DOOR_DISTANCE, other[2] / 2) for other in distinct):
@@ -164,7 +164,7 @@ def _find_rows_under(navigable: VoxelGrid, middle: Array, contact: Array) -> Arr
 
 
 def _find_columns(cells: Array) -> Array:
-    """(k, 2) columns of cells, each once, ascending."""
+    """Return (k, 2) columns of cells, each once, ascending."""
     size = int(cells[:, 1].max()) + 1
     codes = np.unique(cells[:, 0].astype(np.int64) * size + cells[:, 1])
     return np.column_stack([codes // size, codes % size]).astype(cells.dtype)
@@ -235,7 +235,7 @@ def _split_at_pass(clearance: Array, first: int, second: int) -> tuple[Array, Ar
 
 
 def _rasterise_rooms(navigable: VoxelGrid, room: Array, low: Array, size: Array, contact: Array) -> Array:
-    """(size) room of each column of a window at `low`, at the height of the contact; -1 where nobody can stand."""
+    """Return (size) room of each column of a window at `low`, at the height of the contact; -1 where nobody can stand."""
     reach = int(LEVEL_HEIGHT / navigable.edge)
     middle = round(float(contact[:, 2].mean()))
     levels = np.arange(middle - reach, middle + reach + 1)
@@ -247,7 +247,7 @@ def _rasterise_rooms(navigable: VoxelGrid, room: Array, low: Array, size: Array,
 
 
 def _find_middle_cell(first: Array, second: Array, way: Array) -> Array | None:
-    """The cell of `way` halfway between two parts on the shortest connection."""
+    """Return the cell of `way` halfway between two parts on the shortest connection."""
     steps = [count_steps(part, way) for part in (first, second)]
     total = np.where((steps[0] > 0) & (steps[1] > 0), steps[0] + steps[1], np.iinfo(np.int64).max)
     if not (total < np.iinfo(np.int64).max).any():
@@ -308,6 +308,7 @@ def build_topometric_map(grid: VoxelGrid, floor: Floor, body_height: float, know
     areas, area, old_area = _build_areas(floor, label, area)
     owner = areas["room"]
     narrows = find_edges(floor, area, storey[owner], above, lambda a, b: (owner[a] == owner[b]) & fresh[owner[a]])
+    # How surely two areas are one room, so that zones can be cut without extracting again (docs/adr/0047).
     narrows["confidence"] = compute_merge_levels(floor.merges, old_area[narrows["rooms"]])
     return TopometricMap(grid, room, floor.cells, label, rooms, edges, floor.storeys, areas, area, narrows)
 
@@ -319,7 +320,7 @@ def select_rooms_with_floor(floor: Floor) -> Array:
 
 
 def _build_areas(floor: Floor, label: Array, area: Array) -> tuple[Array, Array, Array]:
-    """(A,) AREA_DTYPE, the areas renumbered, and (A,) the numbers that they had."""
+    """Return (A,) AREA_DTYPE, the areas renumbered, and (A,) the numbers that they had."""
     numbers = np.unique(area[area >= 0])
     number = np.append(np.searchsorted(numbers, np.arange(int(area.max(initial=-1)) + 1)), -1)
     area = number[area].astype(np.int32)
@@ -337,7 +338,7 @@ def _build_areas(floor: Floor, label: Array, area: Array) -> tuple[Array, Array,
 
 
 def _measure_rooms(grid: VoxelGrid, room: Array, floor: Floor, label: Array, above: Array, numbers: Array) -> Array:
-    """(R,) ROOM_DTYPE; `numbers` (R,) are those of the floor's rooms."""
+    """Return (R,) ROOM_DTYPE; `numbers` (R,) are those of the floor's rooms."""
     count = int(label.max(initial=-1)) + 1
     cells = floor.cells
     rooms = np.zeros(count, ROOM_DTYPE)

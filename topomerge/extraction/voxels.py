@@ -127,7 +127,7 @@ class LatticeCells:
 
 
 def _choose_origin(points: Array, shift: Array, edge: float) -> Array | None:
-    """(3,) cell far below the middle of a chunk, a multiple of 16; None of a chunk without a finite point."""
+    """Return (3,) cell far below the middle of a chunk, a multiple of 16; None of a chunk without a finite point."""
     for step in (max(len(points) // ORIGIN_POINTS, 1), 1):
         some = points[::step]
         some = some[np.isfinite(some).all(axis=1)]

@@ -43,6 +43,7 @@ def unroll_walls(
     """
     if scan.fine is None or not any(storey.count for storey in storeys):
         return None
+    # Of segments, before rooms exist: so doors on walls have a say in the only cut (docs/adr/0024).
     first, rows = 0, []
     for storey in storeys:
         rows += _faces_of(scan.grid, rasters, storey, first)
@@ -61,6 +62,7 @@ def find_doorways(elevations: Elevations, doors: Array, locate: Locate) -> Array
     Args:
         doors: (n / 2, 3) of `compute_door_probabilities`.
     """
+    # A strip goes on past its face: a doorway there is of the room before it, not of that whose wall is in line (docs/adr/0018).
     found = detect_doorways(elevations, doors, _sides_before(elevations, locate))
     found = found[found["rooms"][:, 0] >= 0].copy()
     for k in np.flatnonzero(found["rooms"][:, 1] < 0).tolist():
@@ -79,6 +81,7 @@ def relabel_walls(walls: StoreyWalls, number: Array) -> StoreyWalls:
     """
     number = np.append(number, -1)
     faces, doorways = walls.elevations.faces.copy(), walls.doorways.copy()
+    # Read once: what walls lie beside is only named anew (docs/adr/0024).
     faces["room"] = number[faces["room"]]
     sides = number[doorways["rooms"]]
     sides[sides[:, 0] == sides[:, 1], 1] = -1
@@ -122,7 +125,7 @@ def _faces_of(grid: VoxelGrid, rasters: RasterisedStoreys, storey: SegmentedStor
 
 
 def _sides_before(elevations: Elevations, locate: Locate) -> Array:
-    """(n / 2, 3) int64 what lies under spots before each place along all strips, -1 none."""
+    """Return (n / 2, 3) int64 what lies under spots before each place along all strips, -1 none."""
     sizes = np.diff(elevations.first) // PLACES
     face = elevations.faces[np.repeat(np.arange(len(sizes)), sizes)]
     along = (np.arange(len(face)) - np.repeat(elevations.first[:-1] // PLACES, sizes) + 0.5) * (PLACES * ALONG)
@@ -131,7 +134,7 @@ def _sides_before(elevations: Elevations, locate: Locate) -> Array:
 
 
 def _sample_places_behind(way: Array) -> Array:
-    """(k, 3) m, behind a doorway as its first side sees it."""
+    """Return (k, 3) m, behind a doorway as its first side sees it."""
     steps = np.arange(BEYOND[0], BEYOND[1] + 0.05, 0.1)
     aside = np.array([-way["out"][1], way["out"][0]]) * float(way["width"]) / 4
     places = way["centre"][:2] + aside * np.array([[-1.0], [0.0], [1.0]]) + steps[:, None, None] * way["out"]

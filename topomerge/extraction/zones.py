@@ -14,6 +14,8 @@ from scipy.spatial import cKDTree
 from topomerge.extraction.plans.storey_plan import Merge
 from topomerge.types import Array, TopometricMap, select_lowest_of_column
 
+# Down to .1 the tree gives more, but then a piece of floor in an opening parts a cubicle from its aisle, and their door is
+# lost (docs/adr/0047).
 ZONE_LEVEL = 0.2  # up to this probability of a door between them two areas are one zone
 
 
@@ -72,6 +74,7 @@ def cut_zones(map: TopometricMap, level: float = ZONE_LEVEL) -> TopometricMap:
     count = int(zone.max(initial=-1)) + 1
     owner = np.append(np.zeros(count, np.int64), bare)
     owner[zone] = map.areas["room"]
+    # No least size: zones below 1 m2 as parts of their neighbour lose (IoU .788 for .814: docs/adr/0047).
     order = np.argsort(owner, kind="stable")
     number, owner = np.argsort(order), owner[order]
     zone = number[zone]
@@ -124,7 +127,7 @@ class _ZonePlaces:
 
 
 def _measure_zones(map: TopometricMap, floor: Array, cells: Array, owner: Array) -> Array:
-    """(Z,) ROOM_DTYPE: what is known of the room of each zone, with the measures of its own floor and cells."""
+    """Return (Z,) ROOM_DTYPE: what is known of the room of each zone, with the measures of its own floor and cells."""
     rooms, lowest = map.rooms[owner].copy(), select_lowest_of_column(map.navigable)
     middles, edge = map.navigable.compute_centroids(), map.grid.edge
     floors = np.bincount(floor[lowest][floor[lowest] >= 0], minlength=len(owner))

@@ -1,4 +1,4 @@
-"""What somebody decided about a merge, in the journal of its folder: maps that belong together or not, and where they lie."""
+"""Decisions of a user about a merge, in the journal of its folder: maps that belong together or not, and where they lie."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Pair = tuple[int, int]
 
 @dataclass(frozen=True)
 class Decisions:
-    """What was decided of the pairs of some maps.
+    """Decisions about pairs of maps.
 
     Args:
         poses: of maps i < j -> T_ij that is fixed, or None where they do not belong together.

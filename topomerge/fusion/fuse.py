@@ -112,7 +112,7 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
 
 @dataclass(frozen=True)
 class _Part:
-    """What is asked of a map before it is fused: number of provenance bits, edge length in the joined frame, m, and whether its
+    """A map as it is prepared for fusion: number of provenance bits, edge length in the joined frame, m, and whether its
     heights were assumed."""
 
     bits: int
@@ -135,7 +135,7 @@ def _choose_edge(parts: Sequence[_Part]) -> float:
 
 
 class _JoinedCells:
-    """What is joined so far: cells by their Morton codes, ascending, which maps saw them, the room of a map that they are of
+    """Cells that are joined so far: their Morton codes, ascending, which maps saw them, the room of a map that they are of
     (numbered through all maps, -1 none), and where in them their points lie on average (0..1), as how many points say; codes of
     the free cells, which are twice as long.
 
@@ -180,6 +180,7 @@ class _JoinedCells:
         room = map.room[rows].astype(np.int64)
         room = np.where(room >= 0, room + first_room, -1)
         means, points = transform_means(map.grid, placement, rows, cells, self.origin, self.edge)
+        # Walls that were raised from a slice are a guess: they go where no other map has any near (docs/adr/0020).
         if assumed and len(cells):
             added = self._is_occupied(cells) | ~(self._is_surveyed(cells) | self._is_seen_through(cells))
             cells, provenance, room, means, points = cells[added], provenance[added], room[added], means[added], points[added]
@@ -207,26 +208,29 @@ class _JoinedCells:
         labels[row[:before][kept]] = self.room[kept]
         self.room = labels
         means, points = np.concatenate([self.means, means]), np.concatenate([self.points, points])
+        # Means of both maps: so a wall lies within 6 mm of its points and is registered as well as one of a scan (docs/adr/0014).
         self.points = np.bincount(row, points, len(joined))
         total = np.column_stack([np.bincount(row, points * means[:, k], len(joined)) for k in range(3)])
         self.means = np.where(self.points[:, None] > 0, total / np.maximum(self.points, 1e-9)[:, None], 0.5)
 
     def convert_means(self) -> Array:
-        """(n, 3) where the points of each cell lie on average, never on its border: rounding may take that for the next cell."""
+        """Return (n, 3) where the points of each cell lie on average, never on its border: rounding may take that for the next
+        cell."""
         steps = np.minimum(self.means * OFFSET_STEPS, OFFSET_STEPS - 1).astype(np.int64)
         middles: Array = self.origin + (decode_cells(self.codes) + (steps + 0.5) / OFFSET_STEPS) * self.edge
         return middles
 
     def _is_occupied(self, cells: Array) -> Array:
-        """(n,) bool: is a cell there already?"""
+        """Return (n,) bool: is a cell there already?"""
         return np.isin(encode_cells(cells), self.codes)
 
     def _is_seen_through(self, cells: Array) -> Array:
-        """(n,) bool: do cells lie where rays went?"""
+        """Return (n,) bool: do cells lie where rays went?"""
         return np.isin(encode_cells(cells // 2), self.free_codes)
 
     def _is_surveyed(self, cells: Array) -> Array:
-        """(n,) bool: have the columns of cells, at the heights between the lowest and the highest of them, anything near?"""
+        """Return (n,) bool: have the columns of cells, at the heights between the lowest and the highest of them, anything
+        near?"""
         occupied = decode_cells(self.codes)
         low, high = cells[:, 2].min(), cells[:, 2].max()
         occupied = occupied[(occupied[:, 2] >= low - 3) & (occupied[:, 2] <= high + 3)]
@@ -261,6 +265,7 @@ def _build_joined(
         map = _carry_rooms(grid, label, floors, parts)
         map = replace(map, source=name)
     else:
+        # No part has a room that could be carried over (docs/adr/0038).
         map = extract(grid, name=name, carve=False)
         # Floors that the extraction assumes under slices are cells that no map saw.
         rows = grid.find_rows(grid.locate(map.grid.compute_centroids()))
@@ -274,7 +279,7 @@ def _build_joined(
 
 
 def _build_free_space(joined: _JoinedCells, grid: VoxelGrid, base: Array) -> VoxelGrid | None:
-    """What a part saw empty and none occupied; None where no part knows any.
+    """Build the grid of cells that a part saw empty and none occupied; None where no part knows any.
 
     Args:
         base: (3,) cell of the lattice at the corner of the grid.
@@ -301,6 +306,7 @@ def _carry_rooms(grid: VoxelGrid, label: Array, floors: Sequence[PartFloor], par
     member = np.where(found.member >= 0, number[found.member], -1)
     map, known = add_carried_odds(map, tables, member, found.share)
     map = add_room_probabilities(map, raised=is_raised(grid), asked=~known)
+    # None for walls: faces of two maps differ by more than a leaf lies back, so doors read off them are worse (docs/adr/0014).
     map = select_distinct_doors(add_wall_doors(map, found.floor.classified_storeys, None))
     assert map.navigable_area is not None
     area = np.append(_number_anew(found.floor.area, map.navigable_area), -1)[found.area_member]
@@ -313,7 +319,7 @@ def _carry_rooms(grid: VoxelGrid, label: Array, floors: Sequence[PartFloor], par
 
 
 def _number_anew(old: Array, new: Array) -> Array:
-    """(n + 1,) new number of each old one, -1 where there is none."""
+    """Return (n + 1,) new number of each old one, -1 where there is none."""
     out = np.full(int(old.max(initial=-1)) + 2, -1)
     out[old] = new
     out[-1] = -1

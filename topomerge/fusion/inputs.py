@@ -1,4 +1,4 @@
-"""What two maps or many must be to be merged, and what a user should know of them before."""
+"""Checks of the maps that are to be merged, two or many, and warnings for the user."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from topomerge.types import TopometricMap
 MERGE_SCALES = ("fixed", "free")
 POSE_SOURCES = ("search", "rooms", "surfaces")
 FEW_MAPS = 11  # of which each is registered with all others
+# Among many strangers those that lie best lie well by chance (docs/adr/0019).
 LINK_BELIEVED = (0.8, 0.9)  # of few maps; of more, where those that look most alike are sought out among many strangers
 UNIT_SPAN = 300.0  # m, and
 UNIT_RATIO = 30.0  # times the other map: a map that spans this is in another unit
@@ -65,8 +66,8 @@ def resolve_threshold(threshold: float | None) -> float:
 
 
 def resolve_link_threshold(threshold: float | None, maps: int = 2) -> float:
-    """The probability from which a link of an atlas is believed: at least `LINK_BELIEVED` where none is asked for, as a wrong
-    link drags all that hangs on it.
+    """Return the probability from which a link of an atlas is believed: at least `LINK_BELIEVED` where none is asked for, as a
+    wrong link drags all that hangs on it.
 
     Args:
         maps: how many the atlas holds.
@@ -79,8 +80,8 @@ def resolve_link_threshold(threshold: float | None, maps: int = 2) -> float:
 
 
 def find_risk_threshold(risk: float) -> float:
-    """The probability from which a merge is believed so that at most `risk` of a thousand pairs, drawn by the stated priors
-    (docs/method.md), are merged falsely, as left-out training pairs show it.
+    """Return the probability from which a merge is believed so that at most `risk` of a thousand pairs, drawn by the stated
+    priors (docs/method.md), are merged falsely, as left-out training pairs show it.
 
     Raises:
         InputError: a risk that no threshold can promise.

@@ -128,18 +128,18 @@ class _Columns:
         self.rows = [self.navigable.find_rows(floor.cells) for floor in floors]  # of the parts' cells
 
     def number(self, storey: Array, cells: Array) -> Array:
-        """(k,) numbers of the columns of cells."""
+        """Return (k,) numbers of the columns of cells."""
         x, y = cells[:, 0].astype(np.int64), cells[:, 1].astype(np.int64)
         out: Array = (storey.astype(np.int64) * (self.grid.shape[0] + 1) + x) * (self.grid.shape[1] + 1) + y
         return out
 
     def find(self, numbers: Array) -> Array:
-        """(k,) which column has a number, -1 none."""
+        """Return (k,) which column has a number, -1 none."""
         at = np.minimum(np.searchsorted(self.numbers, numbers), len(self.numbers) - 1)
         return np.where(self.numbers[at] == numbers, at, -1)
 
     def claim(self, floors: Sequence[PartFloor], values: Sequence[Array]) -> Array:
-        """(parts, columns) what each part has on its lowest floor in each column, -1 nothing."""
+        """Return (parts, columns) what each part has on its lowest floor in each column, -1 nothing."""
         out = np.full((len(floors), len(self.numbers)), -1, np.int64)
         for claimed, floor, rows, value in zip(out, floors, self.rows, values, strict=True):
             order = np.argsort(-floor.cells[:, 2], kind="stable")  # the lowest is written last
@@ -147,7 +147,7 @@ class _Columns:
         return out
 
     def find_contacts(self, owner: Array) -> tuple[Array, Array]:
-        """(k, 2) pairs of owners of columns beside each other, and how many of these."""
+        """Return (k, 2) pairs of owners of columns beside each other, and how many of these."""
         pairs = []
         for step in (1, self.grid.shape[1] + 1):
             other = self.find(self.numbers + step)
@@ -157,7 +157,7 @@ class _Columns:
 
 
 def find_common_floor(claims: Array) -> tuple[Array, Array]:
-    """(k, 2) rooms of two parts that have floor in common, and of how many columns.
+    """Return (k, 2) rooms of two parts that have floor in common, and of how many columns.
 
     Args:
         claims: (parts, columns) room of each, numbered through all parts, -1 none.
@@ -167,7 +167,7 @@ def find_common_floor(claims: Array) -> tuple[Array, Array]:
 
 
 def _count_pairs(pairs: Array) -> tuple[Array, Array]:
-    """(k, 2) those of pairs (n, 2) of numbers that there are, ascending, and how often."""
+    """Return (k, 2) those of pairs (n, 2) of numbers that there are, ascending, and how often."""
     most = int(pairs.max(initial=0)) + 1
     keys, counts = np.unique(pairs[:, 0] * most + pairs[:, 1], return_counts=True)
     return np.column_stack([keys // most, keys % most]), counts
@@ -194,6 +194,7 @@ def unite_rooms(claims: Array, entered: Array, part_of: Array, column: float) ->
     share = common / np.maximum(area[pairs].min(axis=1), 1e-9)
     same = share >= SAME_SHARE
     partly = ~same & (share >= DOUBT_SHARE) & (common >= DOUBT_AREA)
+    # Else a glimpsed outline of 16 m2 takes a room of 5 m2 (docs/adr/0038).
     beyond = (area[pairs] - common[:, None] >= PIECE_AREA) & ~entered[pairs] & entered[pairs[:, ::-1]]
     doubtful = {int(r) for r in pairs[partly | (same & beyond.any(axis=1))].ravel()}
     group = np.arange(len(entered))
@@ -210,13 +211,14 @@ def unite_rooms(claims: Array, entered: Array, part_of: Array, column: float) ->
     names, group = np.unique(group, return_inverse=True)
     pieces = np.zeros((len(names), int(part_of.max(initial=-1)) + 1), np.int64)
     np.add.at(pieces, (group, part_of), area >= PIECE_AREA)
+    # A map that is sure of one large room would take both rooms of a map that glimpsed two (docs/adr/0038).
     doubt = np.asarray((pieces > 1).any(axis=1))
     doubt[group[sorted(doubtful)]] = True
     return group, doubt
 
 
 def _unite_areas(claims: Array, group_of: Array) -> Array:
-    """(n,) area of the joined map of each area of the parts: those of one group that share their floor are one."""
+    """Return (n,) area of the joined map of each area of the parts: those of one group that share their floor are one."""
     size = np.bincount(claims[claims >= 0], minlength=len(group_of))
     pairs, common = find_common_floor(claims)
     one = (common >= SAME_SHARE * size[pairs].min(axis=1)) & (group_of[pairs[:, 0]] == group_of[pairs[:, 1]])
@@ -250,6 +252,7 @@ def join_rooms(
     total = np.bincount(owner, minlength=len(doubt))
     doubt |= (total * grid.edge**2 < LEAST_ROOM) | _find_unknown_borders(columns, owner, group, part_of)
     for floor in floors:
+        # Floor of the thesis' preset ends before the walls (docs/adr/0038).
         doubt[group[floor.room]] |= not floor.complete
     number = np.where(doubt, -1, np.cumsum(~doubt) - 1)
     member, owner = number[group], number[owner]
@@ -265,7 +268,7 @@ def join_rooms(
 
 
 def _find_unknown_borders(columns: _Columns, owner: Array, group: Array, part_of: Array) -> Array:
-    """(groups,) bool: does a group have a border with another one, of which no part has both?"""
+    """Return (groups,) bool: does a group have a border with another one, of which no part has both?"""
     pairs, contact = columns.find_contacts(owner)
     pairs = pairs[contact * columns.grid.edge >= LEAST_CONTACT]
     has = np.zeros((int(part_of.max(initial=-1)) + 1, int(group.max(initial=-1)) + 1), bool)
@@ -307,6 +310,7 @@ def _add_fresh_rooms(cut: CutFloor, columns: _Columns, owner: Array, parts: Sequ
     redone = owner[columns.column] < 0
     near = np.zeros((grid.shape[0], grid.shape[1]), bool)
     near[tuple(navigable.cells[redone, :2].T)] = True
+    # The plan network's look was a third of a joined map's time: it looks only where the parts disagree (docs/adr/0038).
     near = edt.edt(~near, parallel=1) * grid.edge <= AROUND
     rows = np.flatnonzero(near[tuple(grid.cells[:, :2].T)])
     standing = redone & navigable.properties["standing"]
@@ -336,7 +340,7 @@ def _add_fresh_rooms(cut: CutFloor, columns: _Columns, owner: Array, parts: Sequ
 
 
 def _build_floor(cut: CutFloor, columns: _Columns, carried: int) -> Floor:
-    """The floor as one grid; of its rooms the first ones are carried over."""
+    """Return the floor as one grid; of its rooms the first ones are carried over."""
     floor, storeys, of_cell = join_floor(columns.grid, columns.storeys, cut.cells, cut.tables)
     doors, merges = (cut.fresh.door_probability, cut.fresh.merges) if cut.fresh else ({}, ())
     first = len(cut.room_of_area) - (len(cut.fresh.room_of_area) if cut.fresh else 0)

@@ -68,9 +68,9 @@ def load_belief_weights(method: str) -> Array:
 
 
 def compute_belief_features(matching: Matching, a: TopometricMap, b: TopometricMap, seen: Places) -> Array:
-    """(M, 6) of each match: 1, log odds by matching, what all places say, what those around the room of a say (mean log odds;
-    0 of none), share 0..1 of the floor of the smaller room that lies on the other, and that share times the probability of all
-    places: rooms lie on each other under many a wrong pose."""
+    """Return (M, 6) of each match: 1, log odds by matching, what all places say, what those around the room of a say (mean log
+    odds; 0 of none), share 0..1 of the floor of the smaller room that lies on the other, and that share times the probability of
+    all places: rooms lie on each other under many a wrong pose."""
     whole_features = seen.features
     p = np.clip(matching.probability, SUREST, 1 - SUREST)
     whole = np.full(len(p), whole_features["place_mean"] * np.log1p(whole_features["place_area"] / PLACE_AREA))

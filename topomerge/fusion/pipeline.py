@@ -140,7 +140,8 @@ def list_posterior(registration: Registration) -> list[tuple[str, str]]:
 
 
 def _list_winner_evidence(f: Mapping[str, float]) -> list[Row]:
-    """What only the best hypothesis was asked (`compute_winner_features`); joined maps of older versions do not have it."""
+    """List the evidence that is computed for the best hypothesis only (`compute_winner_features`); joined maps of older versions
+    do not have it."""
     if "moved_walls" not in f:
         return []
     rows = [
@@ -253,6 +254,7 @@ def place_pair(maps: Sequence[TopometricMap], config: MergeConfig, prepared: Seq
     describe = _TimedDescriptor(config.embedder or DEFAULT, watch, config.poses == "rooms")
     fixed = config.decided.get((0, 1))
     searched = config.poses == "search" and fixed is None
+    # Rooms are matched only where walls do not suffice (docs/adr/0021).
     proposals = FallbackProposals(partial(_propose_room_poses, a, b, config, describe), threshold if searched else np.inf)
     choices: dict[str, Any] = {"rigid": config.rigid or fixed is not None, "same": config.same}
     tried = proposals if fixed is None else [fixed]
@@ -288,7 +290,7 @@ def _explain_pair(registration: Registration, threshold: float, config: MergeCon
 
 
 def _find_observations(a: TopometricMap, b: TopometricMap, registration: Registration, accepted: bool) -> list[Observation]:
-    """What would settle a merge that is refused, or of which another alternative is left."""
+    """Find observations that would settle a merge that is refused, or of which another alternative is left."""
     each = registration.posterior
     left = max((p for name, p in each.items() if name != "here"), default=0.0)
     if registration.transform is None or not registration.posterior or (accepted and left < LEFT_OPEN):
@@ -409,6 +411,7 @@ class _TimedDescriptor:
 
     def __init__(self, embedder: str | Descriptor, watch: Stopwatch, scales: bool) -> None:
         self.embedder, self.watch = embedder, watch
+        # The one that ships is opened when rooms are asked for, not before each merge (docs/adr/0050).
         if embedder != DEFAULT or scales:
             _ = self.describe  # says at once what is wrong with it
         if scales and hasattr(self.describe, "at_scales"):

@@ -115,7 +115,7 @@ def _add_measurement(
 
 
 def _compute_jacobian(pose: Sim3, points: Array) -> Array:
-    """(k, 3, 5) of the placed points by x, y, z, yaw and the logarithm of the scale."""
+    """Return (k, 3, 5) of the placed points by x, y, z, yaw and the logarithm of the scale."""
     turned = pose.apply(points) - np.array(pose.translation)
     jacobian = np.zeros((len(points), 3, 5))
     jacobian[:, [0, 1, 2], [0, 1, 2]] = 1.0
@@ -316,7 +316,7 @@ class Assembler:
         return rejected
 
     def _find_weakest_link(self, assembly: Assembly, pair: tuple[int, int]) -> tuple[int, int] | None:
-        """The link on the way between two maps that says most against their hypothesis."""
+        """Return the link on the way between two maps that says most against their hypothesis."""
         component = assembly.find_component(pair[0])
         links = [link for link in assembly.links if link.maps[0] in component]
         between = [link for link in links if len(set(pair) & set(split_component(component, assembly.links, link)[0])) == 1]

@@ -75,8 +75,9 @@ def _find_filled_cells(grid: VoxelGrid, chosen: slice, placement: Placement, ori
 
 
 def _linearise(bend: Deformation | None, cells: Array, places: Array, grid: VoxelGrid) -> tuple[Array, Array]:
-    """Where bending moves the middles (n, 3) of cells (n, 3) of a grid, and the bending about them as `kernels.resample` wants
-    it: (n, 8), or (0, 8) where nothing is bent. Of one storey it is the same for all cells of a column, and computed once."""
+    """Return where bending moves the middles (n, 3) of cells (n, 3) of a grid, and the bending about them as
+    `kernels.voxels.find_filled_cells` takes it: (n, 8), or (0, 8) where nothing is bent. Of one storey it is the same for all
+    cells of a column, and computed once."""
     if bend is None:
         return places, np.zeros((0, 8))
     if len(bend.fields) > 1:
@@ -100,8 +101,8 @@ def _linearise_places(bend: Deformation, places: Array, grid: VoxelGrid) -> tupl
 
 
 def _find_columns(cells: Array) -> tuple[Array, Array]:
-    """(c,) row of a cell (n, 3) of each column, and (n,) the column of each cell; each cell by itself where they are too thinly
-    spread for a raster."""
+    """Return (c,) row of a cell (n, 3) of each column, and (n,) the column of each cell; each cell by itself where they are too
+    thinly spread for a raster."""
     at = cells[:, :2].astype(np.int64)
     at -= at.min(axis=0)
     size = int(at[:, 0].max() + 1), int(at[:, 1].max() + 1)
@@ -137,7 +138,8 @@ def _find_slant(bend: Deformation | None, edge: float) -> float:
 def transform_means(
     grid: VoxelGrid, placement: Placement, rows: Array, cells: Array, origin: Array, edge: float
 ) -> tuple[Array, Array]:
-    """(n, 3) 0..1 where in the cells of a lattice the points of moved cells lie on average, and (n,) how many points say so.
+    """Return (n, 3) 0..1 where in the cells of a lattice the points of moved cells lie on average, and (n,) how many points say
+    so.
 
     The mean of a moved cell that fills a neighbour, too, lies outside of that: there its nearest place in the cell is taken, and
     counts little. Of cells whose points are not known nothing is said.
@@ -172,7 +174,7 @@ def decode_cells(codes: Array) -> Array:
 
 
 def find_wall_copies(first: Seen, second: Seen, edge: float) -> Array:
-    """(n,) int64 row of the cell of the first map's wall of which each cell of the second map is a copy, -1 none.
+    """Return (n,) int64 row of the cell of the first map's wall of which each cell of the second map is a copy, -1 none.
 
     Args:
         first, second: cells (n, 3) of one lattice that a map shows, and the free cells (m, 3), twice as long, of the lattice on
@@ -199,7 +201,7 @@ def find_wall_copies(first: Seen, second: Seen, edge: float) -> Array:
 
 
 def _build_table(cells: Array, size: Array) -> tuple[Array, Array]:
-    """`kernels.lookup` of those cells that lie in a volume of so many cells."""
+    """Build the look-up (`kernels.voxels.build`) of those cells that lie in a volume of so many cells."""
     inside = ((cells >= 0) & (cells < size)).all(axis=1)
     x, y, z = size.tolist()
     return build(np.ascontiguousarray(cells[inside]), (x, y, z))

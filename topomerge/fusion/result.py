@@ -1,4 +1,4 @@
-"""What a merge gives: whether two maps belong together, where, which rooms are the same, and the joined map."""
+"""The result of a merge: whether two maps belong together, where, which rooms are the same, and the joined map."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ class RoomMatch:
 
 @dataclass(frozen=True, eq=False)
 class MergeResult:
-    """What `merge` gives.
+    """The result of `merge`.
 
     Args:
         status: "merged" or "abstained".

@@ -1,4 +1,5 @@
-"""What the maps know that were joined -> the joined map: doors, windows, landmarks, and who was in the rooms (method 4)."""
+"""Transfer knowledge of the maps that were joined to the joined map: doors, windows, landmarks, and who was in the rooms (method
+4)."""
 
 from __future__ import annotations
 
@@ -27,7 +28,7 @@ LEAST_COVER = 0.3  # of a joined room's floor, from which on a part knows who wa
 
 
 class PlacedPart(NamedTuple):
-    """What of a part is needed once it is joined: its rooms, ROOM_DTYPE of them, and its doors and openings as they lie in the
+    """A part as it is kept once it is joined: its rooms, ROOM_DTYPE of them, and its doors and openings as they lie in the
     joined map, EDGE_DTYPE with the part's rooms; likewise its narrowings, with the part's areas."""
 
     rooms: PartRooms
@@ -114,7 +115,7 @@ def transform_floor(part: TopometricMap, placement: Placement) -> tuple[Array, A
 
 @dataclass(frozen=True, eq=False)
 class _PlacedFloor:
-    """What a part says of doors, in the joined map.
+    """The floor and doors of a part, in the joined map.
 
     Args:
         floor: tree of the floor of its rooms, (k, 3) m.
@@ -193,6 +194,7 @@ def add_part_odds(joined: TopometricMap, parts: Sequence[PartRooms]) -> Topometr
         present = room >= 0
         places = np.bincount(room[present], minlength=count)
         mean = np.bincount(room[present], part.entered[part.room[present]], count) / np.maximum(places, 1)
+        # By the surest part 94 % of 884 joined rooms are told right, by the joined outline 87 % (docs/adr/0020).
         entered = np.where(places * part.area >= LEAST_COVER * area, np.maximum(entered, mean), entered)
     rooms = joined.rooms.copy()
     rooms["entered"] = np.where(entered >= 0, entered, rooms["entered"])

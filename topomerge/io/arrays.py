@@ -103,7 +103,7 @@ def _read_member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) ->
 
 
 def _build_piece(path: Path, name: str, arrays: dict[str, Array]) -> Piece:
-    """The arrays of an archive as a piece, their shapes checked."""
+    """Return the arrays of an archive as a piece, their shapes checked."""
     points = arrays[name]
     _check_points(path, name, points.shape)
     columns = {c: next((arrays[n] for n in names if n in arrays), None) for c, names in (("c", COLOR_NAMES), ("l", LABEL_NAMES))}

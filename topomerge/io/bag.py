@@ -76,7 +76,7 @@ def _read_first_message(bag: Bag, topic: Topic) -> Any:
 
 
 def _read_camera(bag: Bag, topic: Topic) -> Camera:
-    """The camera of a topic of images, as its CameraInfo states it after rectification (P), else before (K)."""
+    """Return the camera of a topic of images, as its CameraInfo states it after rectification (P), else before (K)."""
     companion = bag.find_topic(
         topic.name.removesuffix(TRANSPORT).removesuffix(PACKED).rstrip("/").rpartition("/")[0] + "/camera_info"
     )
@@ -107,7 +107,7 @@ def _decode_camera(bag: Bag, beside: Topic) -> Camera:
 
 
 def _decode_image(path: Path, message: Message) -> tuple[Array, float]:
-    """(h, w) values of an Image, and how many of them are a metre."""
+    """Return (h, w) values of an Image, and how many of them are a metre."""
     image = message.content
     if image.encoding not in ENCODINGS:
         able = " or ".join(ENCODINGS)
@@ -342,7 +342,7 @@ def _read(path: Path, options: ReadOptions) -> Iterator[Piece]:
 
 
 def _select_topic(bag: Bag, name: str | None) -> Topic:
-    """The topic to read: the one that is named, or the only one with points, else with depth images, slices, or a map.
+    """Return the topic to read: the one that is named, or the only one with points, else with depth images, slices, or a map.
 
     Raises:
         InputError: there is none, or are several; with what the bag holds.
@@ -364,7 +364,7 @@ def _select_topic(bag: Bag, name: str | None) -> Topic:
 
 
 def _read_first_frame(bag: Bag, topic: Topic) -> str:
-    """The frame of the first message of a topic."""
+    """Return the frame of the first message of a topic."""
     return str(next(bag.iter_messages([topic])).content.header.frame_id)
 
 

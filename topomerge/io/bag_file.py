@@ -33,7 +33,7 @@ class UnpackingError(ValueError):
 
 
 class UnpackingBudget:
-    """What may still be unpacked of a bag of so many bytes; `restart` when it is gone through once more."""
+    """The number of bytes that may still be unpacked of a bag of a size; `reset` when it is gone through once more."""
 
     def __init__(self, size: int) -> None:
         self.size = size
@@ -155,7 +155,7 @@ LONGEST_DEFINITION = 1 << 16  # letters of the definition of a type
 
 @dataclass(frozen=True)
 class Topic:
-    """What a bag holds under a name."""
+    """A topic of a bag: its name, the type of its messages and their number."""
 
     name: str
     type: str  # such as sensor_msgs/msg/PointCloud2
@@ -298,7 +298,7 @@ class Bag:
 
 
 def _format_reason(path: Path, error: Exception) -> str:
-    """What the library says, unless it may quote what a link out of the bag's folder points to."""
+    """Format the reason that the library gives, unless it may quote the target of a link out of the bag's folder."""
     about = path / "metadata.yaml"
     if is_outside_link(path) or (path.is_dir() and about.exists() and is_outside_link(about)):
         return type(error).__name__

@@ -292,7 +292,7 @@ class LandmarkReader:
             self.pictures.warnings.append(f"not all landmarks are read: {reason}")
 
     def _find_decoders(self) -> Decoders:
-        """What to do with the messages of the topics that are known, pictures apart."""
+        """Find the decoders of the topics that are known, but for pictures."""
         decoders: Decoders = {}
         for types, decode in ((TAGS, self._read_tags), ((OBJECTS,), self._read_objects), ((PRESSURE,), self._read_pressure)):
             for topic in self.bag.find_topics(*types):
@@ -347,7 +347,7 @@ class LandmarkReader:
         return place_box(corners, Picture(np.zeros((1, 1, 3), np.uint8), camera, depth, small, pose))
 
     def _find_frame_camera(self, frame: str) -> Camera | None:
-        """The camera of the only CameraInfo of a frame."""
+        """Return the camera of the only CameraInfo of a frame."""
         if frame not in self.frame_cameras:
             fitting = []
             for topic in self.bag.find_topics(CAMERA_INFO):

@@ -28,7 +28,7 @@ Passing = Generator[Any, Any, Any]
 
 @dataclass(frozen=True, eq=False)
 class ArchiveLayout:
-    """What an archive is read by.
+    """The layout that an archive is read by.
 
     Args:
         classes: members in their order, `name:type`; without a name: a base.
@@ -170,7 +170,7 @@ class BinaryArchive:
         return (yield self._move_object(kind, value))
 
     def _move_class(self, value: Members | None) -> str | None:
-        """The class of what is behind a pointer."""
+        """Return the class of what is behind a pointer."""
         kind = "" if value is None else value["class"]
         number = self._move_number("<i2", self.numbers.get(kind, len(self.numbers)) if value is not None else -1)
         if number == -1:

@@ -18,7 +18,7 @@ from topomerge.types import Array, Landmarks
 
 @dataclass(frozen=True, eq=False)
 class PosedScan:
-    """What a sensor measured from one place.
+    """The points that a sensor measured from one place.
 
     Args:
         points: (n, 3) in the sensor's frame, or in the fixed frame where they are `registered`.
@@ -63,7 +63,7 @@ def iter_pieces(
 
 
 def _transform_scan(scan: PosedScan) -> PosedScan:
-    """The scan with its points in the fixed frame."""
+    """Return the scan with its points in the fixed frame."""
     points = np.asarray(scan.points, np.float64)
     far = np.einsum("ij,ij->i", points, points)
     met = np.isfinite(far) & ((far > 0) | scan.registered)
@@ -176,7 +176,7 @@ def iter_posed_scans(
 
 
 def _build_scan(frame: Frame, show: Show | None) -> PosedScan:
-    """The points of one frame as its camera sees them."""
+    """Return the points of one frame as its camera sees them."""
     depth = read_depth(frame.depth) if isinstance(frame.depth, Path) else frame.depth
     points, rows, columns = unproject_depth(frame.name, depth, frame.camera)
     shown = read_color(frame.color) if isinstance(frame.color, Path) else frame.color
@@ -186,7 +186,7 @@ def _build_scan(frame: Frame, show: Show | None) -> PosedScan:
 
 
 def unproject_depth(name: Path | str, depth: Array, camera: Camera) -> tuple[Array, Array, Array]:
-    """(n, 3) points in front of a camera, m, and the rows and columns (n,) of their pixels; not every pixel becomes one.
+    """Return (n, 3) points in front of a camera, m, and the rows and columns (n,) of their pixels; not every pixel becomes one.
 
     Args:
         name: of the image, for messages.
@@ -230,7 +230,7 @@ def _check_camera(name: Path | str, camera: Camera, shape: tuple[int, ...]) -> N
 def _sample_colors(
     frame: Frame, shown: Array | None, points: Array, rows: Array, columns: Array, shape: tuple[int, ...]
 ) -> Array | None:
-    """(n, 3) uint8 of the points; None where the colours show something else than the depth image."""
+    """Return (n, 3) uint8 of the points; None where the colours show something else than the depth image."""
     if shown is None:
         return None
     height, width = shown.shape[:2]
@@ -257,7 +257,8 @@ def read_depth(path: Path) -> Array:
 
 
 def read_color(source: Path | bytes, name: Path | str | None = None) -> Array | None:
-    """(h, w, 3) uint8 of a PNG or JPEG, in a file or as bytes (then with a name for messages); None where it has other values."""
+    """Return (h, w, 3) uint8 of a PNG or JPEG, in a file or as bytes (then with a name for messages); None where it has other
+    values."""
     image = read_pixels(source, name if name is not None else str(source))
     if image.dtype != np.uint8:
         return None

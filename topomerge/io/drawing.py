@@ -63,7 +63,7 @@ class PictureText:
 
 @dataclass(frozen=True, eq=False)
 class ParsedDrawing:
-    """What a drawing shows, in pixels of `zoom` times the picture's number a side.
+    """The content of a drawing, in pixels of `zoom` times the picture's number a side.
 
     Args:
         occupied: (h, w) bool, walls and windows; free: floor and open doors; door, window: (h, w) bool.
@@ -304,7 +304,7 @@ def estimate_scale(drawing: ParsedDrawing, texts: Sequence[PictureText]) -> Draw
 
 
 def _find_room(rooms: Array, text: PictureText, zoom: float) -> int:
-    """The room that a text lies in: its own pixels may be holes."""
+    """Return the room that a text lies in: its own pixels may be holes."""
     column, row = (int(v * zoom) for v in text.place)
     reach = max(int(text.height * zoom), 2)
     part = rooms[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]

@@ -102,7 +102,7 @@ def place_text(text: PictureText, corner: tuple[float, float], pixel: float, row
 
 @dataclass
 class Content:
-    """What a drawing holds, in its units: lines, swings of doors, texts at their middle, layers, and the unit it states."""
+    """The content of a drawing, in its units: lines, swings of doors, texts at their middle, layers, and the unit it states."""
 
     lines: list[Line] = field(default_factory=list)
     swings: list[Swing] = field(default_factory=list)
@@ -111,7 +111,7 @@ class Content:
     unit: str | None = None
 
     def measure_box(self) -> Array:
-        """(2, 2) lowest and highest x and y of all lines."""
+        """Return (2, 2) lowest and highest x and y of all lines."""
         points = np.concatenate([line.points for line in self.lines])
         return np.stack([points.min(axis=0), points.max(axis=0)])
 

@@ -69,7 +69,7 @@ class PlanMasks:
     warnings: tuple[str, ...] = ()
 
 
-class _Raster:
+class _LineRaster:
     """Pixels over all lines, first row at the top."""
 
     def __init__(self, lines: list[Line], pixel: float) -> None:
@@ -79,12 +79,12 @@ class _Raster:
         self.pixel, self.shape, self.corner = pixel, (rows, columns), (float(low[0]), float(low[1]))
 
     def place(self, points: Array) -> Array:
-        """(n, 2) columns and rows of points (n, 2)."""
+        """Return (n, 2) columns and rows of points (n, 2)."""
         places = (points - self.corner) / self.pixel
         return np.stack([places[:, 0], self.shape[0] - places[:, 1]], axis=1)
 
     def draw(self, lines: list[tuple[Array, float]]) -> Array:
-        """(h, w) bool: lines (n, 2) of a width (m)."""
+        """Return (h, w) bool: lines (n, 2) of a width (m)."""
         from PIL import Image, ImageDraw
 
         image = Image.new("1", self.shape[::-1])
@@ -112,7 +112,7 @@ class _Raster:
         return part.size
 
     def sample(self, mask: Array, points: Array) -> Array:
-        """(n,) values of a mask at points (n, 2), those outside False."""
+        """Return (n,) values of a mask at points (n, 2), those outside False."""
         places = np.floor(self.place(points)).astype(int)
         inside = ((places >= 0) & (places < self.shape[::-1])).all(axis=1)
         out = np.zeros(len(points), bool)
@@ -128,7 +128,7 @@ def build_plan_masks(lines: list[Line], swings: list[Swing], pixel: float) -> Pl
         swings: arcs of doors, in m.
         pixel: m.
     """
-    raster = _Raster(lines, pixel)
+    raster = _LineRaster(lines, pixel)
     swings = [s for s in swings if SWING[0] <= np.linalg.norm(s.ends[0] - s.hinge) <= SWING[1]]
     is_leaf = [line.kind == "door" or is_door_leaf(line, swings) for line in lines]
     leaves, walls = ([line for line, leaf in zip(lines, is_leaf, strict=True) if leaf is side] for side in (True, False))
@@ -160,7 +160,7 @@ def is_door_leaf(line: Line, swings: list[Swing]) -> bool:
 
 
 def _find_window_hulls(lines: list[Line]) -> list[Array]:
-    """The hulls of blocks of windows that are as thin as a wall."""
+    """Return the hulls of blocks of windows that are as thin as a wall."""
     from shapely import MultiPoint
 
     parts: dict[int, list[Array]] = {}
@@ -188,7 +188,7 @@ def _fill_narrow(drawn: Array, pixel: float) -> Array:
     return drawn | (size >= LEAST_NARROW)[label]
 
 
-def find_gaps(raster: _Raster, occupied: Array, swings: list[Swing], leaves: list[Line]) -> list[Array]:
+def find_gaps(raster: _LineRaster, occupied: Array, swings: list[Swing], leaves: list[Line]) -> list[Array]:
     """Find the (2, 2) ends of the gap of each door: of its arc, else of its block."""
     gaps = []
     boxes = np.array([[*line.points.min(axis=0), *line.points.max(axis=0)] for line in leaves]).reshape(-1, 4)
@@ -220,7 +220,7 @@ def _runs_along(points: Array, start: Array, end: Array) -> bool:
     return max(away) < LEAF_THICKNESS
 
 
-def _score_gap(raster: _Raster, occupied: Array, ends: Array) -> float:
+def _score_gap(raster: _LineRaster, occupied: Array, ends: Array) -> float:
     """Count the ends (2, 2) beyond which a wall goes on."""
     along = (ends[1] - ends[0]) / max(float(np.linalg.norm(ends[1] - ends[0])), 1e-9)
     score = 0.0
@@ -229,8 +229,8 @@ def _score_gap(raster: _Raster, occupied: Array, ends: Array) -> float:
     return score
 
 
-def _find_block_gap(raster: _Raster, occupied: Array, points: Array) -> list[Array]:
-    """The gap of a door without an arc: the line across its box whose ends meet walls; none where no line's do."""
+def _find_block_gap(raster: _LineRaster, occupied: Array, points: Array) -> list[Array]:
+    """Return the gap of a door without an arc: the line across its box whose ends meet walls; none where no line's do."""
     from shapely import MultiPoint
 
     box = MultiPoint(points).minimum_rotated_rectangle
@@ -247,12 +247,12 @@ def _find_block_gap(raster: _Raster, occupied: Array, points: Array) -> list[Arr
 
 
 def _lengthen(ends: Array, length: float) -> Array:
-    """(2, 2) ends that lie so much farther out, m."""
+    """Return (2, 2) ends that lie so much farther out, m."""
     along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
     return ends + np.stack([-along, along]) * length
 
 
-def _erase_gap(raster: _Raster, occupied: Array, ends: Array) -> None:
+def _erase_gap(raster: _LineRaster, occupied: Array, ends: Array) -> None:
     """Erase what is drawn across a gap."""
     inner = _lengthen(ends, -2 * raster.pixel)
     along = (inner[1] - inner[0]) / np.linalg.norm(inner[1] - inner[0])
@@ -260,8 +260,8 @@ def _erase_gap(raster: _Raster, occupied: Array, ends: Array) -> None:
     raster.fill(occupied, [np.stack([inner[0] - aside, inner[1] - aside, inner[1] + aside, inner[0] + aside])], False)
 
 
-def _fill_floor(raster: _Raster, occupied: Array, seals: Array) -> PlanMasks:
-    """What the page can't reach is floor, but for what is as thin as a wall and has no door."""
+def _fill_floor(raster: _LineRaster, occupied: Array, seals: Array) -> PlanMasks:
+    """Fill the floor: all that the page's border can't reach, but for parts as thin as a wall that have no door."""
     pixel = raster.pixel
     closed = occupied | seals
     distance = ndimage.distance_transform_edt(~closed)
@@ -286,7 +286,7 @@ def _fill_floor(raster: _Raster, occupied: Array, seals: Array) -> PlanMasks:
 
 
 def _find_inside(closed: Array, distance: Array, radius: float) -> Array:
-    """What a disc of a radius (px) does not reach from the border; `distance` is that to what is closed."""
+    """Find the pixels that a disc of a radius (px) does not reach from the border; `distance` is to the nearest closed one."""
     label, _ = ndimage.label(distance > radius)
     outside = label == label[0, 0]
     if radius > 0:

@@ -75,7 +75,7 @@ def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
 
 
 def _read_pose(header: Any) -> Array:
-    """(4, 4) pose of a scan; without one its points stand in the common frame already."""
+    """Return (4, 4) pose of a scan; without one its points stand in the common frame already."""
     if not header.has_pose():
         return np.eye(4)
     quaternion = np.asarray(header.rotation, np.float64)
@@ -113,7 +113,7 @@ def _iter_scan_blocks(path: Path, file: Any, header: Any) -> Iterator[tuple[Arra
 
 
 def _convert_to_cartesian(spherical: Array) -> Array:
-    """(n, 3) x, y, z from range, azimuth and elevation (rad)."""
+    """Return (n, 3) x, y, z from range, azimuth and elevation (rad)."""
     distance, azimuth, elevation = spherical.T
     flat = distance * np.cos(elevation)
     return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)], axis=1)

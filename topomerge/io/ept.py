@@ -39,7 +39,7 @@ NUMBER_KINDS = {"signed": "i", "unsigned": "u", "float": "f"}
 
 @dataclass(frozen=True)
 class EptLayout:
-    """What `ept.json` says: how nodes are stored, what lies in a row and how its X, Y, Z become coordinates."""
+    """The layout that `ept.json` states: how nodes are stored, what lies in a row and how its X, Y, Z become coordinates."""
 
     suffix: str
     layout: np.dtype[Any]

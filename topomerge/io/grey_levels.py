@@ -118,7 +118,7 @@ def _get_level_window(level: int) -> slice:
 
 
 def _find_mode(counts: Array) -> int:
-    """The grey with the most pixels around it."""
+    """Return the grey with the most pixels around it."""
     sums = np.convolve(counts, np.ones(2 * SPREAD + 1), "same")
     near = _get_level_window(int(sums.argmax()))
     smooth = np.convolve(counts, (1, 2, 3, 2, 1), "same")

@@ -118,7 +118,7 @@ TOLD_SHARE = 0.01  # of the floor: more noise around the grey of unknown is told
 
 @dataclass(frozen=True)
 class Plan:
-    """What a map_server file says; the defaults are its own."""
+    """The content of a map_server file; the defaults are its own."""
 
     image: Path
     resolution: float  # m per pixel
@@ -302,14 +302,14 @@ def _read_number(path: Path, values: dict[str, Any], key: str, default: float | 
 
 
 def _shorten_value(value: object) -> str:
-    """What stands in a file, not longer than fits into a message: aliases can make a list of a few bytes endless."""
+    """Shorten a value of a file to fit into a message: aliases can make a list of a few bytes endless."""
     short = reprlib.Repr()
     short.maxlevel = short.maxlist = short.maxdict = 2
     return short.repr(value)[:60]
 
 
 def _find_image(path: Path, name: str) -> tuple[Path, tuple[str, ...]]:
-    """The image a map_server file names: as written, else of that name beside the file, else of its stem or the yaml's."""
+    """Return the image a map_server file names: as written, else of that name beside the file, else of its stem or the yaml's."""
     base = PureWindowsPath(name).name if "\\" in name else PurePosixPath(name).name
     exact = path.parent / name
     companion = path.parent / base
@@ -391,8 +391,8 @@ def read_pixels(path: Path, plan: Plan) -> tuple[Array, Array, tuple[str, ...]]:
 
 
 def _read_greys(path: Path, image: tuple[Array, Array], plan: Plan, occupied: Array, free: Array) -> tuple[Array, Array, str]:
-    """The occupied pixels with walls that are grey lines, the free ones without those that are unknown by their grey, and the
-    warning about them, "" for none."""
+    """Return the occupied pixels with walls that are grey lines, the free ones without those that are unknown by their grey, and
+    the warning about them, "" for none."""
     bright, clear = image
     counted = ~(occupied | clear | np.isnan(bright))
     levels = np.round(np.nan_to_num(bright.clip(0.0, 1.0)) * 255.0).astype(np.uint8)
@@ -412,7 +412,7 @@ def _read_greys(path: Path, image: tuple[Array, Array], plan: Plan, occupied: Ar
 def _remove_unknown(
     path: Path, plan: Plan, grey: GreyLevels, levels: Array, free: Array, counted: Array, lossy: bool
 ) -> tuple[Array, str]:
-    """The free pixels without those that are unknown by their grey, and the warning about them, "" for none."""
+    """Return the free pixels without those that are unknown by their grey, and the warning about them, "" for none."""
     if grey.threshold >= plan.free:
         return free, ""
     is_floor = bool((free & (levels == grey.unknown)).any())
@@ -431,7 +431,7 @@ def _remove_unknown(
 
 
 def classify(image: tuple[Array, Array], plan: Plan) -> tuple[Array, Array]:
-    """(h, w) bool occupied and free pixels of an image by the thresholds alone, as map_server has them."""
+    """Return (h, w) bool occupied and free pixels of an image by the thresholds alone, as map_server has them."""
     bright, clear = image
     if plan.mode == "raw":
         share = bright * 255.0 / 100.0  # the value itself is the probability in percent; above 100 is unknown
@@ -462,7 +462,7 @@ def extrude(path: Path, occupied: Array, free: Array, plan: Plan, options: ReadO
 
 
 def _flatten_mask(mask: Array) -> Array:
-    """(n,) int32 numbers of the masked pixels, row after row."""
+    """Return (n,) int32 numbers of the masked pixels, row after row."""
     step = max(1, BLOCK_POINTS // mask.shape[1])  # rows at a time: NumPy's numbers take 8 bytes each
     starts = range(0, len(mask), step)
     return np.concatenate([(np.flatnonzero(mask[i : i + step]) + i * mask.shape[1]).astype(np.int32) for i in starts])

@@ -295,21 +295,21 @@ def _sample_missing_floors(
 
 
 def _measure_level_areas(vertices: Array, faces: Array, which: Array) -> Array:
-    """(k, 2) height (m) and area (m2) of the faces chosen."""
+    """Return (k, 2) height (m) and area (m2) of the faces chosen."""
     a, b, c = (vertices[faces[which, i]] for i in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return np.column_stack([(a + b + c)[:, 2] / 3, area])
 
 
 def _find_level_faces(vertices: Array, faces: Array) -> Array:
-    """(m,) bool: is the face rather level than steep?"""
+    """Return (m,) bool: is the face rather level than steep?"""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
     return np.abs(normals[:, 2]) > 0.7 * np.linalg.norm(normals, axis=1)
 
 
 def _find_floor_faces(vertices: Array, faces: Array) -> Array:
-    """(m,) bool: level faces in the lowest quarter of a body, its floor."""
+    """Return (m,) bool: level faces in the lowest quarter of a body, its floor."""
     low, high = vertices[:, 2].min(), vertices[:, 2].max()
     return _find_level_faces(vertices, faces) & (vertices[faces][:, :, 2].mean(axis=1) < low + (high - low) / 4)
 

@@ -76,7 +76,7 @@ def _iter_place_pieces(path: Path, graph: Mapping[str, Any], options: ReadOption
 
 
 def _parse_places(graph: Mapping[str, Any]) -> tuple[Array, Array]:
-    """(n, 4) m places x y z and how far the nearest obstacle is; (m, 2) rows of those that a way joins."""
+    """Return (n, 4) m places x y z and how far the nearest obstacle is; (m, 2) rows of those that a way joins."""
     rows: dict[Any, list[float]] = {}
     for node in graph["nodes"]:
         try:
@@ -96,7 +96,7 @@ def _parse_places(graph: Mapping[str, Any]) -> tuple[Array, Array]:
 
 
 def _draw_places(path: Path, places: Array, rows: Array, ways: Array) -> tuple[Array, list[float]]:
-    """(h, w) bool of what is free around places and along ways, the lowest row first; and the lower left corner, m."""
+    """Return (h, w) bool of what is free around places and along ways, the lowest row first; and the lower left corner, m."""
     clear = places[:, 3].clip(LEAST_CLEAR, 10.0)
     discs = [(places[k, :2], clear[k]) for k in rows.tolist()]
     for a, b in ways.tolist():
@@ -144,7 +144,7 @@ def _read_node(node: Any, graph: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def _parse_table(path: Path, rows: Any, name: str) -> Array:
-    """(n, 3) float64."""
+    """Return (n, 3) float64."""
     try:
         table = np.array(rows, np.float64)
     except (TypeError, ValueError) as error:
@@ -155,7 +155,7 @@ def _parse_table(path: Path, rows: Any, name: str) -> Array:
 
 
 def _parse_colors(path: Path, mesh: Mapping[str, Any], many: int) -> Array | None:
-    """(many, 3) uint8; None where the mesh has none."""
+    """Return (many, 3) uint8; None where the mesh has none."""
     listed = mesh.get("colors")
     if not listed or not mesh.get("has_colors", True):
         return None

@@ -138,7 +138,7 @@ def _build_table(path: Path, lines: Sequence[int], columns: Mapping[str, Sequenc
 
 
 def _parse_reals(path: Path, lines: Sequence[int], name: str, texts: Sequence[str]) -> Array:
-    """(n,) float64, nan where nothing stands."""
+    """Return (n,) float64, nan where nothing stands."""
     if not texts:
         return np.full(len(lines), np.nan)
     stripped = [text.strip() for text in texts]

@@ -202,14 +202,14 @@ def read_las_node(path: Path, promised: int, options: ReadOptions) -> Iterator[P
 
 
 def _select_fields() -> Any:
-    """What a cloud is made of; other layers of a packed file are not unpacked, where it has layers."""
+    """Select the fields of a cloud; other layers of a packed file are not unpacked, where it has layers."""
     from laspy import DecompressionSelection
 
     return DecompressionSelection.base().decompress_z().decompress_classification().decompress_intensity().decompress_rgb()
 
 
 def _build_rows(data: Array, header: Any) -> Any:
-    """The records of unpacked bytes."""
+    """Return the records of unpacked bytes."""
     import laspy
 
     packed = laspy.PackedPointRecord.from_buffer(data, header.point_format)
@@ -311,7 +311,8 @@ def get_coordinates(rows: Any) -> Array:
 
 
 def _convert_classes(rows: Any) -> Array | None:
-    """(n,) int32 classes beyond those of the standard (ground, buildings, noise and such), -1 of others; None: there are none."""
+    """Return (n,) int32 classes beyond those of the standard (ground, buildings, noise and such), -1 of others; None: there are
+    none."""
     classes = np.asarray(rows.classification, np.int32)
     return np.where(classes > LAST_STANDARD_CLASS, classes, -1) if int(classes.max(initial=0)) > LAST_STANDARD_CLASS else None
 
@@ -322,7 +323,7 @@ def _convert_colors(rows: object) -> Array | None:
 
 
 def _check_head(path: Path) -> None:
-    """What the library would trust: the magic and the number of records before the points."""
+    """Check what the library would trust: the magic and the number of records before the points."""
     head = read_head(path, "a LAS file", b"LASF", 227)
     start, records = int.from_bytes(head[96:100], "little"), int.from_bytes(head[100:104], "little")
     size = path.stat().st_size

@@ -278,7 +278,7 @@ def _check_table(arrays: dict[str, Array], name: str, dtype: np.dtype[Any]) -> A
 
 
 def _widen_table(table: Array, dtype: np.dtype[Any]) -> Array:
-    """A table with more columns, 0 in the new ones."""
+    """Return a table with more columns, 0 in the new ones."""
     out = np.zeros(len(table), dtype)
     for name in table.dtype.names or ():
         out[name] = table[name]
@@ -286,7 +286,7 @@ def _widen_table(table: Array, dtype: np.dtype[Any]) -> Array:
 
 
 def _read_rooms(arrays: dict[str, Array]) -> Array:
-    """The table of rooms. Files of earlier versions say no probabilities: there a glimpsed room was not entered."""
+    """Return the table of rooms. Files of earlier versions say no probabilities: there a glimpsed room was not entered."""
     if arrays["rooms"].dtype == OLDER_ROOMS:
         return add_outline_odds(_widen_table(_check_table(arrays, "rooms", OLDER_ROOMS), ROOM_DTYPE))
     rooms = _check_table(arrays, "rooms", ROOM_DTYPE)
@@ -297,13 +297,13 @@ def _read_rooms(arrays: dict[str, Array]) -> Array:
 
 
 def _read_edges(arrays: dict[str, Array], name: str) -> Array:
-    """A table of edges. Files of earlier versions do not tell half-open doors from open ones."""
+    """Return a table of edges. Files of earlier versions do not tell half-open doors from open ones."""
     older = arrays[name].dtype == OLDER_EDGE_DTYPE
     return _widen_table(_check_table(arrays, name, OLDER_EDGE_DTYPE if older else EDGE_DTYPE), EDGE_DTYPE)
 
 
 def _read_windows(arrays: dict[str, Array]) -> Array:
-    """The table of windows. Files of earlier versions have none."""
+    """Return the table of windows. Files of earlier versions have none."""
     windows = _check_table(arrays, "windows", WINDOW_DTYPE) if "windows" in arrays else np.zeros(0, WINDOW_DTYPE)
     if (windows["width"] <= 0).any() or (windows["head"] <= windows["sill"]).any():
         raise ValueError("windows has one that is not wide or not high")
@@ -317,7 +317,7 @@ def _pack_landmarks(landmarks: Landmarks) -> dict[str, Array]:
 
 
 def _read_landmarks(arrays: dict[str, Array]) -> Landmarks:
-    """The landmarks. Files of earlier versions have none.
+    """Return the landmarks. Files of earlier versions have none.
 
     Raises:
         ValueError: a string, a position or another number is none that `clean_landmarks` leaves.

@@ -120,7 +120,7 @@ def _load_parts(path: Path) -> list[tuple[Array, Array]]:
 
 
 def _check_start(path: Path, kind: str) -> None:
-    """What the library would trust: magic, and counts against the file's size."""
+    """Check what the library would trust: magic, and counts against the file's size."""
     size = path.stat().st_size
     with path.open("rb") as stream:
         head = stream.read(1024)

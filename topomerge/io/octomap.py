@@ -71,7 +71,7 @@ def _split(path: Path, data: bytes, binary: bool) -> tuple[bytes, float, Array]:
 
 
 def _split_leaves(keys: Array, depths: Array, most: int) -> Array | None:
-    """(n, 3) int32 smallest cells of leaves; None where they are too many."""
+    """Return (n, 3) int32 smallest cells of leaves; None where they are too many."""
     sides = 1 << (LEAF_LEVEL - depths.astype(np.int64))
     if (sides**3).sum() > most:
         return None

@@ -112,7 +112,7 @@ def get_packed(fields: Sequence[Field], number: int, signed: bool = False) -> Ar
 
 
 def _parse_varints(data: bytes) -> Array:
-    """(n,) uint64 of whole numbers behind each other."""
+    """Return (n,) uint64 of whole numbers behind each other."""
     raw = np.frombuffer(data, np.uint8)
     if not len(raw):
         return np.zeros(0, np.uint64)
@@ -383,7 +383,7 @@ def _draw_submaps(path: Path, submaps: Sequence[FlatSubmap]) -> tuple[Array, Arr
 
 
 def _list_corners(submap: FlatSubmap) -> Array:
-    """(4, 2) m corners of a submap on the map."""
+    """Return (4, 2) m corners of a submap on the map."""
     extent = submap.resolution * np.array(submap.odds.shape)  # along x are the rows
     ends = np.array(submap.corner) - extent * np.array([(0, 0), (1, 0), (0, 1), (1, 1)])
     return transform_points(submap.pose, np.column_stack([ends, np.zeros(4)]))[:, :2]

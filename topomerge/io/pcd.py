@@ -26,7 +26,7 @@ PCD_TYPES = {("F", 4), ("F", 8), ("U", 1), ("U", 2), ("U", 4), ("U", 8), ("I", 1
 
 @dataclass(frozen=True)
 class Header:
-    """What stands before the points."""
+    """The header of a PCD file, before the points."""
 
     dtype: np.dtype
     points: int
@@ -150,7 +150,7 @@ def _iter_ascii(path: Path, header: Header) -> Iterator[Array]:
 
 
 def _decode_colors(rows: Array) -> Array | None:
-    """(n, 3) uint8 from three fields, or from one of four bytes b, g, r, a."""
+    """Return (n, 3) uint8 from three fields, or from one of four bytes b, g, r, a."""
     names = rows.dtype.names or ()
     if {"r", "g", "b"} <= set(names):
         return np.stack([rows[n] for n in "rgb"], axis=1).astype(np.uint8)
@@ -162,7 +162,7 @@ def _decode_colors(rows: Array) -> Array | None:
 
 
 def _build_pose(viewpoint: tuple[float, ...]) -> Array | None:
-    """(1, 4, 4) pose of the sensor; None for the default, which says nothing."""
+    """Return (1, 4, 4) pose of the sensor; None for the default, which says nothing."""
     if viewpoint == (0, 0, 0, 1, 0, 0, 0) or not np.isfinite(viewpoint).all() or not any(viewpoint[3:]):
         return None
     return build_pose_matrix(normalize_quaternion(np.array(viewpoint[3:])), np.array(viewpoint[:3]))[None]

@@ -253,7 +253,7 @@ def place_square(corners: Array, picture: Picture, side: float) -> tuple[Array, 
 
 
 def _unproject_patch(rays: Array, picture: Picture) -> Array | None:
-    """(n, 3) points of the depth image within a box of rays (4, 2), in the camera's frame; None: too few."""
+    """Return (n, 3) points of the depth image within a box of rays (4, 2), in the camera's frame; None: too few."""
     camera, depth = picture.camera, picture.depth
     low, high = rays.min(axis=0) * camera.focal + camera.centre, rays.max(axis=0) * camera.focal + camera.centre
     if not np.isfinite([low, high]).all():

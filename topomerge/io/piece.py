@@ -1,4 +1,4 @@
-"""What all readers share: options, pieces of a cloud, gathering them."""
+"""Common parts of all readers: options, pieces of a cloud, gathering them."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def convert_to_uint8(colors: Array) -> Array:
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What `read_points`, `read_chunks` and each reader are given; lengths in metres.
+    """Options of `read_points`, `read_chunks` and each reader; lengths in metres.
 
     Args:
         up: axis of the file that points up: "z", "y", "x" or "-z", "-y", "-x"; None: what the format says, which is y for
@@ -215,7 +215,8 @@ def load_json(path: Path, kind: str) -> dict[str, Any]:
 
 
 def compute_deepest_level(root_spacing: float, options: ReadOptions) -> int:
-    """The level whose points are as close as `options.spacing` asks for; levels halve the distance. Not asked for: all levels."""
+    """Return the level whose points are as close as `options.spacing` asks for; levels halve the distance. Not asked for: all
+    levels."""
     if options.spacing is None or not root_spacing > 0:
         return sys.maxsize
     ratio = root_spacing * options.factor / options.spacing

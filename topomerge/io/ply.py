@@ -61,7 +61,7 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """What stands before the rows; `start` is the offset of the first."""
+    """The header of a PLY file; `start` is the offset of the first row."""
 
     order: str  # "", "<" or ">"
     elements: list[Element]
@@ -173,7 +173,7 @@ def _read_binary(path: Path, header: Header, before: list[Element], vertex: Elem
 
 
 def _stack_columns(rows: Array, names: tuple[str, ...]) -> Array:
-    """(n, 3) from three columns of a structured array, in the machine's byte order."""
+    """Return (n, 3) from three columns of a structured array, in the machine's byte order."""
     kind = np.result_type(*(rows.dtype[n] for n in names)).newbyteorder("=")
     out = np.empty((len(rows), len(names)), kind)
     for i, name in enumerate(names):
@@ -232,7 +232,7 @@ def _read_whole(path: Path, options: ReadOptions) -> Iterator[Piece]:
 
 
 def _triangulate(polygons: Array) -> Array:
-    """(m, 3) int64 fans of triangles of polygons given as an (n, k) array or an object array of index lists."""
+    """Return (m, 3) int64 fans of triangles of polygons given as an (n, k) array or an object array of index lists."""
     if polygons.dtype != object:
         return polygons.astype(np.int64)
     by_corners: dict[int, list[Array]] = {}

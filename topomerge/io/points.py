@@ -345,7 +345,7 @@ def detect_format(path: Path) -> Format:
 
 
 def _detect_folder_format(path: Path) -> Format:
-    """What a folder holds: a ROS 2 bag or parts of a bag, an octree of files, RGB-D images, or scans."""
+    """Detect the format of a folder: a ROS 2 bag or parts of a bag, an octree of files, RGB-D images, or scans."""
     bag = next(f for f in FORMATS if f.module == "bag")
     names = [p.name for p in path.iterdir() if not p.name.startswith(".")]
     if "metadata.yaml" in names or any(n.endswith(bag.suffixes) for n in names):

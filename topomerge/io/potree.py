@@ -46,7 +46,8 @@ FILES = {"LAS": "las", "LAZ": "laz"}
 
 @dataclass(frozen=True)
 class Octree:
-    """What `cloud.js` says: the folder of nodes, how many levels lie in one file, the cube of the root, and a point's row."""
+    """The layout that `cloud.js` states: the folder of nodes, how many levels lie in one file, the cube of the root, and a
+    point's row."""
 
     folder: Path
     step: int  # 0: the nodes are listed
@@ -99,7 +100,7 @@ def _read_octree(file: Path) -> Octree:
 
 
 def _parse_attributes(file: Path, attributes: Any) -> tuple[str, np.dtype[Any] | None]:
-    """The suffix of nodes, and the layout of their rows where they are packed."""
+    """Return the suffix of nodes, and the layout of their rows where they are packed."""
     if isinstance(attributes, str) and attributes in FILES:
         return FILES[attributes], None
     fields: list[tuple[Any, ...]] = []
@@ -185,7 +186,7 @@ def _read_node(octree: Octree, name: str, count: int, options: ReadOptions) -> I
 
 
 def _compute_corner(octree: Octree, name: str) -> Array:
-    """(3,) lower corner of a node's cube: each figure of its name halves the cube, x by 4, y by 2, z by 1."""
+    """Return (3,) lower corner of a node's cube: each figure of its name halves the cube, x by 4, y by 2, z by 1."""
     corner, edge = octree.low.copy(), octree.edge
     for figure in name[1:]:
         edge /= 2

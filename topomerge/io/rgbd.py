@@ -44,7 +44,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
 
 
 def _read_camera(path: Path) -> tuple[Camera, list[str]]:
-    """The camera of a folder, and what the user should know of it."""
+    """Return the camera of a folder, and what the user should know of it."""
     stated = path / "camera.txt"
     if stated.is_file():
         try:

@@ -132,7 +132,7 @@ def _iter_3rscan(folder: Path) -> Iterator[Frame]:
 
 
 def _parse_info_camera(info: Path, values: dict[str, list[str]], what: str) -> Camera:
-    """The camera of depth or of colours that `_info.txt` states."""
+    """Return the camera of depth or of colours that `_info.txt` states."""
     try:
         matrix = np.array(values[f"m_calibration{what}Intrinsic"], float).reshape(4, 4)
         size = (int(values[f"m_{what.lower()}Height"][0]), int(values[f"m_{what.lower()}Width"][0]))
@@ -201,7 +201,7 @@ def _read_pincam(path: Path) -> Camera:
 
 
 def _read_matrix_camera(path: Path) -> Camera:
-    """The camera of a matrix of four rows of four numbers, for images of millimetres."""
+    """Return the camera of a matrix of four rows of four numbers, for images of millimetres."""
     matrix = _read_matrix(path)
     try:
         return Camera((matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]), MILLIMETRES, mend=f"mend {path.name}")
@@ -210,7 +210,7 @@ def _read_matrix_camera(path: Path) -> Camera:
 
 
 def _read_pose(path: Path) -> Array | None:
-    """(4, 4) pose of a frame, not finite where tracking was lost; None: it has no file."""
+    """Return (4, 4) pose of a frame, not finite where tracking was lost; None: it has no file."""
     return _read_matrix(path) if path.is_file() else None
 
 
@@ -254,7 +254,7 @@ def _iter_images(folder: Path, pattern: str) -> Iterator[tuple[Path, float]]:
 
 
 def _parse_number(file: Path) -> int:
-    """The number at the end of a name."""
+    """Return the number at the end of a name."""
     match = re.search(r"(\d+)$", file.stem)
     if match is None:
         raise InputError(f"{file}: has no number at the end of its name; copy it again under its own")

@@ -17,7 +17,7 @@ WALL_BETWEEN = 0.4  # m: rooms with this much wall between them stand side by si
 
 
 def _build_palette() -> Array:
-    """(16, 3) uint8: the scheme, then the same darkened for maps that need more than eight."""
+    """Return (16, 3) uint8: the scheme, then the same darkened for maps that need more than eight."""
     light = np.array([[int(code[i : i + 2], 16) for i in (0, 2, 4)] for code in LIGHT], np.float64)
     return np.concatenate([light, light * 0.62]).round().astype(np.uint8)
 

@@ -319,7 +319,7 @@ def read_poses(path: Path, base: sqlite3.Connection, version: tuple[int, ...], w
 
 
 def _detect_kind(path: Path, base: sqlite3.Connection, version: tuple[int, ...]) -> str:
-    """What to read: "spatial" or "flat" scans, or "depth", by the first node that has any.
+    """Detect what to read: "spatial" or "flat" scans, or "depth", by the first node that has any.
 
     Raises:
         InputError: there is none of these.
@@ -455,13 +455,13 @@ def _read_readings(path: Path, base: sqlite3.Connection, columns: set[str]) -> l
 
 
 def _find_places(poses: Poses, nodes: list[int]) -> Array:
-    """(n, 3) m of nodes that have a pose."""
+    """Return (n, 3) m of nodes that have a pose."""
     places = [pose[:3, 3] for node in nodes if (pose := poses.get(node)) is not None]
     return np.array(places).reshape(-1, 3)
 
 
 def _read_labels(base: sqlite3.Connection, poses: Poses) -> Landmarks:
-    """What the user called nodes, as names of where they are."""
+    """Read the labels that the user gave nodes, as names of their places."""
     rows = base.execute(f"SELECT id, label FROM Node WHERE LENGTH(label) > 0 ORDER BY id LIMIT {MOST_SIGHTINGS}")
     named = [(node, clean_text(label)) for node, label in rows if isinstance(label, str) and poses.get(node) is not None]
     named = [(node, label) for node, label in named if label and not OWN_NAME.fullmatch(label)]

@@ -81,7 +81,7 @@ def _build_camera(path: Path, matrix: Array, metre: float, size: tuple[int, int]
 
 
 def _decode_depth(path: Path, number: int, data: bytes, kind: int, shape: tuple[int, int]) -> Array:
-    """(h, w) values of one frame; never more bytes are unpacked than it has pixels for."""
+    """Return (h, w) values of one frame; never more bytes are unpacked than it has pixels for."""
     promised = 2 * shape[0] * shape[1]
     if kind == ZLIB_DEPTH:
         try:

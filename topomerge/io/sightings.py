@@ -244,7 +244,7 @@ class ObjectFinder:
 
 
 def _sum_cells(keys: Array, values: Array) -> Array:
-    """(m, 4 + k) rows of the cells (n, 4) that differ, with the sums of their values (n, k)."""
+    """Return (m, 4 + k) rows of the cells (n, 4) that differ, with the sums of their values (n, k)."""
     order = np.lexsort(keys.T[::-1])
     keys, values = keys[order], values[order]
     starts = np.flatnonzero(np.concatenate([[True], (keys[1:] != keys[:-1]).any(axis=1)]))
@@ -252,7 +252,7 @@ def _sum_cells(keys: Array, values: Array) -> Array:
 
 
 def _label_clusters(keys: Array) -> Array:
-    """(n,) number of the cluster of each cell (n, 4) of class and place, which are sorted."""
+    """Return (n,) number of the cluster of each cell (n, 4) of class and place, which are sorted."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

@@ -48,7 +48,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
 
 
 def find_tiles(folder: Path) -> list[tuple[Path, Format]]:
-    """The files of points in a folder, or in the only folder below it that has some, in the order of their names and numbers.
+    """Return the files of points in a folder, or in the only folder below it that has some, in the order of their names and
+    numbers.
 
     Raises:
         InputError: there are none, or one is empty or can't be opened.
@@ -107,7 +108,7 @@ def _check_systems(folder: Path, files: list[Path]) -> None:
 
 
 def _read_coordinate_system(file: Path) -> str:
-    """The coordinate system that a LAS file names, as "EPSG:1234" or by its name; "" for none."""
+    """Return the coordinate system that a LAS file names, as "EPSG:1234" or by its name; "" for none."""
     import laspy
 
     try:

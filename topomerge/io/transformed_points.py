@@ -26,7 +26,7 @@ OCTREE = "copc"  # a record that says where the nodes of an octree lie in the fi
 
 @dataclass(frozen=True)
 class SavedPoints:
-    """What was written: the number of points, and of those that lie too far from all others for LAS."""
+    """Counts of what was written: the number of points, and of those that lie too far from all others for LAS."""
 
     written: int
     beyond: int = 0
@@ -178,7 +178,8 @@ def _get_las_coordinates(rows: Any) -> Array:
 
 
 def _build_las_header(header: Any, offset: Array, same: bool) -> Any:
-    """The header of the source for moved points, without what holds no longer: an octree, and the name of a coordinate system."""
+    """Return the header of the source for moved points, without what holds no longer: an octree, and the name of a coordinate
+    system."""
     out = copy.deepcopy(header)
     out.offsets, out.scales = offset, np.full(3, LAS_STEP)
     out.generating_software = "topomerge"

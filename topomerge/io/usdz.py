@@ -198,7 +198,7 @@ def _load_shape(path: Path, prim: Any) -> tuple[Array, Array] | None:
 
 
 def _cut_faces(path: Path, counts: Array, indices: Array) -> Array:
-    """(m, 3) triangles of polygons, each cut from its first corner."""
+    """Return (m, 3) triangles of polygons, each cut from its first corner."""
     if len(counts) and (counts.min() < 3 or counts.max() > 1 << 20):
         counts_kept = counts >= 3
         if counts.min() < 0 or counts.max() > 1 << 20:

@@ -34,7 +34,7 @@ WALLED = 0.3  # share of the floor's outline along which robots that draw walls 
 
 @dataclass(frozen=True)
 class RobotMap:
-    """What a vacuum robot drew; arrays (h, w), the lowest row of the picture first.
+    """The map of a vacuum robot; arrays (h, w), the lowest row of the picture first.
 
     Args:
         walls, free: bool.
@@ -147,12 +147,12 @@ def _get_layer_name(layer: dict[str, Any]) -> str:
 
 
 def _parse_number(value: object) -> float:
-    """The value, nan where it is no number."""
+    """Return the value, nan where it is no number."""
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else float("nan")
 
 
 def _parse_runs(path: Path, layer: dict[str, Any]) -> Array:
-    """(n, 3) int64 column, row and length of runs of pixels."""
+    """Return (n, 3) int64 column, row and length of runs of pixels."""
     compressed = layer.get("compressedPixels") or []
     listed, numbers = (compressed, 3) if compressed else (layer.get("pixels") or [], 2)
     kind = str(layer.get("type"))[:20]

@@ -73,7 +73,7 @@ def compile_missing(cache: Path, processes: int) -> None:
 
 
 def _describe_sources() -> str:
-    """What numba looks at, too: a change of a file's date compiles it again."""
+    """Describe the sources as numba checks them: a change of a file's date or size compiles it again."""
     files = [Path(__file__).with_name(f"{name}.py").stat() for name in MODULES]
     return " ".join(f"{file.st_mtime_ns}:{file.st_size}" for file in files)
 

@@ -402,7 +402,7 @@ def find_copied_cells(cells, offsets, first, second, first_free, second_free):  
     Args:
         cells: (n, 3) int64 of the second map.
         offsets: (k, 2) int64 steps to the cells beside, the nearest first.
-        first, second: table and bricks of their cells (`kernels.lookup`).
+        first, second: table and bricks of their cells (`kernels.voxels.build`).
         first_free, second_free: of their free cells, which are twice as long.
     """
     out = np.full(len(cells), -1, np.int64)

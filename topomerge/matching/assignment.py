@@ -68,8 +68,8 @@ def match_by_overlap(
 
 
 def compute_descriptor_costs(a: Rows, b: Rows, standardise: bool = False) -> Array:
-    """(R_a, R_b) Euclidean distances of the rows of a (R_a, D) and b (R_b, D), over the root of D; where rooms have a row for
-    each quarter turn, as far apart as rows of length 1 of their mean cosine over turns (`embedding.quarter_turns`).
+    """Return (R_a, R_b) Euclidean distances of the rows of a (R_a, D) and b (R_b, D), over the root of D; where rooms have a row
+    for each quarter turn, as far apart as rows of length 1 of their mean cosine over turns (`embedding.quarter_turns`).
 
     Args:
         standardise: scale each column by its standard deviation over the rooms of both maps first. Rooms that only one map has
@@ -88,7 +88,7 @@ def compute_descriptor_costs(a: Rows, b: Rows, standardise: bool = False) -> Arr
 
 
 def compute_similarities(cost: Array, temperature: float | None = None, dustbin: float | None = None) -> Array:
-    """(R_a, R_b) 0..1 of each pair: softmax along its row times that along its column, each with the choice of no partner.
+    """Return (R_a, R_b) 0..1 of each pair: softmax along its row times that along its column, each with the choice of no partner.
 
     Args:
         temperature: cost that divides likelihoods by e; a fifth of the median cost if None.
@@ -243,7 +243,7 @@ def compute_certainty(rows: Array, columns: Array) -> Array:
 
 
 def assign_certain(certain: Array, least: float) -> Array:
-    """(M, 2) one-to-one pairs of the largest sum of certainty, each at least `least`; the other rooms stay alone."""
+    """Return (M, 2) one-to-one pairs of the largest sum of certainty, each at least `least`; the other rooms stay alone."""
     return assign(1 - certain, 1 - least)
 
 

@@ -40,8 +40,8 @@ def load_odds_weights(model: str) -> Array:
 
 
 def compute_hypothesis_features(evidence: Array) -> Array:
-    """(H, 4) what the odds of a hypothesis depend on: 1, the amount of evidence, the share that conflicts, and the score, from
-    metres that agree, metres that conflict and m2 of floor in common (H, 3)."""
+    """Return (H, 4) what the odds of a hypothesis depend on: 1, the amount of evidence, the share that conflicts, and the score,
+    from metres that agree, metres that conflict and m2 of floor in common (H, 3)."""
     agree, conflict, floor = evidence.T
     score = agree - CONFLICT * conflict + FLOOR * floor
     return np.stack([np.ones(len(agree)), np.log1p(agree), conflict / (agree + 3), score / 10], axis=1)
@@ -55,7 +55,7 @@ def compute_hypothesis_probability(evidence: Array) -> Array:
 
 
 def compute_match_features(a: TopometricMap, b: TopometricMap, rooms: Array, fit: Array) -> Array:
-    """(M, 5) 1, how well two rooms fit, log m2 of the smaller one, how many of both are mostly unseen, and whether one of
+    """Return (M, 5) 1, how well two rooms fit, log m2 of the smaller one, how many of both are mostly unseen, and whether one of
     both is in several matches.
 
     Args:
@@ -69,7 +69,8 @@ def compute_match_features(a: TopometricMap, b: TopometricMap, rooms: Array, fit
 
 
 def compute_match_probability(a: TopometricMap, b: TopometricMap, rooms: Array, fit: Array) -> Array:
-    """(M,) that rooms which share floor under the right transform are one: scraps, glimpses and pieces of a room seldom are."""
+    """Return (M,) that rooms which share floor under the right transform are one: scraps, glimpses and pieces of a room seldom
+    are."""
     out: Array = 1 / (1 + np.exp(-compute_match_features(a, b, rooms, fit) @ load_odds_weights(MATCH)))
     return out
 
@@ -226,7 +227,7 @@ def _build_poses(to: Array, point: Array, yaw: Array, scale: Array, weight: Arra
 
 
 def _compute_lift(a: TopometricMap, b: TopometricMap, i: Array, j: Array, scale: Array) -> Array:
-    """(H,) m, z of the poses that bring the floors of the storeys of rooms j of b onto those of rooms i of a."""
+    """Return (H,) m, z of the poses that bring the floors of the storeys of rooms j of b onto those of rooms i of a."""
     floors = [m.storeys["floor"][m.rooms["storey"][rooms]] for m, rooms in ((a, i), (b, j))]
     return np.asarray(floors[0] - scale * floors[1])
 
@@ -268,7 +269,7 @@ NEAR_SCALE = 1.16  # factor by which the scale of a pose differs from that at wh
 
 
 class Sampled(NamedTuple):
-    """What of a map is laid over the other's plan."""
+    """Samples of a map that are laid over the other's plan."""
 
     places: Array
     storey: Array
@@ -294,6 +295,7 @@ def propose_hypotheses(
     """
     plans = (build_room_plans(a), build_room_plans(b))
     pairs = select_best_partners(cost, CONSISTENCY.partners)
+    # From rooms alone, not the search of walls: only so do descriptors reach a merge (docs/adr/0010).
     poses = propose_candidate_poses(a, b, plans, pairs, similarity[tuple(pairs.T)] + 1e-3, scale_free, scale)
     if not len(poses):
         return ()
@@ -367,7 +369,7 @@ def count_votes(poses: PoseArrays) -> Array:
 
 
 def _score_poses(poses: PoseArrays, plans: tuple[RoomPlans, RoomPlans], look: int) -> Array:
-    """(H, 4) score, m of walls that agree, m that conflict, m2 of floor in common; the mean of b on a and of a on b.
+    """Return (H, 4) score, m of walls that agree, m that conflict, m2 of floor in common; the mean of b on a and of a on b.
 
     Args:
         look: 0 the first one, 1 the last one, with more samples.

@@ -23,8 +23,8 @@ class PoseHypothesis:
 
     Args:
         transform: T_ab.
-        score: what the last step ranks hypotheses by: the agreement of walls in `fusion.search`, m of walls in
-            `matching.consistency`, log odds that it is right, seen by itself, after `fusion.verify.rank`.
+        score: what the last step ranks hypotheses by: the agreement of walls in `registration.search`, m of walls in
+            `matching.consistency`, log odds that it is right, seen by itself, after `registration.verify.rank`.
         probability: that it is right, beside all others; with "none of them" these sum to 1.
         features: what it was judged by, name -> number.
         from_rooms: was it proposed by matched rooms? Correlation never pushes such a one out.
@@ -377,6 +377,6 @@ def _refine_group(
 
 
 def _place_point(transform: Sim3, point: Array) -> Array:
-    """(2,) m, where a transform puts a point (2,)."""
+    """Return (2,) m, where a transform puts a point (2,)."""
     out: Array = transform.apply(np.array([[*point, 0.0]]))[0, :2]
     return out

@@ -26,6 +26,7 @@ from topomerge.types import Array
 
 MATCHER_FILE = "room_matcher.onnx"
 ATTENTION_HEADS = 4
+# Displacements, not coordinates: maps are turned to their walls, so that these are the same in both (docs/adr/0017).
 RINGS = np.array([0.0, 2.0, 4.0, 7.0, 11.0, 16.0, 24.0])  # m: how far another room is
 RING_WIDTH = (0.5, 0.3)  # m, and share of the ring's distance
 WAY_SOFT = 3.0  # m, at which half of the way to a room is told by its direction
@@ -36,6 +37,7 @@ VOTE_UNIT = 3.0  # votes are logarithms of 1 + so many times their sum
 LEVEL_GAP = 0.8  # m: storeys of ways that agree differ by less
 VOTERS = 3  # pairs of rooms that vote, times the number of rooms of both maps,
 MOST_VOTERS = 2000  # and at most
+# Pairs of rooms grow with the product of both maps (docs/adr/0017).
 MOST_VOTED = 20_000  # pairs of rooms that are voted for, the likeliest ones
 FIRST_SHARPNESS = 25.0  # that cosines are multiplied with for the first votes
 LIKENESS_SCALE = 10.0  # that likeness is multiplied with, times what is learned
@@ -63,7 +65,7 @@ class Matcher:
 
 @dataclass(frozen=True, eq=False)
 class RoomsSeen:
-    """What the network sees of the rooms of a map.
+    """Inputs of the network from the rooms of a map.
 
     Args:
         rows: (R, 4 D) of length 1, of the map as it is turned (`TurnedRows.flatten`).
@@ -120,6 +122,7 @@ def compute_room_odds(a: Rows, b: Rows, likeliest: bool = False) -> tuple[RoomOd
     """
     matcher = load_matcher_weights()
     for rows in (a, b):
+        # Rows of another embedder mean something else: the weights name theirs by its hash (docs/adr/0017).
         if not isinstance(rows, TurnedRows) or not len(rows) or rows.facts is None or rows.embedder != matcher.embedder:
             return ()
     assert isinstance(a, TurnedRows) and isinstance(b, TurnedRows)
@@ -144,6 +147,7 @@ def match_turns(a: TurnedRows, b: TurnedRows, matcher: Matcher, likeliest: bool 
         turns = (max(turns, key=lambda turn: turn.probability),)
     turns = tuple(turn for turn in turns if turn.probability >= LEAST_TURN)
     found = [_match_turn(turn, matcher) for turn in turns]
+    # At wrong turns no room has a partner; the network was trained with such pairs, so that its confidence tells (docs/adr/0017).
     evidence = np.log([turn.probability for turn in turns]) + [odds.confidence for odds in found]
     return tuple(replace(odds, probability=float(p)) for odds, p in zip(found, compute_shares(evidence), strict=True))
 
@@ -184,6 +188,7 @@ def run_network(a: RoomsSeen, b: RoomsSeen, matcher: Matcher) -> RoomOdds:
         feeds |= {f"rows_{side}": map.rows, f"facts_{side}": map.facts, f"places_{side}": map.places - map.places.mean(axis=0)}
         feeds |= {f"heights_{side}": map.heights - map.heights.mean(), f"state_{side}": np.zeros((len(map.rows), matcher.width))}
     likely = compute_first_guess(a.rows @ b.rows.T)
+    # One stage a call, as pairs of rooms vote between two of them, in a compiled loop (docs/adr/0025).
     for stage in range(matcher.stages):
         feeds |= {"stage": np.arange(matcher.stages) == stage, "votes": compute_agreement(likely, a, b)}
         feeds["state_a"], feeds["state_b"], rows, columns = matcher.run(**feeds)
@@ -192,7 +197,7 @@ def run_network(a: RoomsSeen, b: RoomsSeen, matcher: Matcher) -> RoomOdds:
 
 
 def compute_first_guess(cosine: Array) -> Array:
-    """(R_a, R_b) how likely each pair of rooms is by their rows alone: what votes in the first stage."""
+    """Return (R_a, R_b) how likely each pair of rooms is by their rows alone: what votes in the first stage."""
     from scipy.special import softmax
 
     likely: Array = np.sqrt(softmax(FIRST_SHARPNESS * cosine, axis=1) * softmax(FIRST_SHARPNESS * cosine, axis=0))
@@ -200,7 +205,7 @@ def compute_first_guess(cosine: Array) -> Array:
 
 
 def compute_agreement(likely: Array, a: RoomsSeen, b: RoomsSeen) -> Array:
-    """(R_a, R_b, 2) how much of a matching agrees with each pair of rooms on the way from one map to the other.
+    """Return (R_a, R_b, 2) how much of a matching agrees with each pair of rooms on the way from one map to the other.
 
     Args:
         likely: (R_a, R_b) how likely each pair is.
@@ -244,7 +249,7 @@ def build_signature(numbers: int, width: int, stages: int) -> Signature:
 
 
 def load_matcher_weights() -> Matcher:
-    """Load the network that ships, or the one in its place (`io.weight_files`)."""
+    """Load the network that ships, or the one in its place (`archive.find_weights_file`)."""
     return read_matcher(find_weights_file(WEIGHTS_PACKAGE, MATCHER_FILE))
 
 

@@ -53,7 +53,7 @@ class RoomPlans:
 
     @cached_property
     def fields(self) -> tuple[PlanFields, ...]:
-        """What poses are refined by, of each storey."""
+        """Return the fields of each storey by which poses are refined."""
         return tuple(PlanFields(plan) for plan in self.plans)
 
     @cached_property
@@ -128,7 +128,7 @@ def build_room_plans(map: TopometricMap) -> RoomPlans:
 
 
 def _build_storey_plan(map: TopometricMap, storey: int, navigable: Array) -> StoreyPlan:
-    """The plan of a storey; its inside is its navigable floor (nx, ny)."""
+    """Return the plan of a storey; its inside is its navigable floor (nx, ny)."""
     grid, levels = map.grid, (float(map.storeys["floor"][storey]), float(map.storeys["ceiling"][storey]))
     floor = np.full(navigable.shape, levels[0])
     ix, iy = np.ascontiguousarray(grid.cells[:, :2].T.astype(np.int64))

@@ -1,4 +1,4 @@
-"""What each pixel of a drawn floor plan shows: a convolutional network, trained on plans drawn in many hands
+"""Classes of the pixels of a drawn floor plan: a convolutional network, trained on plans drawn in many hands
 (`train.py task=drawing_segmentation`; beyond the thesis: docs/adr/0032)."""
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def compute_drawing_probabilities(picture: Array, network: Run | None = None) ->
 
 
 def _look(x: Array, run: Run, turn: int) -> Array:
-    """(1, 8, h, w) probabilities of (1, 3, h, w), looked at after so many quarter turns."""
+    """Return (1, 8, h, w) probabilities of (1, 3, h, w), looked at after so many quarter turns."""
     (probability,) = run(picture=np.ascontiguousarray(np.rot90(x, turn, (2, 3))))
     return np.rot90(probability, -turn, (2, 3))
 

@@ -123,7 +123,7 @@ def load_network(path: Path, signature: Signature) -> Network:
 
 
 def load_shipped_network(name: str, signature: Signature) -> Network:
-    """Load a network that ships, or the one in its place (`io.weight_files`)."""
+    """Load a network that ships, or the one in its place (`archive.find_weights_file`)."""
     return load_network(find_weights_file(WEIGHTS_PACKAGE, name), signature)
 
 

@@ -70,7 +70,7 @@ def place_by_hand(
 
 
 def _list_poses_near(a: Prepared, b: Prepared, start: Sim3) -> list[Sim3]:
-    """A pose, and others about it in the directions of the walls, turned about the middle of map b and shifted."""
+    """Return a pose, and others about it in the directions of the walls, turned about the middle of map b and shifted."""
     middle = b.middle
     target = start.apply(middle[None])[0]
     poses = [start]
@@ -152,7 +152,7 @@ def _lay_on(yaw: float, place: Array, target: Array, height: float) -> Sim3:
 
 
 def _measure_sides(map: TopometricMap, room: int, yaw: float) -> Array:
-    """(3, 2) m, where the floor of a room begins, has its middle and ends along x and y, after the map was turned."""
+    """Return (3, 2) m, where the floor of a room begins, has its middle and ends along x and y, after the map was turned."""
     cells = map.navigable.compute_centroids(map.navigable.cells[map.navigable_room == room])
     places = Sim3(yaw).apply(cells)[:, :2]
     low, high = places.min(axis=0), places.max(axis=0)

@@ -57,7 +57,8 @@ class Judge:
         return {**_features(counts, max(gaps)), "sliced": float(sliced), "ceilings": unlike, "ceiling_area": area}
 
     def tally(self, pose: Sim3, step: int = 1) -> Array:
-        """(2, 11) of `align.tally`, m2 in a's frame: of the columns of b, and of those of a; of every n-th one, times n."""
+        """Return (2, 11) of `align.tally`, m2 in a's frame: of the columns of b, and of those of a; of every n-th one, times
+        n."""
         out = np.zeros((2, 11))
         back = pose.inverse()
         for v, w in pair_storeys(self.a, self.b, pose.translation[2], pose.scale):
@@ -82,8 +83,8 @@ class Judge:
         return (float(np.concatenate(deviations).mean()), area) if deviations else (0.0, 0.0)
 
     def lift_pose(self, pose: Sim3) -> Sim3:
-        """The pose raised so that ceilings meet, where the floor of a map was not seen: rooms' ceilings differ in height, so that
-        the storey's alone is no good measure."""
+        """Return the pose raised so that ceilings meet, where the floor of a map was not seen: rooms' ceilings differ in height,
+        so that the storey's alone is no good measure."""
         gaps = []
         for v, w in pair_storeys(self.a, self.b, pose.translation[2], pose.scale):
             floors, ceilings = (np.isfinite([v.plan.levels[k], w.plan.levels[k]]).all() for k in (0, 1))
@@ -96,8 +97,8 @@ class Judge:
         return replace(pose, translation=(x, y, z + float(np.clip(np.median(lifts), -1.2, 1.2))))
 
     def _measure_ceiling_gap(self, v: PlanFields, w: PlanFields, pose: Sim3, step: int = 1) -> tuple[Array, Array]:
-        """(n,) m by which the ceilings of a lie above those of b before any shift, where both saw free ground; and the columns
-        (n, 2) of a."""
+        """Return (n,) m by which the ceilings of a lie above those of b before any shift, where both saw free ground; and the
+        columns (n, 2) of a."""
         under = self._sample_ceilings(w)[::step]
         c, s = pose.scale * np.cos(pose.yaw), pose.scale * np.sin(pose.yaw)
         x, y = under[:, 0], under[:, 1]
@@ -112,7 +113,7 @@ class Judge:
         return gap[compared], np.column_stack([i[compared], j[compared]])
 
     def _sample_ceilings(self, fields: PlanFields) -> Array:
-        """(n, 4) place, ceiling and floor, m, of some of the free columns under a ceiling."""
+        """Return (n, 4) place, ceiling and floor, m, of some of the free columns under a ceiling."""
         if id(fields) not in self._rows:
             p = fields.plan
             rows = np.argwhere(p.free & np.isfinite(p.ceiling))
@@ -159,6 +160,7 @@ class Side:
         rows = np.argwhere(kind > 0)
         self.weight = fields.plan.edge**2 * max(len(rows) / JUDGED_COLUMNS, 1.0)
         if len(rows) > JUDGED_COLUMNS:
+            # A fixed seed: the same maps have the same verdict.
             rows = rows[np.sort(np.random.default_rng(0).permutation(len(rows))[:JUDGED_COLUMNS])]
         at = (rows[:, 0], rows[:, 1])
         self.points = fields.plan.origin + (rows + 0.5) * fields.plan.edge
@@ -226,8 +228,8 @@ def compute_winner_features(judge: Judge, pose: Sim3) -> dict[str, float]:
 
 
 def _compare_walls(source: PlanFields, target: PlanFields, move: Sim3) -> tuple[Array, float]:
-    """(n, 6) of each wall column: place in the other map, is it on known ground, does it agree, direction, m2; and the m2 of high
-    walls in runs that stand on free ground."""
+    """Return (n, 6) of each wall column: place in the other map, is it on known ground, does it agree, direction, m2; and the m2
+    of high walls in runs that stand on free ground."""
     points = source.walls
     at = move.apply(np.column_stack([points, np.zeros(len(points))]))[:, :2]
     cells = np.floor((at - target.plan.origin) / target.plan.edge).astype(np.int64)

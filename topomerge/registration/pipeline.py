@@ -41,6 +41,8 @@ from topomerge.types import Sim3, TopometricMap, VoxelGrid
 
 AS_GOOD = 1.5  # log odds: less is no lead
 TESTIFIED = 3  # hypotheses that are bent, too, of those that landmarks speak for most
+# Between rigid maps drift makes the right pose look worse, and wrong ones hardly better: rivals are bent, too. That took the
+# real floor from 37 to about 60 believed pairs of 105 (docs/adr/0015).
 CLOSELY = 3  # hypotheses that are bent at most, the best ones; and one more that no ratio speaks against
 RIGID_FEATURES = {"strain": 0.0, "bent": 0.0, "farthest": 0.0, "doubted": 0.0, "bent_pieces": 0.0, "rmse": float("nan")}
 log = logging.getLogger(__name__)
@@ -133,6 +135,7 @@ def build_candidates(
     if scorer is not None:
         closely += [k for k in select_testified(ranked, scorer) if k not in closely]
     near = [ranked[k] for k in closely]
+    # Bending is half of the time of a registration: it is not done again when rooms propose further poses (docs/adr/0021).
     new = [h for h in near if id(h) not in bent]
     built = run_side_by_side(lambda h: build_candidate(a, b, h, scaled, scorer), new)
     bent |= {id(h): candidate for h, candidate in zip(new, built, strict=True)}
@@ -169,7 +172,7 @@ class Registration:
         reason: in words.
         seconds: step -> s.
         bend: how the maps are bent onto each other under the transform; None where a rigid pose was asked for.
-        posterior: probability of this place and of each named alternative (`fusion.posterior`); they sum to 1.
+        posterior: probability of this place and of each named alternative (`registration.posterior`); they sum to 1.
         places: what both maps show of each place that they share under it, and how much that speaks for it.
         landmarks: what signs, tags and the like say of it.
         walls: the probability without landmarks.
@@ -222,6 +225,7 @@ def register(
         raise InputError(f"scale must be fixed or free, not {scale!r}")
     clock = Stopwatch()
     tell_step(0.0, "draw plans")
+    # More than half of the pose's time goes into each map by itself (docs/adr/0050).
     a, b = run_side_by_side(lambda k: _prepare_completely((a, b)[k], free[k]), (0, 1))
     clock.lap("plans")
     if b.order < a.order:  # so that nothing depends on which comes first
@@ -230,11 +234,14 @@ def register(
         return replace(_invert_registration(swapped), seconds={**swapped.seconds, **clock.seconds})
     pair = _Pair(a, b, scale == "free", clock)
     fallback, first = (proposed, ()) if isinstance(proposed, FallbackProposals) else (None, proposed)
+    # Without the search rivals are missing, and wrong places are believed (docs/adr/0021).
     if searched:
         pair.search([*first, *pair.propose_by_landmarks()])
     else:
         pair.add(first)
     probability = pair.score_candidates(same)
+    # Walls first: on 800 rooms their search takes 1.3 s, rows and matching of rooms 55 s, and rooms hardly ever decide
+    # (docs/adr/0021).
     if fallback is not None and probability < fallback.below:
         tell_step(0.6, "match rooms")
         pair.add(fallback.make())
@@ -246,7 +253,7 @@ def register(
 
 
 def _prepare_completely(map: Map | Prepared, free: VoxelGrid | None) -> Prepared:
-    """What registration needs of a map; where several threads share loops, drawn at once, beside the other map."""
+    """Prepare a map for registration; where several threads share loops, completely, beside the other map."""
     if isinstance(map, Prepared):
         return map
     prepared = prepare(map, free)
@@ -334,7 +341,7 @@ def _refine_candidate(a: Prepared, b: Prepared, best: Candidate, scaled: bool, r
 
 
 def _build_registration(ranked: Sequence[PoseHypothesis], examined: Sequence[Candidate], verdict: Verdict) -> Registration:
-    """The best of the candidates, with its probability and the reason in words."""
+    """Return the best of the candidates, with its probability and the reason in words."""
     best, probability = examined[0], verdict.each[0]
     margin = min(best.odds - examined[1].odds, MARGIN_CAP) if len(examined) > 1 else MARGIN_CAP
     features = {**verdict.features, "rigid_conflict_share": best.hypothesis.features["conflict_share"], "margin": margin}
@@ -368,7 +375,7 @@ def refine_by_surfaces(a: Prepared, b: Prepared, start: Sim3, scaled: bool = Fal
 
 
 def _invert_registration(registration: Registration) -> Registration:
-    """The same registration seen from the other map."""
+    """Return the same registration seen from the other map."""
     others = tuple(replace(h, transform=h.transform.inverse()) for h in registration.alternatives)
     transform = None if registration.transform is None else registration.transform.inverse()
     bent = registration.bend and registration.bend.inverse()

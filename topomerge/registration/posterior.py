@@ -105,8 +105,8 @@ def update_posterior(
 
 
 def find_threshold(risk: float, curve: Sequence[Sequence[float]]) -> float:
-    """The probability from which on a merge is believed so that of a thousand pairs, drawn by `PRIORS`, at most `risk` are merged
-    falsely.
+    """Return the probability from which on a merge is believed so that of a thousand pairs, drawn by `PRIORS`, at most `risk` are
+    merged falsely.
 
     Args:
         curve: (threshold, false merges in a thousand), rising thresholds: measured on pairs that were left out.

@@ -1,4 +1,4 @@
-"""What registration and bending need of a map, made when it is first needed and once only."""
+"""A map prepared for registration and bending: each part is made when it is first needed and once only."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ UNBENT = ("drawing", "raised")  # sensors whose maps mostly stay as they are
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What is drawn from a map; the map itself may be loaded again when it is needed.
+    """A prepared map; the map itself may be loaded again when it is needed.
 
     Args:
         load: gives the map, topometric or occupied cells.
@@ -92,6 +92,7 @@ class Prepared:
         large for that."""
         if sum(fields.plan.wall.size for fields in self.storeys) > SENT_COLUMNS:
             return None
+        # Drawn beside the cloud's extraction, in its process: after it one process would work alone (docs/adr/0050).
         known = {name: value for name, value in vars(self.complete()).items() if name not in ("load", "make_surface")}
         sliced = any(fields.plan.sliced for fields in self.storeys)
         return {**known, "surface": None if sliced else self.make_surface()}

@@ -88,7 +88,7 @@ def refine_pose(
 
 
 def _sample_points(b: Surface, rows: Array) -> Array:
-    """A sample that has as many upright planes as level ones: floors fix the height only."""
+    """Return a sample that has as many upright planes as level ones: floors fix the height only."""
     level = np.abs(b.normals[rows, 2]) > 0.7
     rng = np.random.default_rng(0)
     chosen = [rng.permutation(rows[mask])[: MOVED_POINTS * part // 4] for mask, part in ((level, 1), (~level, 3))]

@@ -81,6 +81,8 @@ class SearchSettings:
     conflict_weight: float = 0.75
     least_walls: int = 20
     height_gap: float = 0.4
+    # With 100 hypotheses and fewer peaks rivals of two wrong poses of the real floor were missing, so these were believed;
+    # more than 200 take right poses with them, as the verdict was fitted with fewer rivals (docs/adr/0021).
     per_yaw: int = 24
     peak_distance: float = 0.6
     hypotheses: int = 200
@@ -231,12 +233,13 @@ def find_scale_candidates(v: PlanFields, w: PlanFields, yaws: Sequence[float]) -
     return sorted(candidates, reverse=True)
 
 
+# A fixed seed: the same maps have the same pose.
 def _sample(walls: Array) -> Array:
     return walls if len(walls) <= PROJECTED_WALLS else walls[np.random.default_rng(0).permutation(len(walls))[:PROJECTED_WALLS]]
 
 
 def _compute_heap_profiles(at: Array, size: int) -> Array:
-    """(S, size) how much higher than around it the projections (n, S), m, are heaped up; unit norm."""
+    """Return (S, size) how much higher than around it the projections (n, S), m, are heaped up; unit norm."""
     columns = np.floor((at - at.min(axis=0)) / HEAP_BIN).astype(np.int64)
     flat = (columns + np.arange(at.shape[1]) * size).ravel()
     counts = np.bincount(flat, minlength=at.shape[1] * size).reshape(at.shape[1], size).astype(np.float64)

@@ -1,4 +1,4 @@
-"""What each storey of a map shows from above: walls, empty space and clutter, by which registration goes (method 4).
+"""Storeys of a map seen from above: walls, empty space and clutter, by which registration goes (method 4).
 
 Storeys are found by their floors and ceilings, by layers of slices, or by lines that were given walls. A *wall* column is filled
 at most of the heights between 0.5 and 2.0 m above the floor; a *free* one has a floor or a ceiling and nothing between, or rays
@@ -55,8 +55,8 @@ def is_extruded(grid: VoxelGrid) -> bool:
 
 
 def extract_lines(grid: VoxelGrid) -> tuple[VoxelGrid, VoxelGrid]:
-    """The lines of such a map at the height of the floor that it was given, where its sensor looked; and that floor, over which
-    it looked."""
+    """Return the lines of such a map at the height of the floor that it was given, where its sensor looked; and that floor, over
+    which it looked."""
     level = grid.cells[:, 2] - grid.cells[:, 2].min()
     lines, floor = grid.cells[level == 1] - (0, 0, 1), grid.cells[level == 0]
     drawn = VoxelGrid.from_cells(lines, grid.origin, grid.edge, grid.shape)
@@ -188,6 +188,7 @@ def build_plans(map: TopometricMap | VoxelGrid, free: VoxelGrid | None = None, c
         lattice = (heights, -HEIGHT_BANDS.below * HEIGHT_BANDS.step, HEIGHT_BANDS.step)
         occupied = compute_column_bits(ix, iy, z, *lattice)
         crossed = compute_column_bits(*crossing, *lattice) if crossing else np.zeros(shape, np.uint32)
+        # Without the limit the highest thing of a room below another storey was the floor above (docs/adr/0015).
         high = _estimate_ceiling(ix, iy, np.where(z < next_floor - SLAB, z, np.nan), base, ceiling, shape)
         rasters = (occupied, crossed, heights, high - heights)
         storeys_seen.append(_build_plan(rasters, corner, cell, (floor, ceiling), bool(layers)))
@@ -205,7 +206,7 @@ def _find_crossed_columns(free: VoxelGrid, corner: Array, cell: float) -> tuple[
 
 
 def _estimate_local_floor(ix: Array, iy: Array, z: Array, heights: Array) -> Array:
-    """The floor under each column: drift and a tilted map raise and lower it by a few centimetres."""
+    """Return the floor under each column: drift and a tilted map raise and lower it by a few centimetres."""
     near = np.abs(z - heights[ix, iy]) < 0.3
     lowest = np.full(heights.shape, np.inf)
     np.minimum.at(lowest, (ix[near], iy[near]), z[near])
@@ -218,7 +219,7 @@ def _estimate_local_floor(ix: Array, iy: Array, z: Array, heights: Array) -> Arr
 
 
 def _estimate_ceiling(ix: Array, iy: Array, z: Array, base: float, ceiling: float, shape: tuple[int, ...]) -> Array:
-    """(H, W) m: the highest cell of each column that may be this storey's ceiling; nan where none is."""
+    """Return (H, W) m: the highest cell of each column that may be this storey's ceiling; nan where none is."""
     high = np.full(shape, -np.inf)
     if np.isfinite(ceiling):
         near = (z > base + 2.0) & (z < ceiling + 1.0)
@@ -227,7 +228,7 @@ def _estimate_ceiling(ix: Array, iy: Array, z: Array, base: float, ceiling: floa
 
 
 def _build_plan(rasters: tuple[Array, ...], origin: Array, cell: float, levels: tuple[float, float], sliced: bool) -> StoreyPlan:
-    """The plan of a storey.
+    """Return the plan of a storey.
 
     Args:
         rasters: (nx, ny) each: bits of the bands that cells fill and that rays crossed; height of the floor, m, and of the
@@ -253,7 +254,7 @@ def _build_plan(rasters: tuple[Array, ...], origin: Array, cell: float, levels: 
 
 
 def _find_straight_runs(mask: Array, cell: float) -> Array:
-    """What a slice shows of walls: straight runs beside which little stands. Legs and chairs are as dense, but stand in heaps."""
+    """Find the walls in a slice: straight runs beside which little stands. Legs and chairs are as dense, but stand in heaps."""
     angles = np.pi * np.arange(24) / 24
     long = max(round(STRAIGHT_RUN / cell), 3)
     straight: Array = find_line_columns(mask, np.cos(angles), np.sin(angles), long, long - 1, max(round(BESIDE_RUN / cell), 2))

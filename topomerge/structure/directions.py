@@ -19,7 +19,8 @@ DIRECTION_BIN = 0.1  # m, into which walls are projected
 
 
 def compute_direction_profile(walls: Array, edge: float, most: int = 6000) -> Array:
-    """(360,) float64: for each direction in steps of 0.5 degrees, how much the walls' projection across it is heaped up."""
+    """Return (360,) float64: for each direction in steps of 0.5 degrees, how much the walls' projection across it is heaped
+    up."""
     if not len(walls):
         return np.zeros(int(180 / DIRECTION_STEP))
     rng = np.random.default_rng(0)

@@ -120,7 +120,7 @@ class _Plan:
 
 
 def _rasterise_floor(columns: Array, edge: float) -> _Plan | None:
-    """The floor over columns (n, 2) of a grid."""
+    """Return the floor over columns (n, 2) of a grid."""
     if not len(columns):
         return None
     reach = max(round(CLOSED_GAP / edge), 1)
@@ -169,7 +169,7 @@ def _straighten_walls(cells: shapely.MultiPolygon) -> shapely.MultiPolygon:
 
 
 def _straighten_ring(corners: Array) -> Array:
-    """(k, 2) corners of a ring around cells -> (j, 2) corners of one with straight walls, all in cells.
+    """Return (k, 2) corners of a ring around cells -> (j, 2) corners of one with straight walls, all in cells.
 
     The middles of the cells' sides lie nearer to the wall than their corners do. Walls are found among them (Douglas and Peucker
     1973) and fitted by least squares.
@@ -200,7 +200,7 @@ def _remove_bevels(walls: list[Array]) -> list[Array]:
 
 
 def _intersect_walls(walls: list[Array]) -> Array:
-    """(j, 2) where walls, given by points (n, 2) along them, meet; two for walls side by side."""
+    """Return (j, 2) where walls, given by points (n, 2) along them, meet; two for walls side by side."""
     lines = [_fit_line(points) for points in walls]
     corners: list[Array] = []
     for k in range(len(walls)):
@@ -227,7 +227,7 @@ def _fit_line(points: Array) -> tuple[Array, Array]:
 
 
 def _intersect_lines(a: tuple[Array, Array], b: tuple[Array, Array]) -> Array | None:
-    """(2,) where two lines meet; None where they are too nearly parallel to say."""
+    """Return (2,) where two lines meet; None where they are too nearly parallel to say."""
     cross = a[1][0] * b[1][1] - a[1][1] * b[1][0]
     if abs(cross) < 0.2:
         return None
@@ -237,7 +237,7 @@ def _intersect_lines(a: tuple[Array, Array], b: tuple[Array, Array]) -> Array | 
 
 
 def _collect_polygons(shape: Any, least: float = 0.0) -> shapely.MultiPolygon:
-    """The polygons in any shape, counter-clockwise; those smaller than `least` only where there are no others."""
+    """Return the polygons in any shape, counter-clockwise; those smaller than `least` only where there are no others."""
     parts = [p for p in shapely.get_parts(shape) if p.geom_type == "Polygon" and p.area > 0]
     large = [p for p in parts if p.area >= least] or parts
     return shapely.MultiPolygon([shapely.geometry.polygon.orient(p) for p in large])
@@ -305,7 +305,7 @@ def select_face_points(map: TopometricMap, storey: int, floors: list[shapely.Mul
 
 
 def find_wall_columns(points: FacePoints, room: int) -> tuple[Array, Array]:
-    """(n, 2) where the columns of a room that fill like walls stand, m, and (n,) m of wall that each is."""
+    """Return (n, 2) where the columns of a room that fill like walls stand, m, and (n,) m of wall that each is."""
     rows = np.flatnonzero(points.upright & (points.room == room))
     _, column, count = np.unique(points.column[rows], return_inverse=True, return_counts=True)
     at = np.column_stack([np.bincount(column, points.at[rows, k], len(count)) / np.maximum(count, 1) for k in (0, 1)])

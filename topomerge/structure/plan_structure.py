@@ -184,7 +184,7 @@ def _is_along(line: Line, edge: Line) -> bool:
 
 
 def _label_pieces(pieces: Array, floor: shapely.MultiPolygon, seen: shapely.Geometry) -> Array:
-    """(n,) bool: which pieces are room."""
+    """Return (n,) bool: which pieces are room."""
     area = shapely.area(pieces)
     inside = shapely.area(shapely.intersection(pieces, floor))
     a, b, edges = _find_borders(pieces)
@@ -320,7 +320,7 @@ def _measure_gap(a: _Face, b: _Face) -> float:
 
 
 def _find_room_side(line: Line, floor: shapely.MultiPolygon) -> Array:
-    """(2,) across a line to where the room lies; 0 where it lies on both sides or on none."""
+    """Return (2,) across a line to where the room lies; 0 where it lies on both sides or on none."""
     at = line.ends[0] + SAMPLES[:, None] * (line.ends[1] - line.ends[0])
     left, right = (float(_is_within(floor, at + line.across * way).mean()) for way in (BESIDE_LINE, -BESIDE_LINE))
     return line.across * (0 if abs(left - right) < 0.3 else 1 if left > right else -1)
@@ -338,7 +338,7 @@ def _shift_line(line: Line, off: Array, extent: Line) -> Line:
 
 @dataclass(frozen=True, eq=False)
 class PlanStructure:
-    """What stands between rooms.
+    """Walls, openings and windows between the rooms of a map.
 
     Args:
         walls: (W,) WALL_DTYPE, by storey.

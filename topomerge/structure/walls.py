@@ -163,7 +163,8 @@ WIDEST = 3.5  # m: wider openings are no hole in a wall
 
 
 def build_wall_polygon(wall: Any, opening: Any = None, more: float = 0.0) -> shapely.Polygon:
-    """A wall (a row of WALL_DTYPE) from above, or what an opening (a row of OPENING_DTYPE) takes of it; counter-clockwise, m.
+    """Return a wall (a row of WALL_DTYPE) from above, or what an opening (a row of OPENING_DTYPE) takes of it; counter-clockwise,
+    m.
 
     Args:
         more: m by which it is thicker on either side.
@@ -221,7 +222,7 @@ def detect_walls(map: TopometricMap, storey: int, rooms: list[shapely.MultiPolyg
 
 
 def _collect_faces(map: TopometricMap, storey: int, rooms: list[shapely.MultiPolygon], points: FacePoints) -> list[_Face]:
-    """The edges of all outlines of a storey."""
+    """Return the edges of all outlines of a storey."""
     upright = points.upright
     tree = shapely.STRtree(shapely.points(points.at[upright]))
     at, scale = points.at[upright], 0.1 / points.edge
@@ -312,7 +313,7 @@ Row = tuple[Array, Array, float, int, tuple[int, int]]
 
 
 def _build_double_wall(f: _Face, g: _Face, start: float, end: float) -> Row | None:
-    """The wall between two faces, from `start` to `end` on the first; None where neither was seen."""
+    """Return the wall between two faces, from `start` to `end` on the first; None where neither was seen."""
     along = f.along - g.along
     along /= np.hypot(*along)
     ends = [f.a + f.along * t for t in (start, end)]

@@ -30,14 +30,14 @@ PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 class UploadError(InputError):
     """A file that is not taken; `status` is that of HTTP."""
 
-    def __init__(self, words: str, status: int = 400) -> None:
-        super().__init__(words)
+    def __init__(self, message: str, status: int = 400) -> None:
+        super().__init__(message)
         self.status = status
 
 
 @dataclass(frozen=True)
 class UploadLimits:
-    """What may be added: bytes of a file, files in the folder, and files at a time."""
+    """Limits of uploads: bytes of a file, files in the folder, and files at a time."""
 
     file_bytes: int = 50 << 30
     files: int = 2000
@@ -140,7 +140,7 @@ class StudioFolder:
             shutil.rmtree(place, ignore_errors=True)
 
     def _iter_paths(self, folder: Path) -> Iterator[Path]:
-        """What is visible of a folder and lies in it: links that lead out are left out."""
+        """Yield the visible entries of a folder, without links that lead out of it."""
         try:
             names = sorted(entry.name for entry in os.scandir(folder) if not entry.name.startswith("."))
         except OSError:
@@ -151,7 +151,7 @@ class StudioFolder:
                 yield path
 
     def _list_joined(self, folder: Path, kind: str) -> list[dict[str, Any]]:
-        """The joined maps of a merge or an atlas, which are opened like any other."""
+        """Return the joined maps of a merge or an atlas, which are opened like any other."""
         maps = [p for p in self._iter_paths(folder) if re.fullmatch(r"map(_\d+)?\.tmap", p.name)]
         described = [(p, _describe_entry(p, self._get_stamp(p))) for p in maps]
         return [{"path": self.name(p), **d, "of": kind} for p, d in described if d is not None]
@@ -177,7 +177,7 @@ def clean_name(name: str) -> str:
 
 @lru_cache(maxsize=4 * MOST_ENTRIES)
 def _describe_entry(path: Path, stamp: tuple[int, int]) -> dict[str, Any] | None:
-    """What an entry of the folder is; None: nothing that the page shows. Read again when its stamp changes."""
+    """Describe an entry of the folder; None where the page does not show it. It is read again when its stamp changes."""
     about = {"name": path.name, "bytes": stamp[1], "changed": stamp[0] // 1_000_000}
     suffix = path.suffix.lower()
     if path.is_dir():

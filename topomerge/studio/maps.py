@@ -147,7 +147,7 @@ class OpenMaps:
 
 
 def _build(held: OpenMap, wish: Mapping[str, Any]) -> Edit:
-    """The edit that somebody wants."""
+    """Return the edit that somebody wants."""
     values = dict(wish)
     op, by, storey = str(values.pop("op", "")), str(values.pop("by", ""))[:64], values.pop("storey", 0)
     if op in TAKE_BACK:
@@ -170,7 +170,7 @@ def _lift(map: TopometricMap, places: list[Any], storey: Any) -> list[Any]:
 
 
 def _apply(held: OpenMap, journal: Journal, after: EditedMap | None = None) -> OpenMap:
-    """The map with another state of its journal.
+    """Return the map with another state of its journal.
 
     Args:
         held: with the state before.
@@ -198,7 +198,7 @@ def _takes_back(edits: Sequence[Edit]) -> bool:
 
 
 def _list_journal(journal: Journal) -> dict[str, Any]:
-    """The edits of a journal, which of them hold, and what can be taken back."""
+    """Return the edits of a journal, which of them hold, and what can be taken back."""
     held = {edit.id for edit in select_effective(journal.edits)}
     edits = [edit.to_json() | {"holds": edit.id in held} for edit in journal.edits if edit.op not in TAKE_BACK]
     can = {}

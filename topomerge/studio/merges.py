@@ -49,7 +49,7 @@ class Job:
         id: number.
         kind: "extract", "merge" or "compare".
         title: what the page shows.
-        words: of the command line after `topomerge`.
+        arguments: of the command line after `topomerge`.
         result: the path that it writes, as the page knows it.
         accepted: exit statuses that are no failure.
         state: "waiting", "running", "done", "failed" or "cancelled".
@@ -60,7 +60,7 @@ class Job:
     id: int
     kind: str
     title: str
-    words: tuple[str, ...]
+    arguments: tuple[str, ...]
     result: str
     accepted: tuple[int, ...] = (0,)
     state: str = "waiting"
@@ -92,7 +92,7 @@ class JobQueue:
         self._numbers = itertools.count(1)
         self._worker: asyncio.Task[None] | None = None
 
-    def add(self, kind: str, title: str, words: Sequence[str], result: str, accepted: tuple[int, ...] = (0,)) -> Job:
+    def add(self, kind: str, title: str, arguments: Sequence[str], result: str, accepted: tuple[int, ...] = (0,)) -> Job:
         """Add a job, which begins when those before it have ended.
 
         Raises:
@@ -100,7 +100,7 @@ class JobQueue:
         """
         if sum(job.state == "waiting" for job in self.jobs.values()) >= MOST_WAITING:
             raise JobError(f"{MOST_WAITING} jobs are waiting; wait until some have ended")
-        job = Job(next(self._numbers), kind, title, tuple(words), result, accepted)
+        job = Job(next(self._numbers), kind, title, tuple(arguments), result, accepted)
         self.jobs[job.id] = job
         for old in [j.id for j in self.jobs.values() if j.state in ENDED][:-MOST_KEPT]:
             del self.jobs[old]
@@ -142,7 +142,7 @@ class JobQueue:
 
     async def _run(self, job: Job) -> None:
         environment = {**os.environ, PROGRESS_VARIABLE: "lines", "PYTHONUNBUFFERED": "1"}
-        command = [sys.executable, "-m", "topomerge", *job.words]
+        command = [sys.executable, "-m", "topomerge", *job.arguments]
         pipe, null = asyncio.subprocess.PIPE, asyncio.subprocess.DEVNULL
         job.process = await asyncio.create_subprocess_exec(
             *command, cwd=self.folder, env=environment, stdin=null, stdout=null, stderr=pipe, start_new_session=True
@@ -173,7 +173,7 @@ class JobQueue:
 
 
 async def _read_line(stream: asyncio.StreamReader) -> bytes:
-    """The next line, or part of one that is longer than any should be; nothing at the end."""
+    """Return the next line, or part of one that is longer than any should be; nothing at the end."""
     try:
         return await stream.readuntil()
     except asyncio.IncompleteReadError as rest:
@@ -280,7 +280,7 @@ def _describe(folder: StudioFolder, maps: OpenMaps, path: Path, listing: Mapping
 
 
 def _list_alternatives(each: Mapping[str, float]) -> list[tuple[str, float]]:
-    """What else it could be, in words, with its probability; the most probable first."""
+    """List the alternatives in words, each with its probability; the most probable first."""
     ranked = sorted(each.items(), key=lambda one: -one[1])
     return [(WORDS.get(name, name), float(p)) for name, p in ranked if p >= LEAST_SHOWN]
 

@@ -1,4 +1,4 @@
-"""What the page draws of a map: plans of its storeys as outlines, doors and labels, on a paper in cm."""
+"""Drawings of a map for the page: plans of its storeys as outlines, doors and labels, on a paper in cm."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from topomerge.structure.floors import compute_jambs
 from topomerge.types import LANDMARK_KINDS, Array, TopometricMap, classify_door_state, find_room_names
 from topomerge.viz.plan import (
     StoreyCells,
-    StoreyPlan,
+    StoreyView,
     compute_frame,
     find_label_place,
     format_hex_colour,
@@ -114,7 +114,7 @@ def build_plan_data(
 
 
 def _trace_storey(
-    plan: StoreyPlan, sheet: Sheet, known: Mapping[bytes, Outline], kept: dict[bytes, Outline]
+    plan: StoreyView, sheet: Sheet, known: Mapping[bytes, Outline], kept: dict[bytes, Outline]
 ) -> dict[int, Outline]:
     """Room -> its outline; one whose pixels are known is not traced again. All go to `kept`."""
     room = fill_rooms(plan, sheet.frame)
@@ -136,8 +136,8 @@ def _trace_storey(
 
 
 def _find_neighbours(map: TopometricMap, rasters: Sequence[Array], size: float) -> Array:
-    """(k, 2) int64 pairs of rooms, ascending, that a door or a wall's thickness parts; told by the plans, in a tenth of the time
-    that all cells of the floors would take."""
+    """Return (k, 2) int64 pairs of rooms, ascending, that a door or a wall's thickness parts; told by the plans, in a tenth of
+    the time that all cells of the floors would take."""
     count = max(len(map.rooms), 1)
     codes = [map.edges["rooms"].astype(np.int64) @ (count, 1)]
     for room in rasters:
@@ -190,7 +190,7 @@ def assign_colours(rooms: int, pairs: Array, old: Mapping[int, int]) -> Array:
 
 
 def _describe_rooms(map: TopometricMap, colours: Array) -> list[dict[str, Any]]:
-    """What is known of each room, without its outline."""
+    """Describe each room, without its outline."""
     names = find_room_names(map.landmarks, len(map.rooms))
     texts = {kind: _find_room_words(map, kind) for kind in ("use", "area") if kind in LANDMARK_KINDS}
     described = []
@@ -209,7 +209,7 @@ def _find_room_words(map: TopometricMap, kind: str) -> dict[int, str]:
 
 
 def _list_parts(map: TopometricMap, sheet: Sheet, storey: int) -> dict[str, Any]:
-    """What a storey has beside its rooms."""
+    """List the doors, stairs, windows, narrowings and landmarks of a storey."""
     of_storey = map.rooms["storey"] == storey if len(map.rooms) else np.zeros(0, bool)
     edges = np.flatnonzero(of_storey[map.edges["rooms"]].any(axis=1)).tolist() if len(map.edges) else []
     windows = map.windows[of_storey[map.windows["rooms"][:, 0]]] if len(map.windows) else map.windows

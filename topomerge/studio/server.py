@@ -174,13 +174,13 @@ class Studio:
         return _send_package_file(PAGE_FILES[name], name)
 
     async def send_events(self, _: Request) -> Response:
-        """What happens, from now on."""
+        """Stream the events from now on."""
         return StreamingResponse(self.hub.stream(), media_type="text/event-stream")
 
     # The folder.
 
     async def list_folder(self, _: Request) -> Response:
-        """What lies in the folder, and the jobs."""
+        """List the entries of the folder, and the jobs."""
         entries = await run_in_threadpool(self.folder.list_entries)
         return JSONResponse(
             {"name": self.folder.root.name, "entries": entries, "jobs": [job.describe() for job in self.jobs.jobs.values()]}
@@ -286,9 +286,9 @@ class Studio:
     async def decide_merge(self, request: Request) -> Response:
         """Accept or reject a merge, or place a map of it: a line of its journal; then it is merged anew."""
         path, wish = self._resolve_merge(request), await _read_json(request)
-        words = await run_in_threadpool(decide, self.folder, path, wish)
+        arguments = await run_in_threadpool(decide, self.folder, path, wish)
         self.hub.publish("merge", path=self.folder.name(path))
-        job = self.jobs.add("merge", path.name, words, self.folder.name(path), (0, 2)) if words else None
+        job = self.jobs.add("merge", path.name, arguments, self.folder.name(path), (0, 2)) if arguments else None
         return JSONResponse({"job": job.describe() if job else None}, 202)
 
     async def place_maps(self, request: Request) -> Response:

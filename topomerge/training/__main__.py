@@ -8,17 +8,17 @@ import sys
 from topomerge.datasets.core.builder import run_script
 
 
-def main(words: list[str]) -> int:
+def main(arguments: list[str]) -> int:
     """Train; keys of the top level can be set as JSON after the file."""
-    if not words or {"-h", "--help"} & set(words):
+    if not arguments or {"-h", "--help"} & set(arguments):
         print(__doc__)
-        return 0 if words else 1
+        return 0 if arguments else 1
     from topomerge.training.embedding import fit
     from topomerge.training.settings import convert_to_dict, load_settings, parse_settings
 
     def work() -> None:
-        values = convert_to_dict(load_settings(words[0]))
-        for word in words[1:]:
+        values = convert_to_dict(load_settings(arguments[0]))
+        for word in arguments[1:]:
             key, _, value = word.partition("=")
             values[key.lstrip("-")] = _parse_value(value) if "=" in word else True
         fit(parse_settings(values))

@@ -157,8 +157,8 @@ def compute_relative_positions(graph: Graph, names: Sequence[str]) -> Graph:
 
 
 def augment_sheet(graph: Graph, augment: Augment, generator: torch.Generator) -> Graph:
-    """A map whose storeys were seen by another sensor on another walk (`training.other_sensors`); middles of rooms, and doors,
-    lie elsewhere."""
+    """Return a map as another sensor saw its storeys on another walk (`simulate_partial_walk`, `simulate_slice`); middles of
+    rooms, and doors, lie elsewhere."""
     rng = np.random.default_rng(int(torch.randint(1 << 40, (), generator=generator)))
     planes, room, anchor, doors = (graph[name].numpy() for name in ("sheet", "sheet_room", "anchor", "door_anchor"))
     if rng.random() < augment.walks:
@@ -184,10 +184,10 @@ def augment_sheet(graph: Graph, augment: Augment, generator: torch.Generator) ->
     return {**out, "sheet": torch.from_numpy(planes), "sheet_room": torch.from_numpy(room), **places}
 
 
-def _rotate_relative_positions(ways: Tensor, angle: float) -> Tensor:
+def _rotate_relative_positions(positions: Tensor, angle: float) -> Tensor:
     """Ways (E, 4), two of x and y each, turned by an angle, rad."""
     c, s = math.cos(angle), math.sin(angle)
-    return (ways.reshape(-1, 2, 2) @ torch.tensor([[c, s], [-s, c]])).flatten(1)
+    return (positions.reshape(-1, 2, 2) @ torch.tensor([[c, s], [-s, c]])).flatten(1)
 
 
 def mirror_graph(graph: Graph) -> Graph:
@@ -250,7 +250,7 @@ class MapPair(Data):
 
     @property
     def truth(self) -> Truth:
-        """What belongs together in a batch."""
+        """Return which rooms of the batch belong together."""
         pair, side, true = self["batch"], self["side"], self["true"]
         same = torch.zeros((len(pair), len(pair)), dtype=torch.bool, device=pair.device)
         first, second = self["match_index"]
@@ -303,8 +303,8 @@ def make_batch(
 def build_map_pair(
     pair: GraphPair, names: Sequence[str], augment: Augment | None = None, generator: torch.Generator | None = None
 ) -> MapPair:
-    """A pair as one graph; see `make_batch`. While training, maps whose turn matters stand alike, and b comes once more, turned
-    wrongly: none of its rooms there is one of a."""
+    """Return a pair as one graph; see `make_batch`. While training, maps whose turn matters stand alike, and b comes once more,
+    turned wrongly: none of its rooms there is one of a."""
     if augment is not None and augment.signs and LANDMARK_PART in names:
         assert generator is not None
         pair = add_invented_signs(pair, augment.signs, generator)

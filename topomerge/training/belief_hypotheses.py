@@ -93,8 +93,8 @@ def build_belief_rows(recipe: GridRecipe, settings: MergeBelief, log_line: Any) 
 
 
 def load_place_networks(settings: MergeBelief) -> list[Network]:
-    """The networks of the runs that saw one half of the buildings each (`task=place_evidence half=1`, `half=2`); the one that
-    ships where none are named.
+    """Return the networks of the runs that saw one half of the buildings each (`task=place_evidence half=1`, `half=2`); the one
+    that ships where none are named.
 
     Raises:
         InputError: a run without a network.
@@ -202,8 +202,8 @@ def classify_pair(row: dict[str, Any]) -> str:
 
 
 def build_floor_rows(settings: MergeBelief, log_line: Any) -> list[Row]:
-    """The pairs of the floor with their judged hypotheses, cached; each weighs `settings.floor`, and none are taken where that
-    is 0 or no real data is there."""
+    """Return the pairs of the floor with their judged hypotheses, cached; each weighs `settings.floor`, and none are taken where
+    that is 0 or no real data is there."""
     if not settings.floor or not settings.data.folder:
         return []
     networks = load_place_networks(settings)
@@ -216,8 +216,8 @@ def build_floor_rows(settings: MergeBelief, log_line: Any) -> list[Row]:
 
 
 def build_lookalike_rows(recipe: LookalikeRecipe, settings: MergeBelief, log_line: Any) -> list[Row]:
-    """The look-alikes of a set with their judged hypotheses, cached; none where the task takes none. ``judged_only``: trains
-    nothing."""
+    """Return the look-alikes of a set with their judged hypotheses, cached; none where the task takes none. ``judged_only``:
+    trains nothing."""
     if settings.lookalikes == "none":
         return []
     paths, _ = build_lookalikes(recipe, settings, log_line)

@@ -1,4 +1,5 @@
-"""What tasks without epochs share: weights out of one fit, with a run's folder, scores, a card and an export all the same."""
+"""Common parts of tasks without epochs: weights out of one fit, with a run's folder, scores, a card and an export all the
+same."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ Settings = TypeVar("Settings", bound=TaskSettings)
 
 @dataclass(frozen=True)
 class FitResult:
-    """What a fit gives: weights as the package reads them, scores on what was left out, and what was learned from."""
+    """The result of a fit: weights as the package reads them, scores on what was left out, and what was learned from."""
 
     weights: dict[str, Any]
     metrics: dict[str, float]

@@ -70,7 +70,7 @@ def concatenate_ranges(first: Array, count: Array) -> Array:
 
 @dataclass(frozen=True)
 class Structure:
-    """What a batch is made of: its parts are a, b, and b once more where it is turned wrongly, of each pair.
+    """The structure of a batch: its parts are a, b, and b once more where it is turned wrongly, of each pair.
 
     Args:
         room, edge: (R,), (E,) rows of the tables.

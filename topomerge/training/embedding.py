@@ -116,8 +116,8 @@ def fit(settings: Training, log_line: LogFn = lambda text: print(text, file=sys.
     check_exporter()
     check_start(settings)  # before other processes, if any, have come so far
     fabric = start_fabric(settings)
-    chief = fabric.is_global_zero
-    log_line = log_line if chief else lambda text: None
+    is_main_process = fabric.is_global_zero
+    log_line = log_line if is_main_process else lambda text: None
     settings = with_own_pairs(settings, log_line, fabric)
     train, watched, replayed = _load_data(settings, log_line, fabric)
     network = _build_network(settings, train)
@@ -125,23 +125,23 @@ def fit(settings: Training, log_line: LogFn = lambda text: print(text, file=sys.
     state = State()
     if settings.resume:
         state = State(**load_state(settings.folder / "last", network, optimizer))
-    if chief:
+    if is_main_process:
         on_cuda = fabric.device.type == "cuda"
         name = torch.cuda.get_device_name() if on_cuda else "cpu"
         begin_run(settings, f"{fabric.world_size} x {name}, {find_precision(settings)}", torch.get_num_threads())
     fabric.barrier()
     job = EmbeddingJob(settings, fabric, network, optimizer, (train, watched, replayed))
-    log = MetricsLog(settings, state.epoch) if chief else None
+    log = MetricsLog(settings, state.epoch) if is_main_process else None
     perfect = 1.0 if settings.overfit else float("inf")
     schedule = Schedule(settings, job.steps, perfect, settings.watch in TASK.lower)
     best = Loop(job, schedule, state, log, log_line).run()
-    if settings.export and chief:
+    if settings.export and is_main_process:
         export_files(settings.folder / "best", settings.export, WEIGHTS_PACKAGE)
     return best
 
 
 class EmbeddingJob:
-    """What the loop does for an embedder.
+    """The job of training an embedder, as the loop runs it.
 
     Args:
         pairs: to train on, to watch, and, where `replay` is set, to draw from besides.

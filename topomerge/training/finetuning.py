@@ -31,7 +31,7 @@ RUN = "run"  # folder of the training in the output
 
 @dataclass(frozen=True)
 class Verdict:
-    """What fine-tuning did on the pairs that were left out.
+    """The verdict on fine-tuning: its gain on the pairs that were left out.
 
     Args:
         old, new, gain: of each of `SCORES`: value, and the ends of its 95 % interval; the gain is drawn in pairs.
@@ -166,7 +166,7 @@ def _count(one: PairScores) -> list[float]:
 
 
 def _compute_scores(sums: Array, every: Array) -> Array:
-    """(n, 3) `SCORES` of sums (n, ...) of `_count`; at the certainty at which F1 of all groups together is best."""
+    """Return (n, 3) `SCORES` of sums (n, ...) of `_count`; at the certainty at which F1 of all groups together is best."""
 
     def f1(of: Array) -> Array:
         matched, right, requested, got = np.moveaxis(of[:, 3:].reshape(len(of), -1, 4), 2, 0)

@@ -1,4 +1,5 @@
-"""What a loop can have besides: loggers, an average of weights, the best checkpoints, a trace, a search for what is no number."""
+"""Optional instruments of a training loop: loggers, an average of weights, the best checkpoints, a trace, a search for what is no
+number."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ def build_rows(split: str, count: int, folder: Path, log_line: LogFn) -> list[Lo
             path = folder / f"rows_{key}_{k:03d}.npz"
             if not path.exists():
                 index = index or PlaceIndex.from_maps({m.path.stem: load_map(m.path) for m in maps})
-                own = [build_row(index, maps[k], split, k, kind, stranger) for kind, stranger in list_scans(k)]
+                own = [build_row(index, maps[k], split, k, kind, negative) for kind, negative in list_scans(k)]
                 of = {f"{n}.{name}": v for n, row in enumerate(filter(None, own)) for name, v in (("x", row.x), ("y", row.y))}
                 archive.write(of, path)
                 log_line(f"{k + 1} of {count} buildings")
@@ -79,9 +79,9 @@ def list_scans(building: int) -> list[tuple[str, bool]]:
     return [(kind, no) for n, kind in enumerate(SCANS) for no in ((False, True) if (building + n) % 3 == 0 else (False,))]
 
 
-def build_row(index: PlaceIndex, own: Any, split: str, number: int, kind: str, stranger: bool) -> LocateRows | None:
+def build_row(index: PlaceIndex, own: Any, split: str, number: int, kind: str, negative: bool) -> LocateRows | None:
     """Judge the poses of one scan; None where it shows no walls."""
-    scan = make_located_scan(split, number, kind, stranger)
+    scan = make_located_scan(split, number, kind, negative)
     try:
         query = prepare_query(scan.cloud)
     except InputError:
@@ -91,7 +91,7 @@ def build_row(index: PlaceIndex, own: Any, split: str, number: int, kind: str, s
     placed = (pose.apply(at) + moved)[0, :2]
     judged = find_places(index, query, LOCATE)
     right = [
-        not stranger
+        not negative
         and index.storeys[j.storey].map == number
         and float(np.hypot(*(j.pose.apply(at)[0, :2] - placed))) < RIGHT[0]
         and abs(wrap_yaw(j.pose.yaw - pose.yaw)) < RIGHT[1]
@@ -110,12 +110,12 @@ def fit_choice(rows: Sequence[LocateRows]) -> LocateWeights:
         for r in rows:
             x, true = r.x / size, np.append(r.y, not r.y.any())
             own = x @ w[:count]
-            chance = own.mean()
-            z = np.append(own, w[count] + w[-1] * chance)
+            mean_score = own.mean()
+            z = np.append(own, w[count] + w[-1] * mean_score)
             total += float(np.logaddexp.reduce(z) - np.logaddexp.reduce(z[true]))
             gap = np.exp(z - np.logaddexp.reduce(z))
             gap[true] -= np.exp(z[true] - np.logaddexp.reduce(z[true]))
-            slope += [*(gap[:-1] @ x + gap[-1] * w[-1] * x.mean(axis=0)), gap[-1], gap[-1] * chance]
+            slope += [*(gap[:-1] @ x + gap[-1] * w[-1] * x.mean(axis=0)), gap[-1], gap[-1] * mean_score]
         slope /= len(rows)
         slope[:count] += 2 * SHRINK * w[:count]
         return total / len(rows) + SHRINK * float(w[:count] @ w[:count]), slope

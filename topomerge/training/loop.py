@@ -90,7 +90,7 @@ class Schedule:
 
 
 class Job(Protocol):
-    """What a task does in the loop.
+    """The job of a task, as the loop runs it.
 
     Args:
         unit: name of what `count_items` counts.
@@ -100,7 +100,7 @@ class Job(Protocol):
 
     @property
     def network(self) -> torch.nn.Module:
-        """What is trained."""
+        """Return the network that is trained."""
 
     def iter_batches(self, state: State) -> Generator[Any, None, None]:
         """Yield the batches of the state's epoch, from its step on."""
@@ -313,7 +313,7 @@ class Loop:
 
 
 def build_diverged(state: State) -> InputError:
-    """What is raised where a loss or its gradient is no finite number."""
+    """Build the error for a loss or gradient that is no finite number."""
     where = f"step {state.step + 1} of epoch {state.epoch + 1}"
     return InputError(f"training diverged by {where}: a loss or gradient is no finite number; train anew with a lower rate")
 
@@ -431,7 +431,7 @@ class NetworkJob(ABC):
         """Write the weights as the package has them."""
 
     def interface(self) -> dict[str, Any]:
-        """What a card says of inputs and outputs; nothing of weights that are no network of `topomerge.networks`."""
+        """Describe inputs and outputs for the card; nothing for weights that are no network of `topomerge.networks`."""
         return {}
 
     def write_checkpoint(self, folder: Path, row: Mapping[str, Any]) -> None:
@@ -477,7 +477,7 @@ class ExportedJob(NetworkJob):
         export_network(module, signature, [tensor.to(self.device) for tensor in sample], path)
 
     def interface(self) -> dict[str, Any]:
-        """What it does, inputs and outputs."""
+        """Describe what the network does, its inputs and outputs."""
         return self.exported().signature.describe()
 
 
@@ -488,18 +488,18 @@ def run_network(job: Job, settings: NetworkTask, steps: int, log_line: LogFn) ->
         The row of the best epoch.
     """
     check_exporter()
-    state, chief = State(), get_rank() == 0
+    state, is_main_process = State(), get_rank() == 0
     task = TASKS[settings.task]
     if settings.init_from and not settings.resume:
         start_from_exported(job, settings)
     if settings.resume:
         state = State(**load_state(settings.folder / "last", job.network, job.get_optimizer(), NETWORK_FILE))
-    if chief:
+    if is_main_process:
         device = str(next(job.network.parameters()).device)
         begin_run(settings, torch.cuda.get_device_name() if device.startswith("cuda") else device, torch.get_num_threads())
-    log = MetricsLog(settings, state.epoch) if chief else None
+    log = MetricsLog(settings, state.epoch) if is_main_process else None
     schedule = Schedule(settings, steps, lower=settings.watch in task.lower)
     best = Loop(job, schedule, state, log, log_line).run()
-    if settings.export and chief:
+    if settings.export and is_main_process:
         export_files(settings.folder / "best", settings.export, task.package)
     return best

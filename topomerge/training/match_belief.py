@@ -99,8 +99,8 @@ def compute_match_rows(path: Path, other: Path | None = None) -> dict[str, Array
 
 
 def fit_match_weights(rows: Sequence[MatchRows], method: str, pull: float) -> Array:
-    """(6,) weights of the most likely logistic model, pulled to what matching says. None but the constant is below 0: what speaks
-    for a match never lowers it.
+    """Return (6,) weights of the most likely logistic model, pulled to what matching says. None but the constant is below 0: what
+    speaks for a match never lowers it.
 
     Raises:
         InputError: there are no matches.

@@ -1,4 +1,4 @@
-"""Task `match_odds`: how likely a hypothesis is right, and rooms that it lays over each other are one (`matching.odds`).
+"""Task `match_odds`: how likely a hypothesis is right, and rooms that it lays over each other are one (`matching.consistency`).
 
 Hypotheses are searched in each pair of maps, and in as many of two buildings; a softmax over the hypotheses and "none" is fitted
 to which one is right, and a logistic model to which rooms that meet under the true transform are one true room.

@@ -103,8 +103,8 @@ def is_same_plan(row: dict[str, Any]) -> bool:
 
 
 def weight_by_plan(alike: Array, weight: Array) -> Array:
-    """(n,) weights of pairs that are of one place and of those that are alike by plan (n,) bool, as frequent as `PRIORS` state;
-    their sum is that of `weight`."""
+    """Return (n,) weights of pairs that are of one place and of those that are alike by plan (n,) bool, as frequent as `PRIORS`
+    state; their sum is that of `weight`."""
     out = np.zeros(len(alike))
     for mine, prior in ((alike, sum(PRIORS[name] for name in SAME_PLAN)), (~alike, PRIORS["here"])):
         if weight[mine].sum() > 0:
@@ -114,8 +114,8 @@ def weight_by_plan(alike: Array, weight: Array) -> Array:
 
 
 def weight_by_prior(truth: Array, weight: Array) -> Array:
-    """(n,) weights under which the kinds of pairs are as frequent as `PRIORS` state; kinds that are missing are left out. Their
-    sum is that of `weight`."""
+    """Return (n,) weights under which the kinds of pairs are as frequent as `PRIORS` state; kinds that are missing are left out.
+    Their sum is that of `weight`."""
     out = np.zeros(len(truth))
     for kind, prior in PRIORS.items():
         mine = truth == kind
@@ -285,7 +285,7 @@ def find_best_hypothesis(
 
 
 def _find_distinct_poses(poses: Array, middle: Array) -> list[int]:
-    """Which of ranked poses (n, 4, 4) end in no better one's place (as `fusion.candidates`)."""
+    """Which of ranked poses (n, 4, 4) end in no better one's place (as `matching.poses.select_distinct_hypotheses`)."""
     hypotheses = [PoseHypothesis(convert_to_sim3(pose)) for pose in poses]  # type: ignore[arg-type]
     single = {id(h) for h in select_distinct_hypotheses(hypotheses, middle, BASIN)}
     return [k for k, h in enumerate(hypotheses) if id(h) in single]

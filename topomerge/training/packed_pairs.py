@@ -87,13 +87,13 @@ def load_pairs(
     limit: int = 0,
     around: float = 0.0,
 ) -> list[GraphPair]:
-    """Load the pairs of a manifest (`datasets.build`), from the packed file, which is made if there is none.
+    """Load the pairs of a manifest (`datasets.pairs.build`), from the packed file, which is made if there is none.
 
     Args:
         manifest: or a packed file itself.
         extras: what is wanted, too: of `EXTRAS`, `landmarks`, `near`, the layout of doors, or `sheet`, the storeys from above.
         limit: of the first pairs only; 0: all.
-        around: m within which rooms are neighbours, too (`embedding.rooms_around`); 0: by doors only.
+        around: m within which rooms are neighbours, too (`embedding.graph.add_proximity_edges`); 0: by doors only.
 
     Raises:
         InputError: no such manifest, or a file is damaged.
@@ -165,7 +165,7 @@ def _add_sheets(pairs: Sequence[GraphPair], files: Sequence[Path], packed_file: 
 
 
 def _get_landmarks(arrays: Mapping[str, Array], extras: Sequence[str]) -> dict[str, Array]:
-    """What landmarks say of all rooms, where it is wanted; of sets without any, 0."""
+    """Get the landmark features of all rooms, where they are asked for; 0 in sets without any."""
     none = np.zeros((len(arrays["x"]), count_columns(LANDMARK_PART)), np.float32)
     return {LANDMARK_PART: arrays.get(LANDMARK_PART, none)} if LANDMARK_PART in extras else {}
 
@@ -240,7 +240,7 @@ def _unpack_pairs(arrays: dict[str, Array], extras: dict[str, Array]) -> list[Gr
 
 
 def _compute_extra(name: str, arrays: dict[str, Array], packed_file: Path, log_line: Callable[[str], None], limit: int) -> Array:
-    """A descriptor of all rooms, 0 of those beyond the limit; chunks that were reckoned before are read."""
+    """Return a descriptor of all rooms, 0 of those beyond the limit; chunks that were reckoned before are read."""
     from topomerge.embedding.engineered import compute_point_features, compute_point_spectra
 
     reckon = {"engineered": compute_point_features, "shapedna": compute_point_spectra}[name]
@@ -284,13 +284,13 @@ def hold_out(pairs: Sequence[GraphPair]) -> tuple[list[GraphPair], list[GraphPai
 
 
 def number_buildings(names: Sequence[str]) -> Array:
-    """(n,) number of each building, in the order in which they first come."""
+    """Return (n,) number of each building, in the order in which they first come."""
     numbers: dict[str, int] = {}
     return np.array([numbers.setdefault(name, len(numbers)) for name in names], np.int64)
 
 
 def mark_watched(buildings: Sequence[str], every: int) -> Array:
-    """(n,) bool: the scans of every n-th building are watched."""
+    """Return (n,) bool: the scans of every n-th building are watched."""
     return np.asarray(number_buildings(buildings) % every == 0)
 
 

@@ -1,4 +1,4 @@
-"""Task `passages`: how much all evidence together says of a door between two segments (`extraction.passages`).
+"""Task `passages`: how much all evidence together says of a door between two segments (`extraction.plans.passages`).
 
 A logistic model for scans that show walls, pulled towards the plan's own answer: what evidence adds must show in the scans.
 Slices have none: on them the plan alone was better.
@@ -223,7 +223,7 @@ def _loss(weights: Array, x: Array, y: Array, count: Array, pull: float) -> tupl
 
 
 def score(scan: PassageExamples, weights: dict[str, list[float]]) -> tuple[Array, Array, Array]:
-    """(n,) probability of a door in each passage, of the plan alone, and are they doors?"""
+    """Return (n,) probability of a door in each passage, of the plan alone, and are they doors?"""
     inputs = compute_inputs(scan.plan, scan.shown)
     return sigmoid(inputs @ np.array(weights[scan.kind])), sigmoid(scan.plan), scan.parted
 

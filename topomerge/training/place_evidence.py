@@ -1,4 +1,4 @@
-"""Task `place_evidence`: the network that says how much two squares from above speak for one place (`fusion.evidence.network`).
+"""Task `place_evidence`: the network that scores whether two squares from above show one place (`registration.evidence.places`).
 
 Squares of simulated maps under their right pose and under wrong ones that the search proposed: another place of the building, a
 twin wing, another storey, another building. Furniture is moved, doors are opened and maps drift between the two. Turned, mirrored
@@ -60,8 +60,8 @@ class Places:
 
 
 def collect_places(paths: Sequence[Path], half: int = 0) -> Places:
-    """The squares of the hypotheses of pairs (`belief_hypotheses`) that are right or wrong; none of those that are neither, and
-    none of pairs that nobody can tell apart.
+    """Return the squares of the hypotheses of pairs (`belief_hypotheses`) that are right or wrong; none of those that are
+    neither, and none of pairs that nobody can tell apart.
 
     Raises:
         InputError: there is none.
@@ -96,8 +96,8 @@ def collect_places(paths: Sequence[Path], half: int = 0) -> Places:
 
 
 def balance_weights(weight: Array, right: Array, group: Array) -> Array:
-    """(n,) weights with which right and wrong ones of each group weigh alike; a group of one side only weighs nothing, and others
-    as much as the root of the weight of their smaller side."""
+    """Return (n,) weights with which right and wrong ones of each group weigh alike; a group of one side only weighs nothing, and
+    others as much as the root of the weight of their smaller side."""
     _, owner = np.unique(group, return_inverse=True)
     total = np.zeros((owner.max() + 1, 2))
     np.add.at(total, (owner, right.astype(int)), weight)
@@ -121,7 +121,7 @@ class PlaceJob(ExportedJob):
         origin |= {"right": int(learned.right.sum()), "watched": len(watched.right)}
         super().__init__(settings, PlaceNetwork(settings.widths, settings.dropout), origin)
         self.options, self.learned, self.watched = settings, learned, watched
-        self.chance = learned.weight / learned.weight.sum()
+        self.probability = learned.weight / learned.weight.sum()
 
     def iter_batches(self, state: State) -> Generator[tuple[torch.Tensor, ...], None, None]:
         """Yield squares, from a generator of each step."""
@@ -129,7 +129,7 @@ class PlaceJob(ExportedJob):
         options, learned = self.options, self.learned
         for step in range(state.step, options.steps):
             rng = self.start_generator(1, state.epoch, step)
-            rows = rng.choice(len(self.chance), options.batch, p=self.chance)
+            rows = rng.choice(len(self.probability), options.batch, p=self.probability)
             x = augment_planes(learned.planes[rows].astype(np.float32), options.augment, rng)
             right = torch.from_numpy(learned.right[rows].astype(np.float32))
             yield torch.from_numpy(x).permute(0, 3, 1, 2), right

@@ -79,7 +79,7 @@ def _sample_smooth_field(shape: tuple[int, ...], sigma: float, rng: np.random.Ge
 
 
 def _sample_patches(shape: tuple[int, ...], share: float, rng: np.random.Generator) -> Array:
-    """(n, n) bool, smooth patches that cover a share of a crop."""
+    """Return (n, n) bool, smooth patches that cover a share of a crop."""
     field = _sample_smooth_field(shape, rng.uniform(1, 5), rng)
     return np.asarray(field > np.quantile(field, 1 - share))
 
@@ -110,7 +110,7 @@ def _add_furniture(inside: Array, wall: Array, room: Array, rng: np.random.Gener
 
 
 def _draw_seat_rows(floor: Array, rng: np.random.Generator) -> Array:
-    """(n, n) bool, parallel rows, whole or of single seats, somewhere on a large floor."""
+    """Return (n, n) bool, parallel rows, whole or of single seats, somewhere on a large floor."""
     places = np.argwhere(ndimage.binary_erosion(floor, SQUARE, 6))
     if not len(places):
         return np.zeros(floor.shape, bool)
@@ -166,7 +166,7 @@ class PlanJob(ExportedJob):
         self.options, self.watched = settings, watched
         self.plans = [build_plan_tensors(e, settings.loss) for e in learned]
         probability = np.sqrt([float(e.room.size) for e in learned])
-        self.chance = probability / probability.sum()
+        self.probability = probability / probability.sum()
 
     def iter_batches(self, state: State) -> Generator[tuple[torch.Tensor, ...], None, None]:
         """Yield crops."""
@@ -178,7 +178,7 @@ class PlanJob(ExportedJob):
         options = self.options
         for step in range(state.step, options.steps):
             rng = self.start_generator(1, state.epoch, step)
-            rows = rng.choice(len(self.plans), options.batch, p=self.chance)
+            rows = rng.choice(len(self.plans), options.batch, p=self.probability)
             crops = [crop(self.plans[row], options.crop, options.augment, rng) for row in rows]
             x, truth, weight = (np.stack(arrays) for arrays in zip(*crops, strict=True))
             labels = torch.from_numpy(truth.astype(np.int64))
@@ -206,7 +206,8 @@ class PlanJob(ExportedJob):
 
 
 def convert_to_grid(example: PlanExample, furnished: bool) -> PlanExample:
-    """The plan of a scan as a robot would leave it, or a draughtsman: walls alone, all raised alike. Grids stay as they are.
+    """Return the plan of a scan as a robot would leave it, or a draughtsman: walls alone, all raised alike. Grids stay as they
+    are.
 
     Args:
         furnished: with what a laser meets near the floor as walls.

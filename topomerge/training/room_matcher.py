@@ -226,16 +226,16 @@ def score_matcher(watched: Sequence[MatcherExample], matcher: Matcher) -> dict[s
     return {k: v for k, v in out.items() if "clear" not in k} | shares
 
 
-def compute_room_losses(chance: Array, matches: Array) -> Array:
+def compute_room_losses(probability: Array, matches: Array) -> Array:
     """Compute (R,) -log(probability of a room's partners, or of having none).
 
     Args:
-        chance: (R, S + 1) of each room of the other map, and of none; matches: (M, 2) rooms that are one.
+        probability: (R, S + 1) of each room of the other map, and of none; matches: (M, 2) rooms that are one.
     """
-    right = np.zeros(chance.shape, bool)
+    right = np.zeros(probability.shape, bool)
     right[matches[:, 0], matches[:, 1]] = True
     right[:, -1] = ~right.any(axis=1)
-    return np.asarray(-np.log(np.maximum((chance * right).sum(axis=1), LEAST_PROBABILITY)))
+    return np.asarray(-np.log(np.maximum((probability * right).sum(axis=1), LEAST_PROBABILITY)))
 
 
 def fit(settings: RoomMatching, log_line: LogFn) -> dict[str, float]:

@@ -233,7 +233,8 @@ def fit_room_odds(settings: RoomOdds, log_line: LogFn) -> FitResult:
 
 
 def list_recipes(settings: RoomOdds, heldout: bool) -> dict[str, list[PlanRecipe]]:
-    """The sets of scans of each of `FAMILIES`, to fit to or to judge on. What lies outside is told in ordinary scans, too."""
+    """Return the sets of scans of each of `FAMILIES`, to fit to or to judge on. What lies outside is told in ordinary scans,
+    too."""
     if heldout:
         return {
             "scans": [settings.heldout],

@@ -72,7 +72,7 @@ def check_folder(folder: Path, settings: Mapping[str, Any]) -> None:
 
 
 def _find_changes(folder: Path, settings: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """What differs from the settings in the folder of a run."""
+    """Find the settings that differ from those in the folder of a run."""
     try:
         before = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -123,7 +123,7 @@ def _get_version(package: str) -> str:
 
 
 def read_run(folder: Path) -> dict[str, Any]:
-    """What `run.json` says; nothing where there is none: runs of earlier versions.
+    """Read `run.json`; return nothing where there is none, as in runs of earlier versions.
 
     Raises:
         InputError: it is damaged.
@@ -139,7 +139,7 @@ def read_run(folder: Path) -> dict[str, Any]:
 
 
 def describe_provenance(folder: Path) -> dict[str, Any]:
-    """What a card says of the run in a folder: all but times, so that the same training gives the same card."""
+    """Describe the run in a folder for a card: all but times, so that the same training gives the same card."""
     run = read_run(folder)
     return {**run, "starts": [{k: v for k, v in start.items() if k != "began"} for start in run["starts"]]} if run else {}
 
@@ -161,7 +161,7 @@ def describe_data(settings: Any) -> dict[str, Any]:
 
 
 def _read_recipe(manifest: Path) -> Any:
-    """What `pairs.build` wrote beside a manifest; None where it did not."""
+    """Read the recipe that `pairs.build` wrote beside a manifest; None where it did not."""
     path = manifest.with_suffix(".recipe.json")
     try:
         return json.loads(path.read_text(encoding="utf-8"))
@@ -215,7 +215,7 @@ def write_card(
         settings: of the run.
         data: what was learned from: counts, names of sets.
         metrics: on what was held out of the training.
-        interface: what a network does, its inputs and outputs (`networks.signature`).
+        interface: what a network does, its inputs and outputs (`networks.network.Signature`).
     """
     run = next((folder for folder in file.parents[1:3] if (folder / RUN_FILE).is_file()), file.parent.parent)
     keys = (f"{k}={v}" for k, v in settings.items() if isinstance(v, int | float | str) and k in ("seed", "epochs"))

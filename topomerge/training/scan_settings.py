@@ -26,12 +26,12 @@ class PlanLoss:
 
 @dataclass
 class PlanAugment:
-    """What is taken away from crops while training, now and then.
+    """Augmentation of crops while training: what is taken away, now and then.
 
     Args:
         upper: share of crops without ceiling or without floor.
         columns: share of crops that lose single columns; lost: share of these, drawn between 0 and this.
-        grid_noise: share of crops with the noise of robots' grids (`training.grid_noise`).
+        grid_noise: share of crops with the noise of robots' grids (`training.plan_segmentation.add_grid_noise`).
     """
 
     grid_noise: float = 0.0
@@ -132,7 +132,7 @@ class DrawingSegmentation(RasterTask):
 
 @dataclass
 class WallAugment:
-    """What is done to stretches of walls while training, beside mirroring.
+    """Augmentation of stretches of walls while training, beside mirroring.
 
     Args:
         shift: elements by which a face is moved nearer or farther, at most.
@@ -155,7 +155,7 @@ class WallSegmentation(RasterTask):
     steps: of an epoch; warmup: steps in which the rate rises.
     length: places of a stretch, even; at_holes: share of the stretches about the side of a door or window.
     classes: weights of the classes in the cross-entropy.
-    widths: of `models.wall_network.WallNetwork`.
+    widths: of `models.convolutional.WallNetwork`.
     unseen: weight of places where nothing was seen.
     """
 

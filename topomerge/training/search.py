@@ -36,16 +36,16 @@ OWN_WORDS = ("search", "name", "runs", "resume", "overwrite")  # which a trial h
 
 @dataclass(frozen=True)
 class Plan:
-    """What each process of a search needs.
+    """The plan of a search, as each of its processes needs it.
 
     Args:
-        words: of every trial.
+        overrides: of every trial, ``key=value``.
         folder: of the search; the trials are folders in it.
         watch: score that is compared; lower: less of it is better.
     """
 
     search: Search
-    words: Sequence[str]
+    overrides: Sequence[str]
     folder: Path
     seed: int
     watch: str
@@ -68,41 +68,41 @@ class SearchResult:
         return f"best: {self.best}: {self.watch} {self.score:.3f} with {found}; the table: {self.table}"
 
 
-def compose_search(words: Sequence[str]) -> Search | None:
-    """Return the search that words, or an experiment that they name, ask for; None where they ask for none.
+def compose_search(overrides: Sequence[str]) -> Search | None:
+    """Return the search that overrides, or an experiment that they name, ask for; None where they ask for none.
 
     Raises:
         InputError: one line with the key's name.
     """
-    if not any(word.lstrip("+").startswith(("search", "experiment=")) for word in words):
+    if not any(word.lstrip("+").startswith(("search", "experiment=")) for word in overrides):
         return None
-    if {"-m", "--multirun"} & set(words):
-        names = [word.partition("=")[2] for word in words if word.lstrip("+").startswith("experiment=")]
-        alone = [word for word in words if word.lstrip("+").startswith(("search", "plugins"))]
+    if {"-m", "--multirun"} & set(overrides):
+        names = [word.partition("=")[2] for word in overrides if word.lstrip("+").startswith("experiment=")]
+        alone = [word for word in overrides if word.lstrip("+").startswith(("search", "plugins"))]
         tried = [[*alone, f"experiment={name}"] for name in ",".join(names).split(",") if name] or [alone]
         if any(compose_config("train", prepare_words(one)).get("search") is not None for one in tried):
             raise InputError("search: runs several trainings by itself; leave out -m")
         return None
-    composed = compose_config("train", prepare_words([word for word in words if not word.startswith("-")]))
-    given = None if {"-c", "--cfg"} & set(words) else composed.get("search")
+    composed = compose_config("train", prepare_words([word for word in overrides if not word.startswith("-")]))
+    given = None if {"-c", "--cfg"} & set(overrides) else composed.get("search")
     if given is None:
         return None
     return convert_to_dataclass(given, Search)
 
 
-def search_settings(search: Search, words: Sequence[str], log_line: LogFn) -> SearchResult:
+def search_settings(search: Search, overrides: Sequence[str], log_line: LogFn) -> SearchResult:
     """Run the trials that are left, and write a table of all.
 
     Args:
-        words: of the command line.
+        overrides: of the command line, ``key=value``.
 
     Raises:
         InputError: a space that makes no sense, settings that cannot train, a folder that holds another run or search.
         KeyboardInterrupt: after Ctrl-C or SIGTERM; ``resume=true`` goes on.
     """
     _check_search(search)
-    kept = [word for word in words if word.lstrip("+").partition("=")[0].partition(".")[0] not in OWN_WORDS]
-    settings = compose_settings(words)
+    kept = [word for word in overrides if word.lstrip("+").partition("=")[0].partition(".")[0] not in OWN_WORDS]
+    settings = compose_settings(overrides)
     space = parse_space(search.space)
     _check_space(space, kept)
     folder = settings.folder
@@ -182,20 +182,20 @@ def _check_search(search: Search) -> None:
             raise InputError(f"search.{key} must be 1 or more, not {getattr(search, key)}")
 
 
-def _check_space(space: Mapping[str, Any], words: Sequence[str]) -> None:
+def _check_space(space: Mapping[str, Any], overrides: Sequence[str]) -> None:
     """Compose settings with both ends, or every choice, of each key.
 
     Raises:
         InputError: a key is given as well, there is no such key, or a value is refused.
     """
-    given = {word.lstrip("+").partition("=")[0] for word in words}
+    given = {word.lstrip("+").partition("=")[0] for word in overrides}
     for key, distribution in space.items():
         if key in given or key in OWN_WORDS or key == "seed":
             raise InputError(f"search.space.{key}: cannot be searched, or is given as {key}=, too; leave out one of them")
         values = getattr(distribution, "choices", None) or (distribution.low, distribution.high)
         for value in values:
             try:
-                compose_settings([*words, _format_word(key, value)])
+                compose_settings([*overrides, _format_word(key, value)])
             except InputError as error:
                 raise InputError(f"search.space.{key}: {_format_value(value)} is refused: {error}") from error
 
@@ -277,7 +277,7 @@ def run_trial(plan: Plan, number: int | None, log_line: LogFn) -> None:
         found = [_format_word(key, value) for key, value in trial.params.items()]
         goes_on = "resume=true" if (plan.folder / name / "last").exists() else "overwrite=true"
 
-        settings = compose_settings([*plan.words, *found, f"runs={plan.folder}", f"name={name}", goes_on])
+        settings = compose_settings([*plan.overrides, *found, f"runs={plan.folder}", f"name={name}", goes_on])
 
         def report(row: dict[str, Any]) -> None:
             trial.report(row[f"val/{plan.watch}"], row["epoch"])

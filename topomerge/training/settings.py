@@ -60,7 +60,7 @@ def _check_run(settings: RunSettings) -> None:
 
 @dataclass
 class RunSettings:
-    """What every run has.
+    """Settings of every run.
 
     Args:
         task: which of the learned parts.
@@ -91,7 +91,7 @@ class RunSettings:
 
 @dataclass
 class NetworkSettings(RunSettings):
-    """What a run has that trains a network.
+    """Settings of a run that trains a network.
 
     Args:
         epochs: at most; rate: of learning; decay: of weights; batch: examples a step, of each process.
@@ -143,7 +143,7 @@ class Search:
 
 @dataclass
 class TaskSettings(RunSettings):
-    """What every task but `embedding` has.
+    """Settings of every task but `embedding`.
 
     Args:
         jobs: processes that make data that is missing; cluster: scheduler of a Dask cluster that does so.
@@ -174,7 +174,7 @@ class TaskSettings(RunSettings):
 
 @dataclass
 class NetworkTask(TaskSettings, NetworkSettings):
-    """What tasks that train a network have besides.
+    """Further settings of tasks that train a network.
 
     Args:
         hold_out: the scans of every n-th physical building are watched and train nothing.
@@ -192,7 +192,7 @@ class NetworkTask(TaskSettings, NetworkSettings):
 
 @dataclass
 class RasterTask(NetworkTask):
-    """What tasks whose networks look at rasters have besides.
+    """Further settings of tasks whose networks read rasters.
 
     Args:
         accelerator: cpu or cuda. Only cpu gives the same bytes again for the same seed.
@@ -216,7 +216,7 @@ BATCHES = ("auto", "host", "device")
 
 @dataclass
 class Augment:
-    """What is changed about maps while training, anew in each step.
+    """Augmentation of maps while training, drawn anew in each step.
 
     Args:
         rooms: share of rooms that are lost, drawn for each map between 0 and this.

@@ -75,13 +75,13 @@ def write_model_page(runs: str | Path, page: str | Path) -> Path:
     (example,) = sets.values()
     data = read_run(example).get("data", {})
     names = {key: data.get(key, {}).get("name", "?") for key in ("data", "validation")}
-    gathered = [{"experiment": name, **_gather(of)} for name, of in rows.items()]
-    gathered.sort(key=lambda row: (-row["best"], row["experiment"]))
-    first, last = (f"`{row['experiment']}`" for row in (gathered[0], gathered[-1]))
-    best, worst = (f"{np.mean([row['recall@1'] for row in rows[one['experiment']]]):.2f}" for one in (gathered[0], gathered[-1]))
+    averaged = [{"experiment": name, **_gather(of)} for name, of in rows.items()]
+    averaged.sort(key=lambda row: (-row["best"], row["experiment"]))
+    first, last = (f"`{row['experiment']}`" for row in (averaged[0], averaged[-1]))
+    best, worst = (f"{np.mean([row['recall@1'] for row in rows[one['experiment']]]):.2f}" for one in (averaged[0], averaged[-1]))
     about = {"first": first, "last": last, "best": best, "worst": worst, "made": _describe_start(example)}
     lines = [INTRO.format(data=names["data"], watched=f"pairs of `{names['validation']}`", **about)]
-    lines += format_table(gathered, ["experiment", *(name for name in SHOWN if any(name in row for row in gathered))])
+    lines += format_table(averaged, ["experiment", *(name for name in SHOWN if any(name in row for row in averaged))])
     if missing := [name for name in list_experiments() if name not in rows]:
         lines += ["", f"Not trained yet: {', '.join(missing)}."]
     with replace_on_success(page) as temporary:
@@ -107,7 +107,7 @@ class SweepTable:
     """Hydra's callback that writes table.md when all runs of a sweep have ended."""
 
     def _ignore_event(self, **_: Any) -> None:
-        """What else Hydra reports."""
+        """Ignore the other events that Hydra reports."""
 
     on_run_start = on_run_end = on_multirun_start = on_job_start = on_job_end = on_compose_config = _ignore_event
 
@@ -131,12 +131,12 @@ def write_table(folder: str | Path) -> Path:
     rows.sort(key=lambda row: -row["best"])
     columns = list(dict.fromkeys(name for row in rows for name in row if name not in ("best", "same")))
     lines = format_table(rows, columns)
-    if gathered := gather_seeds(rows):
+    if averaged := gather_seeds(rows):
         lines += [
             "",
             "Mean over seeds, with its 95 % interval:",
             "",
-            *format_table(gathered, ["seeds" if n == "seed" else n for n in columns]),
+            *format_table(averaged, ["seeds" if n == "seed" else n for n in columns]),
         ]
     with replace_on_success(folder / "table.md") as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -16,7 +16,7 @@ LOOKALIKES_TAKEN = ("none", "judged", "fitted")
 
 @dataclass
 class PlaceAugment:
-    """What is done to squares while training, beside turning and mirroring.
+    """Augmentation of squares while training, beside turning and mirroring.
 
     Args:
         upper: share of the squares of which nothing is seen above a body.

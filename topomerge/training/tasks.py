@@ -1,4 +1,4 @@
-"""What a task of `train.py` and `evaluate.py` is; every learned part that ships is one (`topomerge.registry.TASKS`)."""
+"""Tasks of `train.py` and `evaluate.py`; every learned part that ships is one (`topomerge.registry.TASKS`)."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def estimate_pose(a: Mapping[str, Array], b: Mapping[str, Array], certain: Array
 
     Args:
         a, b: `pos`, `edge_pos` and `edge_index` of both graphs (`embedding.graph`).
-        certain: (R_a, R_b) `matching.scores.compute_certainty`.
+        certain: (R_a, R_b) `matching.assignment.compute_certainty`.
     """
     pairs = assign_certain(certain, LEAST_CERTAINTY)
     pairs = pairs[np.argsort(-certain[tuple(pairs.T)], kind="stable")]
@@ -84,7 +84,7 @@ def _pair_places(a: Mapping[str, Array], b: Mapping[str, Array], pairs: Array) -
 
 
 def _compute_candidates(places: MatchedPlaces) -> tuple[Array, Array, Array]:
-    """(C,) turn and move as complex numbers, and rise, m, of every two places that are as far apart in both maps."""
+    """Return (C,) turn and move as complex numbers, and rise, m, of every two places that are as far apart in both maps."""
     far = [np.linalg.norm(x[:, None, :2] - x[None, :, :2], axis=2) for x in (places.to, places.of)]
     alike = (np.minimum(*far) >= PLACES_APART) & (abs(far[0] - far[1]) <= LARGEST_STRETCH)
     p, q = np.nonzero(np.triu(alike, 1))

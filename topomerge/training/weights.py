@@ -22,15 +22,15 @@ from topomerge.training.tasks import compose_settings, train
 RUNS = Path("runs/weights")
 
 
-def main(words: Sequence[str]) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Train every task that has not ended."""
-    if {"-h", "--help"} & set(words):
+    if {"-h", "--help"} & set(arguments):
         print(__doc__)
         return 0
     shipped = [task for task in TASKS if TASKS[task].hours]
-    only = next((word[5:].split(",") for word in words if word.startswith("only=")), shipped)
-    runs = Path(next((word[5:] for word in words if word.startswith("runs=")), str(RUNS)))
-    shared = [word for word in words if not word.startswith(("only=", "runs="))]
+    only = next((word[5:].split(",") for word in arguments if word.startswith("only=")), shipped)
+    runs = Path(next((word[5:] for word in arguments if word.startswith("runs=")), str(RUNS)))
+    shared = [word for word in arguments if not word.startswith(("only=", "runs="))]
 
     def work() -> None:
         if unknown := next((task for task in only if task not in shipped), ""):
@@ -77,7 +77,7 @@ def _is_finished(runs: Path, task: str) -> bool:
 
 
 def _read_seconds(runs: Path) -> dict[str, float]:
-    """What was recorded of the steps."""
+    """Read the seconds that were recorded of the steps."""
     path = runs / "seconds.json"
     seconds: dict[str, float] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     return seconds

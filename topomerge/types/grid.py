@@ -146,7 +146,7 @@ class VoxelGrid:
         return self.origin + (np.asarray(self.cells if cells is None else cells) + 0.5) * self.edge
 
     def locate(self, points: Array) -> Array:
-        """(n, 3) int64 cells v_p that hold the given points; outside the bounds they are negative or beyond `shape`."""
+        """Return (n, 3) int64 cells v_p that hold the given points; outside the bounds they are negative or beyond `shape`."""
         return np.floor((np.asarray(points, np.float64) - self.origin) / self.edge).astype(np.int64)
 
     def find_rows(self, cells: Array) -> Array:

@@ -1,4 +1,4 @@
-"""What a map holds beside its walls: signs, tags, readings of radio and pressure, objects and names of rooms."""
+"""Landmarks of a map, beside its walls: signs, tags, readings of radio and pressure, objects and names of rooms."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class ShiftField:
     shifts: Array
 
     def at(self, points: Array) -> Array:
-        """(n, 2) m by which the points (n, 2) are moved."""
+        """Return (n, 2) m by which the points (n, 2) are moved."""
         from topomerge.kernels.bend import interpolate_nodes
 
         out: Array = interpolate_nodes(
@@ -105,7 +105,7 @@ class Deformation:
         return ShiftField(low, step, blended(nodes, anchors, moves, self.reach).reshape(*shape, 2))
 
     def storey_at(self, heights: Array) -> Array:
-        """(n,) storey of each height, m: the last one whose floor is not above it."""
+        """Return (n,) storey of each height, m: the last one whose floor is not above it."""
         out: Array = np.clip(np.searchsorted(self.floors - BETWEEN_STOREYS, heights, side="right") - 1, 0, None)
         return out
 
@@ -119,7 +119,8 @@ class Deformation:
         return out
 
     def _shifts(self, points: Array) -> Array:
-        """(n, 2) m. Over the last decimetres below a floor the moves of two storeys are blended: pipes and walls go through."""
+        """Return (n, 2) m. Over the last decimetres below a floor the moves of two storeys are blended: pipes and walls go
+        through."""
         if len(self.fields) == 1:
             only = self.fields[0]
             return np.zeros((len(points), 2)) if only is None else only.at(points[:, :2])
@@ -177,7 +178,7 @@ class Deformation:
 
     @staticmethod
     def from_json(values: Mapping[str, Any]) -> Deformation:
-        """What `to_json` gave.
+        """Build a deformation from what `to_json` gave.
 
         Raises:
             InputError: something else, or a deformation that folds space.
@@ -211,7 +212,8 @@ class Deformation:
 
 
 def blended(points: Array, anchors: Array, moves: Array, reach: float) -> Array:
-    """(n, 2) m: shifts of points (n, 2) by the moves (k, 4) of pieces about their anchors (k, 2), weighed by their nearness."""
+    """Return (n, 2) m: shifts of points (n, 2) by the moves (k, 4) of pieces about their anchors (k, 2), weighed by their
+    nearness."""
     many = min(BLENDED_PIECES, len(anchors))
     from scipy.spatial import cKDTree  # here: SciPy takes a quarter of a second, and only bent maps need it
 

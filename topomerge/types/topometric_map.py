@@ -262,7 +262,7 @@ class TopometricMap:
         return out
 
     def find_cell_storeys(self) -> Array:
-        """(n,) int32 storey of each occupied cell: its room's, or for a cell without a room the last one whose floor is
+        """Return (n,) int32 storey of each occupied cell: its room's, or for a cell without a room the last one whose floor is
         not above it."""
         if not len(self.storeys):
             return np.full(len(self.grid), -1, np.int32)

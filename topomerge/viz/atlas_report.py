@@ -151,9 +151,9 @@ def _render_index(result: AtlasResult, pages: Mapping[int, str]) -> Markup:
     return render_section("The joined maps", _render_text_table(("page", "maps", "weakest link", "names"), rows), "joined")
 
 
-def _render_link(words: str, file: str | None) -> str:
+def _render_link(text: str, file: str | None) -> str:
     """Words that lead to a file beside this one, if there is one."""
-    return words if file is None else build_element("a", words, href=file)
+    return text if file is None else build_element("a", text, href=file)
 
 
 def _render_verdict(result: AtlasResult, parts: Iterable[str]) -> Markup:
@@ -163,7 +163,7 @@ def _render_verdict(result: AtlasResult, parts: Iterable[str]) -> Markup:
 
 
 def _format_counts(result: AtlasResult) -> list[str]:
-    """What came out, where the names of all maps would fill a page."""
+    """Format the counts of the result, where the names of all maps would fill a page."""
     joined = [members for members in result.components if len(members) > 1]
     counts = [f"{sum(map(len, joined))} of {len(result.names)} maps, in {len(joined)} joined maps"]
     counts += [f"stand apart: {len(result.alone)}"] if result.alone else []
@@ -191,7 +191,7 @@ def _render_maps(result: AtlasResult, components: Sequence[int] | None = None, p
 
 
 def _render_links(result: AtlasResult, within: Sequence[int] | None = None) -> Markup:
-    """What holds the maps together and what was thrown out; of some of them, or of all and how long it took."""
+    """Render the links that hold the maps together and those thrown out; of some maps, or of all with the time it took."""
     parts: list[Markup] = []
     links, rejected = ([x for x in of if within is None or {*x.maps} & {*within}] for of in (result.links, result.rejected))
     if links:
@@ -244,7 +244,7 @@ def _render_text_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> M
 
 
 def _count_observers(map: TopometricMap) -> Array:
-    """(n,) how many maps saw each cell, 3 for more."""
+    """Return (n,) how many maps saw each cell, 3 for more."""
     assert map.provenance is not None
     return np.minimum(np.bitwise_count(map.provenance), 3).astype(np.int64)
 

@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from topomerge.archive import replace_on_success
 from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.types import TopometricMap
-from topomerge.viz.plan import Frame, Place, StoreyPlan, compute_frame, find_label_places, rasterize_storeys
+from topomerge.viz.plan import Frame, Place, StoreyView, compute_frame, find_label_places, rasterize_storeys
 
 PAPER, NO_ROOM, WALL_INK, TEXT_INK = "#ffffff", "#e4e4e4", "#333333", "#222222"
 EDGE_LINES: dict[str, dict[str, Any]] = {
@@ -117,7 +117,7 @@ def _create_panels(count: int, columns: int, inches: float, frame: Frame) -> tup
     return figure, axes
 
 
-def _draw_cells(ax: Axes, plan: StoreyPlan, frame: Frame, colours: Any) -> None:
+def _draw_cells(ax: Axes, plan: StoreyView, frame: Frame, colours: Any) -> None:
     image = np.ones((*frame.shape, 4))
     image[..., :3] = mpl.colors.to_rgb(PAPER)
     image[plan.floor] = mpl.colors.to_rgba(NO_ROOM)

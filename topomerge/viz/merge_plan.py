@@ -13,7 +13,7 @@ import numpy as np
 from topomerge.fusion.result import RoomMatch
 from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.types import Array, Deformation, Placement, Sim3, TopometricMap
-from topomerge.viz.plan import StoreyPlan, find_label_places, format_hex_colour
+from topomerge.viz.plan import StoreyView, find_label_places, format_hex_colour
 from topomerge.viz.report import render_zoom_buttons
 from topomerge.viz.svg import Sheet, lay_out, render_drawing, trace_rooms, trace_walls
 from topomerge.viz.tables import Markup, build_element, join, render_room_link
@@ -87,7 +87,7 @@ def render_arrows(name: str, shifts: PieceShifts, storey: int, sheet: Sheet, fac
 
 
 def _format_arrow(x: int, y: int, u: int, v: int) -> str:
-    """A line to (u, v) with a head, which is a third of it long, 10 to 40 cm."""
+    """Return a line to (u, v) with a head, which is a third of it long, 10 to 40 cm."""
     length = max(float(np.hypot(u - x, v - y)), 1.0)
     head = min(max(length / 3, 10.0), 40.0)
     a, b = (u - x) / length * head, (v - y) / length * head
@@ -115,7 +115,7 @@ def deform_path(d: str, sheet: Sheet, bend: Deformation, height: float) -> tuple
 
 
 def _subdivide_ring(corners: Array) -> Array:
-    """(n, 2) int64 cm, of a ring none of whose edges is longer than `LONGEST_EDGE`."""
+    """Return (n, 2) int64 cm, of a ring none of whose edges is longer than `LONGEST_EDGE`."""
     edges = np.roll(corners, -1, axis=0) - corners
     parts = np.maximum(np.ceil(np.hypot(*edges.T) / LONGEST_EDGE), 1).astype(np.int64)
     first = np.repeat(np.cumsum(parts) - parts, parts)
@@ -191,7 +191,7 @@ def format_centimetres(metres: float) -> str:
     return f"{100 * metres:.1f} cm" if metres < 0.1 else f"{100 * metres:.0f} cm"
 
 
-Drawn = tuple[Sheet, list[StoreyPlan]]
+Drawn = tuple[Sheet, list[StoreyView]]
 LEVEL_TOLERANCE = 0.7  # m by which floors of one storey may differ
 AFFINE_REACH = 10_000  # cm: places on the paper are rounded, so an affine map is measured over a long way
 
@@ -277,7 +277,7 @@ class _OverlaySide:
     name: str
     map: TopometricMap
     sheet: Sheet
-    plans: list[StoreyPlan]
+    plans: list[StoreyView]
     pose: Sim3
     bend: Deformation | None
 
@@ -312,7 +312,7 @@ def compute_sheet_transform(sheet: Sheet, paper: Sheet, pose: Sim3) -> Array:
 
 
 def _compute_enclosing_sheet(a: Sheet, b: Sheet, pose: Sim3) -> Sheet:
-    """A paper in a's frame, turned as a's, that holds what both show."""
+    """Return a paper in a's frame, turned as a's, that holds what both show."""
     ends = []
     for sheet, move in ((a, Sim3()), (b, pose)):
         width, height = sheet.size
@@ -391,7 +391,7 @@ def render_lines(
     return build_element("svg", *parts, class_="plan lines", viewBox=view, style=style, role="img", aria_label=text)
 
 
-def _render_storey(map: TopometricMap, sheet: Sheet, plan: StoreyPlan, colours: Array | None) -> list[Markup]:
+def _render_storey(map: TopometricMap, sheet: Sheet, plan: StoreyView, colours: Array | None) -> list[Markup]:
     shades = assign_room_colours(map) if colours is None else colours
     rooms = [
         build_element(

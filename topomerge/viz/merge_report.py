@@ -187,10 +187,10 @@ def save_merge(result: MergeResult, folder: str | Path) -> None:
         with ExitStack() as stack, ThreadPoolExecutor(1) as pool:  # all are whole before the first is renamed
             places = [stack.enter_context(replace_on_success(folder / name)) for name, _ in writers]
             jobs = list(zip(writers, places, strict=True))
-            beside = [pool.submit(write, place) for (_, write), place in jobs[2:]]  # a third of it is compression
+            background = [pool.submit(write, place) for (_, write), place in jobs[2:]]  # a third of it is compression
             for (_, write), place in jobs[:2]:
                 write(place)
-            for done in beside:
+            for done in background:
                 done.result()
             (folder / "merge.json").unlink(missing_ok=True)  # renamed last: a kill leaves no list of another run's files
     except BaseException:
@@ -266,7 +266,7 @@ def _render_verdict(result: MergeResult) -> Markup:
 
 
 def _render_observations(result: MergeResult) -> list[Markup]:
-    """What would settle the merge, where anything would."""
+    """Render the observations that would settle the merge, where any would."""
     if not result.settle:
         return []
     names = [m.title for m in result.maps]
@@ -321,7 +321,7 @@ def _render_maps(result: MergeResult, drawn: tuple[Drawn, Drawn], within: tuple[
 
 
 def _compute_colours(result: MergeResult, within: tuple[Array, Array]) -> tuple[Array, Array]:
-    """(R, 3) uint8 of the rooms of both maps: matched ones have the colour of the joined map's room in which they lie."""
+    """Return (R, 3) uint8 of the rooms of both maps: matched ones have the colour of the joined map's room in which they lie."""
     assert result.map is not None
     palette = assign_room_colours(result.map)
     of_maps = []
@@ -399,7 +399,7 @@ def _render_overlay(result: MergeResult, drawn: tuple[Drawn, Drawn], pose: Sim3)
 
 
 def _compute_observers(result: MergeResult) -> Array:
-    """(n,) 0 assumed, 1 seen by a only, 2 by b only, 3 by both; either may be joined of several maps already."""
+    """Return (n,) 0 assumed, 1 seen by a only, 2 by b only, 3 by both; either may be joined of several maps already."""
     assert result.map is not None and result.map.provenance is not None
     before = result.maps[0].provenance
     count = 1 if before is None else max(int(np.bitwise_or.reduce(before, initial=0)).bit_length(), 1)

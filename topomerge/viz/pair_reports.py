@@ -93,14 +93,14 @@ def _render_match_summary(matches: Sequence[RoomMatch], a: TopometricMap, b: Top
 
 
 def _compute_shades(map: TopometricMap, rooms: Array, probability: Array) -> Array:
-    """(R, 3) uint8, from grey (no match) to green (sure)."""
+    """Return (R, 3) uint8, from grey (no match) to green (sure)."""
     sure = np.zeros(len(map.rooms))
     np.maximum.at(sure, rooms, probability)
     return np.round(SILENT + sure[:, None] * (FOR - SILENT)).astype(np.uint8)
 
 
 def _render_pairs(matches: Sequence[RoomMatch], a: TopometricMap, b: TopometricMap) -> list[Markup]:
-    """What stands around the rooms of each match, folded."""
+    """Render the surroundings of the rooms of each match, folded."""
     if not matches:
         return []
     around_a, around_b = (cut_crops(build_sheet_arrays(m)) for m in (a, b))

@@ -1,4 +1,4 @@
-"""What views of a map show: rasters of its storeys, and its cells in 3D."""
+"""Data of the views of a map: rasters of its storeys, and its cells in 3D."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class StoreyPlan:
+class StoreyView:
     """One storey from above."""
 
     room: Array  # (nx, ny) int32 room of each pixel, -1 none
@@ -85,7 +85,7 @@ class StoreyCells:
     wall: Array
 
 
-def rasterize_storeys(map: TopometricMap, frame: Frame) -> list[StoreyPlan]:
+def rasterize_storeys(map: TopometricMap, frame: Frame) -> list[StoreyView]:
     """Return a plan of each storey, lowest first; one plan of everything where the map has no storeys."""
     return [paint_rooms(map, cells) for cells in locate_storey_cells(map, frame)]
 
@@ -116,18 +116,18 @@ def _group_cells(cells: Array, storey: Array, frame: Frame, count: int) -> list[
     return [(order[a:b], at[a:b]) for a, b in zip([0, *ends], ends, strict=False)]
 
 
-def paint_rooms(map: TopometricMap, cells: StoreyCells) -> StoreyPlan:
+def paint_rooms(map: TopometricMap, cells: StoreyCells) -> StoreyView:
     """Paint the rooms of a storey."""
     room = np.full(cells.floor.size, -1, np.int32)
     labels = map.room[cells.occupied]
     inside = labels >= 0
     room[cells.occupied_at[inside]] = labels[inside]
     room[cells.walked_at] = map.navigable_room[cells.walked]  # where one walks is surer than what hangs over it
-    return StoreyPlan(room.reshape(cells.floor.shape), cells.floor, cells.wall)
+    return StoreyView(room.reshape(cells.floor.shape), cells.floor, cells.wall)
 
 
 def _rasterize_walls(map: TopometricMap, frame: Frame, storey: int, level: Array, at: Array) -> Array:
-    """(nx, ny) bool: the cut of the storey, at heights above its floor."""
+    """Return (nx, ny) bool: the cut of the storey, at heights above its floor."""
     if not len(level):
         return np.zeros(frame.shape, bool)
     lowest = map.grid.origin[2] + level.min() * map.grid.edge
@@ -149,7 +149,7 @@ class Place:
 
 
 @lru_cache(maxsize=DRAWN_AGAIN)
-def find_label_places(plan: StoreyPlan, frame: Frame) -> dict[int, Place]:
+def find_label_places(plan: StoreyView, frame: Frame) -> dict[int, Place]:
     """Room -> the point of its area with most space around it; of nearly equal ones the nearest to the middle."""
     boxes = enumerate(ndimage.find_objects(plan.room + 1))
     return {i: find_label_place(plan.room[box] == i, plan.wall[box], box, frame) for i, box in boxes if box is not None}
@@ -242,7 +242,7 @@ def format_hex_colour(colour: Array) -> str:
 
 
 def _compute_corners(rooms: Array, origin: Array) -> list[list[float]] | None:
-    """The corners of the box around rooms, m from the scene's corner."""
+    """Return the corners of the box around rooms, m from the scene's corner."""
     if not len(rooms):
         return None
     low, high = rooms["lo"].min(axis=0) - origin, rooms["hi"].max(axis=0) - origin

@@ -20,7 +20,7 @@ from topomerge.errors import InputError
 from topomerge.fusion.result import BEND_PARAMETER
 from topomerge.fusion.transfer import LANDMARK_PARAMETER
 from topomerge.types import Array, TopometricMap
-from topomerge.viz.plan import StoreyPlan, build_scene_data
+from topomerge.viz.plan import StoreyView, build_scene_data
 from topomerge.viz.svg import Sheet, lay_out, render_plan_svgs
 from topomerge.viz.tables import (
     SHOWN_KINDS,
@@ -177,7 +177,7 @@ def list_storey_names(map: TopometricMap) -> list[tuple[str, str]]:
     return names or [("Plan", "no storeys were found")]
 
 
-def render_plan_view(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan], colours: Array | None = None) -> Markup:
+def render_plan_view(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyView], colours: Array | None = None) -> Markup:
     """Render all storeys' plans, as `lay_out` made them; the page's script shows one at a time, zooms and switches layers.
 
     Args:
@@ -205,8 +205,8 @@ def render_plan_view(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPla
     groups = [("choices", choices), ("layers", boxes), ("zoom", render_zoom_buttons())]
     bar = build_element("div", *(build_element("div", *parts, class_=name) for name, parts in groups if parts), class_="controls")
     figures = [
-        build_element("figure", build_element("figcaption", build_element("b", name), f" {words}"), drawing, data_storey=i)
-        for i, ((name, words), drawing) in enumerate(zip(names, render_plan_svgs(map, sheet, plans, colours), strict=True))
+        build_element("figure", build_element("figcaption", build_element("b", name), f" {text}"), drawing, data_storey=i)
+        for i, ((name, text), drawing) in enumerate(zip(names, render_plan_svgs(map, sheet, plans, colours), strict=True))
     ]
     hint = build_element("p", "Point at a room. Drag to move; click, then scroll to zoom.", class_="told", aria_live="polite")
     return build_element(
@@ -217,8 +217,8 @@ def render_plan_view(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPla
 def render_zoom_buttons() -> list[Markup]:
     """Render the buttons by which a plan is zoomed."""
     return [
-        build_element("button", sign, type="button", data_zoom=step, title=words, aria_label=words)
-        for sign, step, words in (("+", "in", "Zoom in"), ("−", "out", "Zoom out"), ("⤢", "all", "Show all"))
+        build_element("button", sign, type="button", data_zoom=step, title=text, aria_label=text)
+        for sign, step, text in (("+", "in", "Zoom in"), ("−", "out", "Zoom out"), ("⤢", "all", "Show all"))
     ]
 
 
@@ -238,7 +238,7 @@ def render_legend(map: TopometricMap) -> Markup:
         ("wall", "wall, cut at 1 to 1.9 m", True),
         ("seen", "seen, not a room", True),
     ]
-    items = [build_element("li", build_element("i", class_=f"sign-{sign}"), text) for sign, text, there in entries if there]
+    items = [build_element("li", build_element("i", class_=f"sign-{sign}"), text) for sign, text, shown in entries if shown]
     return build_element("ul", *items, class_="legend")
 
 

@@ -18,7 +18,7 @@ from topomerge.viz.plan import (
     DRAWN_AGAIN,
     Frame,
     Place,
-    StoreyPlan,
+    StoreyView,
     compute_frame,
     find_label_places,
     format_hex_colour,
@@ -92,7 +92,7 @@ def build_rotation(angle: float) -> Array:
     return np.array([[c, -s], [s, c]])
 
 
-def lay_out(map: TopometricMap, key: str = "", turn: float | None = None) -> tuple[Sheet, list[StoreyPlan]]:
+def lay_out(map: TopometricMap, key: str = "", turn: float | None = None) -> tuple[Sheet, list[StoreyView]]:
     """Return the paper for a map and the plan of each storey, lowest first.
 
     Args:
@@ -105,7 +105,7 @@ def lay_out(map: TopometricMap, key: str = "", turn: float | None = None) -> tup
     return build_sheet(plans, frame, key, turn), plans
 
 
-def build_sheet(plans: list[StoreyPlan], frame: Frame, key: str = "", turn: float | None = None) -> Sheet:
+def build_sheet(plans: list[StoreyView], frame: Frame, key: str = "", turn: float | None = None) -> Sheet:
     """Build the paper for the plans of all storeys."""
     mask = np.any([plan.room >= 0 for plan in plans], axis=0)
     if not mask.any():
@@ -134,7 +134,7 @@ SPECK = 0.3  # m2: smaller patches of what was seen outside rooms are left out
 
 
 @lru_cache(maxsize=DRAWN_AGAIN)
-def fill_rooms(plan: StoreyPlan, frame: Frame) -> Array:
+def fill_rooms(plan: StoreyView, frame: Frame) -> Array:
     """Return (nx, ny) int32 room of each pixel, -1 none, with small gaps and holes filled; no pixel changes from room to room."""
     reach = max(round(CLOSED / frame.size), 1)
     room = plan.room.copy()
@@ -159,7 +159,7 @@ def _fill_small_holes(mask: Array, most: float) -> Array:
 
 
 @lru_cache(maxsize=DRAWN_AGAIN)
-def trace_rooms(plan: StoreyPlan, sheet: Sheet) -> dict[int, str]:
+def trace_rooms(plan: StoreyView, sheet: Sheet) -> dict[int, str]:
     """Trace each room: room -> its outline as the `d` of an SVG path."""
     room = fill_rooms(plan, sheet.frame)
     return {i: trace_room(room[box] == i, sheet, box) for i, box in enumerate(ndimage.find_objects(room + 1)) if box is not None}
@@ -172,7 +172,7 @@ def trace_room(mask: Array, sheet: Sheet, box: tuple[slice, slice]) -> str:
 
 
 @lru_cache(maxsize=DRAWN_AGAIN)
-def trace_walls(plan: StoreyPlan, sheet: Sheet) -> str:
+def trace_walls(plan: StoreyView, sheet: Sheet) -> str:
     """Trace walls as the `d` of an SVG path; the two faces of a thin wall are drawn as one."""
     near = round(0.1 / sheet.frame.size)
     wall = plan.wall
@@ -183,7 +183,7 @@ def trace_walls(plan: StoreyPlan, sheet: Sheet) -> str:
     return trace(wall.astype(np.float32), sheet, blur=blur, level=level)
 
 
-def trace_observed_floor(plan: StoreyPlan, sheet: Sheet) -> str:
+def trace_observed_floor(plan: StoreyView, sheet: Sheet) -> str:
     """Trace the observed floor of the storey outside rooms, as the `d` of an SVG path."""
     patches, count = ndimage.label(plan.floor & (fill_rooms(plan, sheet.frame) < 0))
     large = np.bincount(patches.ravel(), minlength=count + 1) >= SPECK / sheet.frame.size**2
@@ -245,7 +245,7 @@ MOST_LANDMARKS_DRAWN = 1000  # on a storey
 SHORTEST_FLIGHT = 0.5  # m: stairs whose ends are nearer to each other, seen from above, are drawn as a sign
 
 
-def render_plan_svgs(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan], colours: Array | None = None) -> list[Markup]:
+def render_plan_svgs(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyView], colours: Array | None = None) -> list[Markup]:
     """Render the plan of each storey, lowest first.
 
     Args:
@@ -374,7 +374,7 @@ def _render_label(map: TopometricMap, sheet: Sheet, room: int, place: Place, nam
 
 
 def _compute_jambs(edge: Any) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The two jambs of a door, seen from above, m."""
+    """Return the two jambs of a door, seen from above, m."""
     x, y = edge["centre"][:2].tolist()
     half = max(float(edge["width"]), 0.2) / 2
     u, v = -math.sin(edge["direction"]) * half, math.cos(edge["direction"]) * half

@@ -231,8 +231,8 @@ def _list_neighbours(map: TopometricMap) -> list[list[int]]:
 
 def render_doors_table(map: TopometricMap, key: str = "") -> Markup:
     """Render all doors, openings, stairs and ramps; rows carry `data-edge` and `data-sure`."""
-    words, numbers = ("kind", "between", "storey", "state"), ("width m", "height m", "confidence", "x m", "y m")
-    columns = [("no.", "number"), *((name, "text") for name in words), *((name, "number") for name in numbers)]
+    texts, numbers = ("kind", "between", "storey", "state"), ("width m", "height m", "confidence", "x m", "y m")
+    columns = [("no.", "number"), *((name, "text") for name in texts), *((name, "number") for name in numbers)]
     rows = []
     for i, edge in enumerate(map.edges):
         a, b = edge["rooms"].tolist()

@@ -27,8 +27,10 @@ from topomerge.types import Array
 
 DOOR_CHANCE, LIKELY_DOOR = 0.35, 0.5  # probability of a door of every place of a doorway, and of one of them
 LEAST_WIDTH = 0.45  # m
+# Floor that goes on where nothing was seen is no door (docs/adr/0018).
 SEEN_AROUND, LEAST_ELEMENTS = 10, 12  # places to both sides of a doorway, and elements with points that its wall has there
 LEAF_BANDS = slice(2, 10)  # 0.3 to 1.9 m
+# The network cannot tell a set-back leaf from a niche with a decimetre of wall behind it (docs/adr/0018).
 SURFACE_FILL, EMPTY_FILL, THICKEST_LEAF = 0.3, 0.1, 0.08  # of the elements of a surface, and between two; m between them
 HALF_WALL = 0.06  # m from the face of a wall to its middle, where one face was seen only
 SAME_DOORWAY = 0.45  # m between what two faces show of one doorway
@@ -69,7 +71,8 @@ class StoreyWalls:
 
 
 def classify_places(walls: Elevations) -> Array:
-    """(n / 2, 7) float32 probability of each of `WALL_CLASSES` in each place along all strips, each read from both its ends."""
+    """Return (n / 2, 7) float32 probability of each of `WALL_CLASSES` in each place along all strips, each read from both its
+    ends."""
     bounds = list(iter_strip_bounds(walls))
     network = weights() if bounds else None  # once, before threads ask for it
     parts = run_side_by_side(lambda ends: read_both_ways(walls.strips[slice(*ends)], network), bounds)
@@ -77,7 +80,8 @@ def classify_places(walls: Elevations) -> Array:
 
 
 def read_both_ways(strip: Array, network: Run | None = None) -> Array:
-    """(n / 2, 7) float32 probability of each of `WALL_CLASSES`: a mirrored wall has the same doors, so two readings are averaged.
+    """Return (n / 2, 7) float32 probability of each of `WALL_CLASSES`: a mirrored wall has the same doors, so two readings are
+    averaged.
 
     Args:
         strip: (n, 32, 17), n even.
@@ -89,7 +93,7 @@ def read_both_ways(strip: Array, network: Run | None = None) -> Array:
 
 
 def compute_door_probabilities(walls: Elevations, classes: Array) -> Array:
-    """(n / 2, 3) float32 probability of an open, a shut and a half-open door in each place, of those of all classes."""
+    """Return (n / 2, 3) float32 probability of an open, a shut and a half-open door in each place, of those of all classes."""
     parts = [classes[low // PLACES : high // PLACES, [OPEN, SHUT, HALF_OPEN]] for low, high in iter_strip_bounds(walls)]
     return np.concatenate([np.zeros((0, 3), np.float32), *parts])
 
@@ -122,7 +126,7 @@ def detect_doorways(walls: Elevations, doors: Array, before: Array | None = None
 
 
 def _find_most_common(rooms: Array, otherwise: int) -> int:
-    """The room that occurs most often, `otherwise` where it is one of these or there is none (-1)."""
+    """Return the room that occurs most often, `otherwise` where it is one of these or there is none (-1)."""
     counts = np.bincount(rooms[rooms >= 0].astype(np.int64), minlength=otherwise + 1)
     if otherwise < 0:
         return int(counts.argmax()) if len(counts) else -1
@@ -138,6 +142,7 @@ def merge_openings(doorways: Array) -> tuple[Array, Array]:
     rooms = np.sort(doorways["rooms"], axis=1)
     along = np.column_stack([-doorways["out"][:, 1], doorways["out"][:, 0]])
     apart = doorways["centre"][None] - doorways["centre"][:, None]
+    # Not two doorways with floor between them, however far apart: that joined two doors in a wall of glass (docs/adr/0018).
     gap = np.abs((apart[..., :2] * along[:, None]).sum(axis=2)) - (doorways["width"][:, None] + doorways["width"]) / 2
     off = np.abs((apart[..., :2] * doorways["out"][:, None]).sum(axis=2))
     meet = (gap < SAME_DOORWAY) & (off < SAME_DOORWAY) & (np.abs(along @ along.T) > STRAIGHT)
@@ -197,7 +202,7 @@ def _build_doorway(face: Array, room: int, doors: Array, start: int, stop: int) 
 
 
 def _merge_faces(rows: Array) -> Array:
-    """What several faces show of one doorway as one row, the likeliest first."""
+    """Merge the rows of several faces of one doorway into one, the likeliest first."""
     if len(rows) < 2:
         return rows
     from scipy.cluster.hierarchy import fcluster, linkage  # here: maps that are only merged need none of it

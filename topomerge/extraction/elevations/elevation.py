@@ -19,11 +19,15 @@ from topomerge.networks.network import Network, Run, Signature, Tensor, load_net
 from topomerge.structure.lines import Line
 from topomerge.types import Array, VoxelGrid
 
+# Finer across than along: a shut leaf may lie only 3 cm deeper than its wall (docs/adr/0018).
 ALONG, ACROSS, UPWARDS = 0.05, 0.025, 0.2  # m, of an element
+# Both sides in one strip: furniture hides half of a wall from one side (docs/adr/0018).
 BEFORE, BEHIND = 0.3, 0.5  # m on both sides of a face
 LOWEST, HIGHEST = -0.1, 2.5  # m above the floor
+# So that doors in corners are in the strip (docs/adr/0018).
 PAST_ENDS = 1.2  # m by which a strip goes on past both ends of its face
 DEPTHS, BANDS = round((BEFORE + BEHIND) / ACROSS), round((HIGHEST - LOWEST) / UPWARDS)
+# Behind a shut leaf no ray went (docs/adr/0018).
 FREE_HEIGHTS = ((0.3, 0.6), (1.0, 1.3), (1.7, 2.0))  # m above the floor, at which rays are looked for
 FREE_ALONG, FREE_ACROSS = 2, 4  # elements that share an answer: cells that rays crossed are longer
 STRIP_CHANNELS = BANDS + 1 + len(FREE_HEIGHTS)  # and where one can walk, and where rays went
@@ -31,6 +35,7 @@ FULL = 0.75  # of the cells of a flat surface that make an element full
 SIDE_REACH = (0.15, 0.6)  # m from a face: where its room's floor lies
 # Of a place along a wall: a door that stands open, is shut, a window, a door that stands half open, a recess, and what stands
 # before the wall; "wall" where there is none, too.
+# Niches and cupboards are classes only to keep them from doors; they count as wall (docs/adr/0018).
 WALL_CLASSES = ("wall", "open", "shut", "window", "half", "niche", "cupboard")
 TILE = 1.0  # m: squares in which faces are looked up
 FACE_DTYPE = np.dtype(
@@ -155,7 +160,7 @@ def compute_place_probabilities(strip: Array, network: Run | None = None) -> Arr
 
 
 def weights() -> Network:
-    """Load the network that ships, or the one in its place (`io.weight_files`)."""
+    """Load the network that ships, or the one in its place (`archive.find_weights_file`)."""
     return load_shipped_network(WALL_NETWORK_FILE, WALL_SIGNATURE)
 
 

@@ -48,7 +48,7 @@ LEAST_FILL = 0.01  # share of the elements
 
 @dataclass(frozen=True, eq=False)
 class DoorCandidates:
-    """What plans or walls show.
+    """Candidates for doors from plans or walls.
 
     Args:
         edges: (n,) EDGE_DTYPE.
@@ -81,8 +81,8 @@ def add_wall_doors(map: TopometricMap, storeys: Sequence[ClassifiedStorey], wall
 
 
 def compute_door_probability(candidates: DoorCandidates, models: Mapping[str, Sequence[float]] | None = None) -> Array:
-    """(n,) probability that each is a door. Wide openings that the plan alone shows are as likely as the plan says: walls show
-    doors, and without the opening two rooms between which one walks would not be joined.
+    """Return (n,) probability that each is a door. Wide openings that the plan alone shows are as likely as the plan says: walls
+    show doors, and without the opening two rooms between which one walks would not be joined.
 
     Args:
         models: of each of `SOURCES` a constant and the weights of `WALL_DOOR_FEATURES`; None: those that ship.
@@ -110,6 +110,7 @@ def build_door_candidates(
         storeys: what probably stands in the columns of the plans.
         walls: with what lies beside them numbered as in the edges; None of a map that shows none at heights.
     """
+    # Slices and grids show no walls at several heights: a model of its own weighs the plan alone (docs/adr/0018).
     if walls is None:
         return _build_flat_candidates(complete, storeys, edges)
     doorways, shown = merge_openings(walls.doorways)
@@ -148,14 +149,15 @@ def build_door_candidates(
             )
             source.append(SOURCES.index("wall"))
     table = np.array(rows, EDGE_DTYPE) if rows else np.zeros(0, EDGE_DTYPE)
+    # In sparse scans walls show less, so the same evidence means more: doors' recall .81 to .90 (docs/adr/0018).
     seen = walls.elevations.strips[..., :BANDS] > 0
     fill = float(np.log(LEAST_FILL + (seen.mean() if seen.size else 0.0)))
     return _build_candidates(table, features, fill, storeys, np.array(source, np.int8))
 
 
 def _is_only_way(candidates: DoorCandidates, probability: Array, rooms: int) -> Array:
-    """(n,) bool: passages of a map without walls by which alone one walks from some rooms to others, the likeliest: what parts a
-    room wrongly must not part the graph."""
+    """Return (n,) bool: passages of a map without walls by which alone one walks from some rooms to others, the likeliest: what
+    parts a room wrongly must not part the graph."""
     ways, group = np.zeros(len(probability), bool), np.arange(rooms)
     for k in np.argsort(-probability, kind="stable").tolist():
         a, b = group[candidates.edges["rooms"][k]].tolist()
@@ -166,7 +168,7 @@ def _is_only_way(candidates: DoorCandidates, probability: Array, rooms: int) -> 
 
 
 def _build_flat_candidates(complete: Array, storeys: Sequence[ClassifiedStorey], edges: Array) -> DoorCandidates:
-    """The doors of the plans of a map without walls."""
+    """Return the doors of the plans of a map without walls."""
     less = complete[edges["rooms"]].min(axis=1).tolist()
     sizes = [_compute_size_features(width, c, 0) for width, c in zip(edges["width"], less, strict=True)]
     features = [[0, 0, 0, 0, float(e["confidence"]), 0, 0, *size] for e, size in zip(edges, sizes, strict=True)]
@@ -179,6 +181,7 @@ def _build_candidates(
     """Put the signs of the plan beside what was measured; where walls alone show a door the plan is not asked."""
     measured = np.array(features, float).reshape(len(edges), len(WALL_DOOR_FEATURES) - len(PLAN_SIGNS) - 1)
     measured = np.column_stack([measured, np.full(len(edges), fill)])
+    # With the plan's signs a shut door was dropped that both faces show surely and the plan does not see (docs/adr/0018).
     unasked = source == SOURCES.index("wall")
     signs = np.where(unasked[:, None], 0.0, compute_plan_features(storeys, edges["centre"]))
     return DoorCandidates(edges, np.hstack([measured, signs]), source)
@@ -190,14 +193,14 @@ def _compute_doorway_features(way: Array) -> list[float]:
 
 
 def _compute_size_features(width: float, complete: float, apart: float) -> tuple[float, ...]:
-    """The four of `WALL_DOOR_FEATURES` before the last ones, which are not of a door alone."""
+    """Return the four of `WALL_DOOR_FEATURES` before the last ones, which are not of a door alone."""
     odd = abs(float(np.log(max(float(width), 0.1) / 0.9)))
     return odd, complete, apart, float(width > DOOR_MOST_WIDTH)
 
 
 def _match_openings(edges: Array, doorways: Array) -> Array:
-    """(W,) the opening of the plan, wider than doors are, of which each doorway is a part, -1 none: walls show where it begins
-    and where it ends. A doorway on one side only may be a door in a wall that the plan lacks, of glass for example."""
+    """Return (W,) the opening of the plan, wider than doors are, of which each doorway is a part, -1 none: walls show where it
+    begins and where it ends. A doorway on one side only may be a door in a wall that the plan lacks, of glass for example."""
     out = np.full(len(doorways), -1)
     for k in np.flatnonzero(edges["width"] > DOOR_MOST_WIDTH).tolist():
         edge = edges[k]
@@ -213,7 +216,8 @@ def _match_openings(edges: Array, doorways: Array) -> Array:
 
 
 def _match_doorways(edges: Array, doorways: Array, whole: Array) -> Array:
-    """(E,) the doorway that each door of the plan is, -1 none: the nearest first, each once. A part of an opening is no other."""
+    """Return (E,) the doorway that each door of the plan is, -1 none: the nearest first, each once. A part of an opening is no
+    other."""
     partner = np.full(len(edges), -1)
     if not len(edges) or not len(doorways):
         return partner
@@ -231,7 +235,7 @@ def _match_doorways(edges: Array, doorways: Array, whole: Array) -> Array:
 
 
 def _move_door(edge: Array, way: Array) -> Array:
-    """A door of the plan where the wall shows it."""
+    """Return a door of the plan where the wall shows it."""
     out = edge.copy()
     out["centre"] = (*way["centre"][:2], edge["centre"][2])
     out["width"], out["direction"], out["half"] = way["width"], _compute_normal(way), _is_half_open(way) and edge["open"]
@@ -246,7 +250,7 @@ def _is_half_open(way: Array) -> bool:
 
 
 def _build_edge(way: Array) -> Array:
-    """A door that the plan does not show."""
+    """Return a door that the plan does not show."""
     out = np.zeros((), EDGE_DTYPE)
     out["rooms"], out["centre"], out["width"] = np.sort(way["rooms"]), way["centre"], way["width"]
     out["direction"], out["open"], out["half"] = _compute_normal(way), way["open"] >= 0.5, _is_half_open(way)
@@ -260,7 +264,7 @@ def _compute_normal(way: Array) -> float:
 
 
 def _measure_near_doors(walls: Elevations, doors: Array, edge: Array) -> tuple[float, float]:
-    """The highest probability of a door that walls show around a door of the plan, and is any wall seen there?"""
+    """Return the highest probability of a door that walls show around a door of the plan, and is any wall seen there?"""
     best, covered = 0.0, 0.0
     at = edge["centre"][:2] - walls.faces["start"]
     t = (at * walls.faces["along"]).sum(axis=1)

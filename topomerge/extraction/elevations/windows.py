@@ -58,8 +58,8 @@ def find_wall_depth(strip: Array, start: int, stop: int) -> int:
 
 
 def compute_wall_profile(strip: Array, start: int, stop: int) -> Array:
-    """(32,) how much lies in each element across the strip beside a stretch and above it: its wall. A cupboard has a face, too,
-    and its strip shows the wall, or a window, behind it."""
+    """Return (32,) how much lies in each element across the strip beside a stretch and above it: its wall. A cupboard has a face,
+    too, and its strip shows the wall, or a window, behind it."""
     left, right = strip[max(start - BESIDE, 0) * PLACES : start * PLACES], strip[stop * PLACES : (stop + BESIDE) * PLACES]
     beside = np.concatenate([left, right])[:, :, BESIDE_BANDS].sum(axis=(0, 2))
     profile: Array = beside + strip[start * PLACES : stop * PLACES, :, ABOVE_BANDS].sum(axis=(0, 2))
@@ -67,8 +67,8 @@ def compute_wall_profile(strip: Array, start: int, stop: int) -> Array:
 
 
 def measure_face_cover(strip: Array, start: int, stop: int, depth: int) -> Array | None:
-    """(13,) 0..1 share of the surface at a depth that is there in each band of a stretch, of what is there in most bands around
-    it; None where hardly anything is."""
+    """Return (13,) 0..1 share of the surface at a depth that is there in each band of a stretch, of what is there in most bands
+    around it; None where hardly anything is."""
     inner = slice((start + 1) * PLACES, (stop - 1) * PLACES)
     reach = slice(max(start - BESIDE, 0) * PLACES, (stop + BESIDE) * PLACES)
     face = strip[:, max(depth - 1, 0) : depth + 1, :BANDS].max(axis=1)
@@ -104,8 +104,8 @@ def iter_distinct_rows(rows: Array, same: Callable[[Array, Array], Array]) -> It
 
 
 def is_in_place(row: Array, centres: Array, widths: Array, across_reach: float = SAME_WALL) -> Array:
-    """(n,) bool: does something so wide share most of its width, or of the row's, with a row that has `centre`, `width` and
-    `direction`?"""
+    """Return (n,) bool: does something so wide share most of its width, or of the row's, with a row that has `centre`, `width`
+    and `direction`?"""
     apart, along = centres - row["centre"], _compute_along(row)
     place, across = apart[:, :2] @ along, np.abs(apart[:, 0] * along[1] - apart[:, 1] * along[0])
     shared = (widths + row["width"]) / 2 - np.abs(place)
@@ -126,7 +126,7 @@ def select_doors(map: TopometricMap) -> Array:
 
 
 def find_adjacent_rooms(map: TopometricMap, rows: Array) -> Array:
-    """(n, 2) the rooms whose floors are the nearest before rows and behind them, along their `direction`; -1 none."""
+    """Return (n, 2) the rooms whose floors are the nearest before rows and behind them, along their `direction`; -1 none."""
     inside = map.navigable_room >= 0
     flat = np.array([1, 1, STOOD / STRETCH_LEVEL])
     floor, room = map.navigable.compute_centroids(map.navigable.cells[inside]) * flat, map.navigable_room[inside]
@@ -145,7 +145,7 @@ def find_adjacent_rooms(map: TopometricMap, rows: Array) -> Array:
 
 
 def _compute_along(rows: Array) -> Array:
-    """(n, 2) unit, the ways along the walls that rows are in."""
+    """Return (n, 2) unit, the ways along the walls that rows are in."""
     return np.stack([-np.sin(rows["direction"]), np.cos(rows["direction"])], axis=-1)
 
 
@@ -166,7 +166,7 @@ def add_windows(map: TopometricMap, walls: Elevations, classes: Array) -> Topome
 
 
 def detect_windows(walls: Elevations, probability: Array) -> Array:
-    """(W,) WINDOW_DTYPE, each once however many faces show it, the likeliest first; `rooms` are those of the faces.
+    """Return (W,) WINDOW_DTYPE, each once however many faces show it, the likeliest first; `rooms` are those of the faces.
 
     Args:
         chance: (n / 2,) probability of a window in each place along the strips.
@@ -182,7 +182,8 @@ def detect_windows(walls: Elevations, probability: Array) -> Array:
 
 
 def select_windows(map: TopometricMap, rows: Array) -> Array:
-    """(W,) WINDOW_DTYPE of the windows with the rooms on their two sides, in the order of these; without those where a door is.
+    """Return (W,) WINDOW_DTYPE of the windows with the rooms on their two sides, in the order of these; without those where a
+    door is.
 
     A floor that goes on behind a window, seen through it, is often taken for one with the room: then there is no second room.
 
@@ -251,6 +252,6 @@ def _merge_windows(rows: Array, out: Array) -> Array:
 
 
 def _is_overlapping(window: Array, rows: Array) -> Array:
-    """(W,) bool: in one wall with a window, and sharing most of the narrower of the two."""
+    """Return (W,) bool: in one wall with a window, and sharing most of the narrower of the two."""
     parallel = np.abs(np.sin(rows["direction"] - window["direction"])) < TURNED_AWAY
     return parallel & is_in_place(window, rows["centre"], rows["width"])

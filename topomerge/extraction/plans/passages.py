@@ -201,6 +201,7 @@ def sort_pair(a: int, b: int) -> Pair:
 # The findings' rule (a passage that has less than 0.7 of the narrower side's width is a door) leaves open what a lintel, a wall
 # in line with the opening or a step of the ceiling say; these are weighed by what simulated scans of training buildings show.
 
+# On 20,424 narrowings the rule was right for 85 %, a logistic regression for 90 %, this network for 92 % (docs/adr/0004).
 DOOR_CLASSIFIER_FILE = "door_classifier.json"
 
 

@@ -41,6 +41,8 @@ OVER_LEVEL = 0.3  # m: what is higher above a storey's level does not lie in its
 LEAST_FLOOR = 0.5  # m2 of seen floor in a part
 HOLE = 4.0  # m2: gaps this small in what is known are filled
 TOUCHES = 0.25  # m: pieces this close to a longer wall belong to it
+# About where somebody can stand. When plans ended there everywhere, 30 of the 45 rooms that flats lost were no part of them: now
+# they go on to what has a ceiling or was looked through (docs/adr/0004).
 PLAN_MARGIN = 0.6  # m
 LEAST_SLAB = 0.1  # m at least, between a ceiling and the floor above it
 
@@ -68,6 +70,7 @@ def build_storey_plan(
     floor = select_lowest_of_column(navigable)
     cells = navigable.cells[floor].astype(np.int64)
     mine = cells[storey[floor] == k]
+    # Whole strides of the network and whole ceiling tiles: where columns lie decides single rooms (docs/adr/0004).
     margin, steps = int(np.ceil(PLAN_MARGIN / e)), int(np.lcm(COARSEST_STRIDE, _compute_tile_size(e)))
     far_off = -(-(round(COVERED_REACH / e) + margin) // steps) * steps
     first, last = mine[:, :2].min(axis=0) - margin, mine[:, :2].max(axis=0) + margin
@@ -81,6 +84,7 @@ def build_storey_plan(
         upper, _, near = _interpolate_heights(above[_is_within(above[:, :2] - low, size)], low, size, nominal)
         upper = np.where(near * e < 1.0, upper, nominal)
         ends = (near * e < 1.0) | ((upper - base) * e >= STOREY_LEAST_HEIGHT)  # not so over half levels
+        # The floor of the storey above would be taken for this one's ceiling (docs/adr/0015).
         top = np.where(ends, np.minimum(top, upper - int(np.ceil(LEAST_SLAB / e))), top)
     profile = np.zeros(size, np.uint64)
     fill_profiles(grid.cells, low, base, top, profile)
@@ -88,13 +92,17 @@ def build_storey_plan(
     wall_like = _is_filled_like_wall(profile, bands)
     clear = find_first_above(profile, bands)
     ceiling = _estimate_ceiling(np.where(wall_like, np.nan, clear), e)
+    # Cupboards: the ceiling was seen above them (docs/adr/0004).
     wall = wall_like & ~_is_below_ceiling(profile, ceiling, e)
+    # Points that hang in a doorway of a slice would move its door by .3 m (docs/adr/0026).
     wall = _remove_clutter(ndimage.binary_closing(wall, np.ones((3, 3)), border_value=0) | wall, e)
     on_floor = (profile & np.uint64(bands.build_mask(-0.3, 0.3))) != 0
+    # What hangs over the hall of the storey below is no floor of this one (docs/adr/0004).
     reach = np.where(_is_open_below(grid, cells[storey[floor] == k - 1], low, base), FLOOR_REACH, COVERED_REACH)
     covered = ~np.isnan(clear)
     if covered[seen].sum() < ROOFLESS_SHARE * seen.sum():  # the scan ends below the ceiling, but furniture stands on floor
         covered |= ((profile & np.uint64(bands.build_mask(*FURNITURE_HEIGHTS))) != 0) & find_enclosed_columns(wall, e)
+    # A depth camera sees neither floor nor ceiling of a bath, but its rays cross it (docs/adr/0004).
     if crossed is not None:
         covered |= _is_seen_through(crossed, grid, low, base) & find_enclosed_columns(
             wall, e
@@ -108,7 +116,8 @@ def build_storey_plan(
 
 
 def _find_box_around(inside: Array, first: Array, last: Array, margin: int) -> tuple[slice, slice]:
-    """The part of a raster from columns `first` to `last`, and `margin` columns beyond where what is inside reaches further.
+    """Return the part of a raster from columns `first` to `last`, and `margin` columns beyond where what is inside reaches
+    further.
 
     At its beginning it grows by whole strides of the plan network, which so sees all else as it would without.
     """
@@ -143,7 +152,8 @@ def _interpolate_heights(cells: Array, low: Array, size: Array, nominal: int = 0
 
 
 def _is_open_below(grid: VoxelGrid, lower: Array, low: Array, base: Array) -> Array:
-    """(nx, ny) bool: does the floor of the storey below, (n, 3) cells, see past the level of this one's? A hall through both."""
+    """Return (nx, ny) bool: does the floor of the storey below, (n, 3) cells, see past the level of this one's? A hall through
+    both."""
     out = np.zeros(base.shape, bool)
     lower = np.ascontiguousarray(lower[_is_within(lower[:, :2] - low, np.array(base.shape))])
     at = tuple((lower[:, :2] - low).T)
@@ -154,7 +164,7 @@ def _is_open_below(grid: VoxelGrid, lower: Array, low: Array, base: Array) -> Ar
 
 
 def _is_seen_through(crossed: VoxelGrid, grid: VoxelGrid, low: Array, base: Array) -> Array:
-    """(nx, ny) bool: did rays cross two free cells or more of a column at the height of a body?"""
+    """Return (nx, ny) bool: did rays cross two free cells or more of a column at the height of a body?"""
     count = np.zeros(base.size, np.int64)
     if crossed.edge > LONGEST_CROSSED:
         return count.reshape(base.shape) > 0
@@ -170,7 +180,7 @@ def _is_seen_through(crossed: VoxelGrid, grid: VoxelGrid, low: Array, base: Arra
 
 
 def build_profile_bands(edge: float) -> HeightBands:
-    """Build the height bands of the bits of a profile (`kernels.profile`): each is as high as a cell, m."""
+    """Build the height bands of the bits of a profile (`kernels.rasters.fill_profiles`): each is as high as a cell, m."""
     return HeightBands(edge, PROFILE_BELOW, PROFILE_LEVELS)
 
 
@@ -229,7 +239,7 @@ def _is_below_ceiling(profile: Array, ceiling: Array, edge: float) -> Array:
 
 
 def _remove_clutter(wall: Array, edge: float) -> Array:
-    """The walls without short pieces that stand free."""
+    """Return the walls without short pieces that stand free."""
     piece, count = ndimage.label(wall, np.ones((3, 3)))
     boxes = ndimage.find_objects(piece)
     length = np.array([max(b[0].stop - b[0].start, b[1].stop - b[1].start) for b in boxes]) * edge
@@ -241,8 +251,8 @@ def _remove_clutter(wall: Array, edge: float) -> Array:
 
 
 def _fill_holes(inside: Array, wall: Array, seen: Array, covered: Array, edge: float) -> Array:
-    """What is known, without small holes and without parts of which neither a floor was seen nor walls around what has a ceiling
-    or was looked through (`covered`)."""
+    """Return the observed columns, without small holes and without parts of which neither a floor was seen nor walls around what
+    has a ceiling or was looked through (`covered`)."""
     reach = max(round(0.2 / edge), 1)
     closed = ndimage.binary_closing(np.pad(inside | wall, reach), np.ones((2 * reach + 1,) * 2))[reach:-reach, reach:-reach]
     hole, count = ndimage.label(~closed)
@@ -278,9 +288,9 @@ OPEN_SHARE = 0.25  # of the outline with walls, and of the floor with a ceiling:
 
 
 def remove_upper_sides(grid: VoxelGrid, plan: StoreyPlan, region: Array, places: Array = NOWHERE) -> Array:
-    """The regions of an upper storey less those that are the upper side of a ceiling: nothing above, and either no walls around
-    or so thin that nobody is carried, with a storey right below. The flat roof of low rooms beside a hall has walls on one side:
-    those of the hall, which so becomes no storey of its own.
+    """Return the regions of an upper storey less those that are the upper side of a ceiling: nothing above, and either no walls
+    around or so thin that nobody is carried, with a storey right below. The flat roof of low rooms beside a hall has walls on one
+    side: those of the hall, which so becomes no storey of its own.
 
     Args:
         grid: occupied cells.

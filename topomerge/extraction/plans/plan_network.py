@@ -1,4 +1,4 @@
-"""What probably stands in each column of a plan: a convolutional network, trained on simulated scans of training buildings
+"""Class probabilities of each column of a plan: a convolutional network, trained on simulated scans of training buildings
 (`train.py task=plan_segmentation`; for robots' grids and drawings `task=grid_segmentation`; beyond the thesis: docs/adr/0005).
 
 A U-Net (Ronneberger et al. 2015) over what the plan knows of each column. It sees a few metres around, so that it may take the
@@ -26,10 +26,12 @@ COARSEST_STRIDE = 16  # columns a side, of an element of the coarsest level
 DOWN_LEVELS = ("a", "b", "c", "d")  # levels of 1/2, 1/4, 1/8, 1/16: each halves and goes on
 UP_LEVELS = ("e", "f", "g", "h")  # and back, each beside what went down
 SIZE_CHANNEL = EVIDENCE_CHANNELS - 1  # the last one, which is the same everywhere
+# One look loses on real homes (IoU .677 to .633), eight looks gain nothing that can be told (docs/adr/0005, 0026).
 LOOKS = 4  # at a plan, each a quarter turned
 NETWORK_REACH = 4  # strides: the network sees 60 columns to each side
 WORTH_PARTING = 0.8  # of a plan's area: its parts are looked at one by one where their boxes have less
 SAME_STOREY = 1.2  # m between a drawn door and the floor of its storey
+# Surer below a ceiling: from .6 on, stubs of walls beside doors went, too (docs/adr/0005).
 FURNITURE_CHANCE = 0.6, 0.95  # of the inside of a room, from which on what looked like wall is none: without and with a ceiling
 
 
@@ -47,8 +49,8 @@ PLAN_SIGNATURE = Signature(
 
 
 def compute_evidence(plan: StoreyPlan) -> Array:
-    """(nx, ny, 11) float32 of what was seen in each column: known, wall, how full four bands of heights are, floor, lintel,
-    ceiling and its height, and how large a column is."""
+    """Return (nx, ny, 11) float32 of what was seen in each column: known, wall, how full four bands of heights are, floor,
+    lintel, ceiling and its height, and how large a column is."""
     levels = []
     for low, high in EVIDENCE_HEIGHTS:
         mask = np.uint64(plan.bands.build_mask(low, high))
@@ -64,7 +66,7 @@ def compute_evidence(plan: StoreyPlan) -> Array:
 
 
 def compute_column_probabilities(plan: StoreyPlan, network: Run | None = None, looks: int = LOOKS) -> Array:
-    """(nx, ny, 5) float32 probability of each of `COLUMN_CLASSES` in each column, by the weights that ship or by others.
+    """Return (nx, ny, 5) float32 probability of each of `COLUMN_CLASSES` in each column, by the weights that ship or by others.
 
     The mean over the plan turned by quarters: what the network says of a door hangs on how its walls lie on the columns, and
     where they do by chance, four looks err less than one (docs/adr/0005).
@@ -91,11 +93,13 @@ def compute_column_probabilities(plan: StoreyPlan, network: Run | None = None, l
 
 
 def _average_turns(x: Array, network: Run, looks: int) -> Array:
-    """(nx, ny, 5) mean probability over (11, nx, ny) evidence turned by the first `looks` quarters."""
+    """Return (nx, ny, 5) mean probability over (11, nx, ny) evidence turned by the first `looks` quarters."""
 
     def look(k: int) -> Array:
         return np.rot90(run_network(np.rot90(x, k, (1, 2)), network), -k, (1, 2))
 
+    # One by one: a batch of four takes 15 % longer (docs/adr/0031). The mean of scores before the softmax is no better than
+    # that of probabilities (docs/adr/0005).
     mean: Array = np.mean(run_side_by_side(look, range(looks)), axis=0)
     return np.moveaxis(mean, 0, -1)
 
@@ -141,6 +145,7 @@ def add_drawn_doors(plan: StoreyPlan, probability: Array, doors: Array) -> Array
     mean = np.bincount(column, doors[here, 3], plan.wall.size) / np.maximum(count, 1)
     drawn = mean.astype(np.float32).reshape(plan.wall.shape)
     before = probability[..., DOORWAY_CLASS]
+    # As evidence of the cut, not as votes for rooms: that gained .02 on flats and lost .01 on schools (docs/adr/0048).
     doorway = np.maximum(before, drawn)
     out = probability * ((1 - doorway) / np.maximum(1 - before, np.float32(1e-6)))[..., None]
     out[..., DOORWAY_CLASS] = doorway
@@ -168,7 +173,7 @@ def run_network(x: Array, network: Run) -> Array:
 
 
 def load_weights(raised: bool = False) -> Network:
-    """Load the network that ships, or the one in its place (`io.weight_files`).
+    """Load the network that ships, or the one in its place (`archive.find_weights_file`).
 
     Args:
         raised: that of robots' grids and drawings, whose walls were all raised alike.

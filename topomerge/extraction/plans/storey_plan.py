@@ -15,7 +15,7 @@ from topomerge.types import Array, VoxelGrid
 # A storey seen from above: the one type for it, and the one rule for which of its columns are walls (beyond the thesis).
 #
 # A wall fills most of the heights between furniture and lintels; what fills fewer is clutter. The extraction makes such plans
-# from the navigable volume (`extraction.plans.plan`), the merging from bare cells (`fusion.storey_plan`), the matching from
+# from the navigable volume (`extraction.plans.plan`), the merging from bare cells (`registration.storeys`), the matching from
 # finished maps (`matching.room_plans`).
 
 WALL_HEIGHTS = np.linspace(0.5, 2.0, 7)  # m above the floor, limits of the bands in most of which a wall is seen
@@ -128,7 +128,7 @@ class StoreyPlan:
 
 @dataclass(frozen=True)
 class WallRule:
-    """What makes a column a wall.
+    """The rule that makes a column a wall.
 
     Args:
         share: of the observed bands that it fills.
@@ -149,7 +149,7 @@ WALL_RULE = WallRule()  # of the plans that poses are judged by
 
 
 def find_first_above(profile: Array, bands: HeightBands, height: float = UPRIGHT) -> Array:
-    """(nx, ny) float64 m above the local floor, lower side of the first thing above a height; nan where there is none."""
+    """Return (nx, ny) float64 m above the local floor, lower side of the first thing above a height; nan where there is none."""
     bit = find_lowest_bit(profile.ravel(), round(height / bands.step) + bands.below).reshape(profile.shape)
     return np.where(bit >= 0, (bit - bands.below) * bands.step, np.nan)
 
@@ -235,7 +235,7 @@ def _find_nearest_storey(storeys: Sequence[ClassifiedStorey], centre: Array) -> 
 
 
 def _crop_around(storey: ClassifiedStorey, centre: Array, reach: float) -> Array:
-    """(a, b, 5) of the columns at most `reach` m from a place, along each axis."""
+    """Return (a, b, 5) of the columns at most `reach` m from a place, along each axis."""
     columns = max(int(reach / storey.edge), 1)
     low = np.floor((np.asarray(centre)[:2] - storey.origin) / storey.edge).astype(np.int64) - columns
     box = tuple(slice(max(k, 0), max(k + 2 * columns + 1, 0)) for k in low.tolist())

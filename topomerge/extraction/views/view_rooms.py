@@ -55,7 +55,8 @@ def find_local_maxima(grid: VoxelGrid, distance: Array, radius: float) -> Array:
 
 
 def raise_views(navigable: VoxelGrid, cells: Array, height: float) -> Array:
-    """(v, 3) float64 centroids of (v, 3) cells raised by `height` m: out of the floor, to where one looks from (seeds 2.4.1)."""
+    """Return (v, 3) float64 centroids of (v, 3) cells raised by `height` m: out of the floor, to where one looks from (seeds
+    2.4.1)."""
     views = navigable.compute_centroids(cells)
     views[:, 2] += height
     return views
@@ -186,7 +187,8 @@ def _renumber_by_first(labels: Array) -> Array:
 
 
 def vote(visibility: Visibility, cluster: Array) -> Array:
-    """(n,) int32: for each cell the cluster of which the most views see it; of equals the smallest number, -1 if none does."""
+    """Return (n,) int32: for each cell the cluster of which the most views see it; of equals the smallest number, -1 if none
+    does."""
     winner = np.full(visibility.cells, -1, np.int32)
     order = np.argsort(cluster, kind="stable")
     graphs.find_most_voted(visibility.indptr, visibility.words, visibility.masks, order, np.asarray(cluster, np.int64), winner)

@@ -1,4 +1,4 @@
-"""What views see: rays through a sparse voxel octree (seeds 2.5)."""
+"""Visibility from views: rays through a sparse voxel octree (seeds 2.5)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ class SparseVoxelOctree:
         return len(self._nodes.first) - 1
 
     def compute_codes(self, level: int) -> Array:
-        """(m,) uint64 Morton codes of a level's octants, 0 <= level <= depth: a parent's is a child's without its 3 low bits."""
+        """Return (m,) uint64 Morton codes of a level's octants, 0 <= level <= depth: a parent's is a child's without its 3 low
+        bits."""
         if not 0 <= level <= self.depth:
             raise ValueError(f"the octree has levels 0..{self.depth}, not {level}")
         first = self._nodes.first

@@ -161,7 +161,7 @@ def _find_mutual_pairs(cosine: Array) -> tuple[tuple[int, int, float], ...]:
 
 
 def _compute_similarity(new: Rows, rows: Rows) -> tuple[Array, Array]:
-    """(R_new, R) how alike rooms are, and by how much their vote counts: less where they are not moved as most are."""
+    """Return (R_new, R) how alike rooms are, and by how much their vote counts: less where they are not moved as most are."""
     if not isinstance(new, TurnedRows) or not isinstance(rows, TurnedRows):
         cosine = _normalise_rows(np.asarray(new)) @ _normalise_rows(np.asarray(rows)).T
         return cosine, np.ones_like(cosine)

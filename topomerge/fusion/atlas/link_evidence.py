@@ -26,7 +26,8 @@ from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Array, Sim3
 
 # Log odds that agreement may add where no rival is named: of wrong registrations, one in e ** 1.5 (.22) is taken for a place that
-# looks the same to all of its maps. An assumption, as the priors of `fusion.posterior`, where storeys and wings are .36 of it.
+# looks the same to all of its maps. An assumption, as the priors of `registration.posterior`, where storeys and wings are .36 of
+# it.
 CLOSING_GAIN = 1.5
 PRIOR_SAME_PLACE = 4.0  # log odds against a registration giving just this place by chance
 NOT_NAMED = 0.1  # least share of what a pair's best pose leaves that belongs to placements no hypothesis names
@@ -85,7 +86,7 @@ def place_component(a: Poses, b: Poses, pair: tuple[int, int], pose: Sim3) -> Si
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """What names placements of two maps (i < j).
+    """A source of placements of two maps (i < j).
 
     Args:
         named: poses T_ij with their shares.
@@ -214,7 +215,7 @@ class _LinkScorer:
         return self._poses[pair, move]
 
     def _compute_share(self, source: Source) -> float | None:
-        """What a source gives to the placement of the link; None where it does not name it."""
+        """Compute the share of a source for the placement of the link; None where it does not name it."""
         if source not in self._shares:
             pose, named = self._compute_pose(source.pair, self.move), None
             if source.direct and source.pair == self.pair:  # the link itself, even if others moved it a little
@@ -227,7 +228,7 @@ class _LinkScorer:
         return next((share for p, share in source.named if self.evidence.is_same_pose(*source.pair, p, pose, limits)), None)
 
     def _compute_rival_share(self, source: Source, rival: Sim3) -> float | None:
-        """What a source gives to a rival placement or to a poor fit near it, but for what it gives to the link itself."""
+        """Compute the share of a source for a rival placement or a poor fit near it, without its share for the link itself."""
         own, pose = self._compute_pose(source.pair, self.move), self._compute_pose(source.pair, rival)
         others = [(p, share) for p, share in source.named if not self.evidence.is_same_pose(*source.pair, p, own)]
         near = [share for p, share in others if self.evidence.is_same_pose(*source.pair, p, pose, LOOK_ALIKE_LIMITS)]
@@ -248,10 +249,11 @@ class _LinkScorer:
                 support = max(support, self._check(source.pair, self.move).log_odds)
             supports.append(max(support, 0.0) if source.pair != self.pair or not source.direct else 0.0)
             odds += [float(np.log(share / source.none))] if share is not None and source.direct else []
+        # Not their sum: pairs share the gaps and the noise of a map, and four wrong ones of .7 would make .97 (docs/adr/0022).
         return max(odds, default=0.0) + min(sum(supports), CLOSING_GAIN)
 
     def _sum_contradictions(self, move: Sim3) -> tuple[float, dict[tuple[int, int], float]]:
-        """What walls on free floor say against a placement, each place once; and the cost of each pair by itself."""
+        """Sum the evidence of walls on free floor against a placement, each place once; and the cost of each pair by itself."""
         costs: dict[tuple[int, int], float] = {}
         places: list[tuple[Array, float]] = []
         for source in self.sources:
@@ -313,6 +315,7 @@ class _LinkScorer:
             named.append((odds, shares[loser] is not None or (seen[loser] and not source.named), seen[loser]))
             if source.direct and odds < loudest[0]:
                 loudest = odds, source.pair
+        # Not their mean: true links would lose by each pair that hardly overlaps (docs/adr/0022).
         gains = [weigh(((sign * odds, both, seen) for odds, both, seen in named)) for sign in (1.0, -1.0)]
         return gains[0] - gains[1], loudest
 

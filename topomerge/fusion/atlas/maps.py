@@ -33,7 +33,7 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class MapSummary:
-    """What is asked of a map before it is put together with others.
+    """A summary of a map, read before it is put together with others.
 
     Args:
         key: `hash_map`.
@@ -144,7 +144,7 @@ def hash_map(map: TopometricMap) -> str:
 
 
 def _get_recent(memory: OrderedDict[str, Made], key: str, capacity: int, make: Callable[[], Made]) -> Made:
-    """What was made of a map, from the memory of those that were used last."""
+    """Get what was made of a map, from the memory of those that were used last, or make it."""
     if key not in memory:
         memory[key] = make()
         while len(memory) > capacity:

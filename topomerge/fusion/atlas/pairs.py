@@ -77,7 +77,8 @@ class Contradiction:
 
 
 def find_conflict_columns(a: Sequence[PlanFields], b: Sequence[PlanFields], pose: Sim3) -> Array:
-    """(n, 4) place in a's frame and area (half of it, as both maps are asked) of the walls on free floor under T_ab, m and m2."""
+    """Return (n, 4) place in a's frame and area (half of it, as both maps are asked) of the walls on free floor under T_ab, m and
+    m2."""
     rows = [np.zeros((0, 4))]
     for v, w in pair_storeys(a, b, pose.translation[2], pose.scale):
         sides = ((w, v, pose, pose.scale**2), (v, w, pose.inverse(), 1.0))
@@ -160,7 +161,7 @@ def serialise_contradiction(c: Contradiction) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Check:
-    """What two maps say to a pose T_ij.
+    """The check of a pose T_ij by its two maps.
 
     Args:
         pose: after it was moved to where the walls meet.
@@ -243,7 +244,7 @@ class Checks:
         return _get_or_compute(self._fine, (i, j), pose, self.maps.get_middle(j), make)
 
     def __call__(self, i: int, j: int, pose: Sim3) -> Check:
-        """What maps i and j say to T_ij."""
+        """Check T_ij by maps i and j."""
         if j < i:
             turned = self(j, i, pose.inverse())
             back = turned.pose.inverse()
@@ -284,7 +285,7 @@ class Checks:
 def _get_or_compute(
     memory: dict[tuple[int, int], list[tuple[Sim3, T]]], pair: tuple[int, int], pose: Sim3, at: Array, make: Callable[[], T]
 ) -> T:
-    """What was made for a pair under a pose that is the same, or what is made now."""
+    """Get the value of a pair under the same pose from the memory, or compute it now."""
     entries = memory.setdefault(pair, [])
     for other, value in entries:
         if is_same_pose(pose, other, at, CHECKED_ONCE):
@@ -339,7 +340,7 @@ def sample_common_points(a: Sequence[PlanFields], b: Sequence[PlanFields], pose:
 
 
 def locate_place(a: Sequence[PlanFields], b: Sequence[PlanFields], pose: Sim3) -> Array:
-    """(5, 3) points of b that stand for the place which both maps saw: its middle, and as far from it as it is wide."""
+    """Return (5, 3) points of b that stand for the place which both maps saw: its middle, and as far from it as it is wide."""
     points = sample_common_points(a, b, pose)
     if not len(points):
         points = np.append(b[0].middle, 0.0)[None]

@@ -33,7 +33,9 @@ TRIES = 4  # of a pair, whose worker may die of something else
 
 Workers = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
 """Calls a function with each task: the numbers of the tasks and what came out, as they end."""
+# 18 % of the pairs that share a place are not among forty, 12 % not among eighty, and each costs a coarse pose (docs/adr/0019).
 COARSE_PARTNERS = 40  # maps that a map's rooms look most like, on which it is laid coarsely
+# Four of five pairs that share a place are among these; ten by looks alone had two of three (docs/adr/0019).
 MOST_PARTNERS = 5  # of these and of those that name it, the ones on which it lies best
 LIKELY_PARTNERS = 2  # that its rooms look most like, however it lies: drift spoils a coarse pose
 NAMED_PARTNERS = 2  # that its signs, tags and radio speak of, however it lies
@@ -269,6 +271,7 @@ def find_partners(
     odds, complete = _score_partners(maps, named, scale, end)
     chosen = {_order_pair(*pair) for pair in linked} | {_order_pair(k, m) for k, of in enumerate(testified) for m in of}
     for k in range(count):
+        # By rank, with no limit of log odds: right pairs of the real floor go down to -7, as strangers do (docs/adr/0019).
         best = sorted(sets[k], key=lambda m, k=k: (-odds.get(_order_pair(k, m), -np.inf), m))  # type: ignore[misc]
         chosen |= {_order_pair(k, m) for m in (best if count <= FEW_MAPS else best[:MOST_PARTNERS] + named[k][:LIKELY_PARTNERS])}
     partners: list[dict[int, float]] = [{} for _ in range(count)]

@@ -228,7 +228,7 @@ def _draw_rooms(map: TopometricMap, plans: Sequence[StoreyPlan]) -> Iterable[Arr
 
 
 def _parse_storeys(number: int, arrays: Mapping[str, Array] | None, memory: _Plans, path: Path | None) -> list[IndexedStorey]:
-    """The storeys of a map, of arrays or of its file.
+    """Return the storeys of a map, of arrays or of its file.
 
     Raises:
         InputError: the file is damaged, or of another version.

@@ -1,4 +1,4 @@
-"""What an atlas gives: which maps belong together, where they lie, and the links that hold them."""
+"""The result of an atlas: which maps belong together, where they lie, and the links that hold them."""
 
 from __future__ import annotations
 

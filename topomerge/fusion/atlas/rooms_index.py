@@ -94,7 +94,7 @@ def _check_links(whole: Array, places: Array, most: int, there: Array) -> None:
 
 
 def _read_integers(whole: Array, places: Array | list[int], count: int) -> Array:
-    """(n, count) whole numbers of 32 bits that begin at these bytes."""
+    """Return (n, count) whole numbers of 32 bits that begin at these bytes."""
     at = np.asarray(places)[:, None] + np.arange(4 * count)
     return np.ascontiguousarray(whole[at]).view("<u4").astype(np.int64)
 
@@ -125,7 +125,7 @@ class RoomRows:
                 archive.write({"embedder": encode_signature(signature), **self._arrays}, self.path)
 
     def _complete_rows(self, stored: StoredAtlas, describe: Descriptor, written: Collection[str]) -> dict[str, Array]:
-        """What is written of the maps of the atlas, and what is missing."""
+        """Collect the rows of all maps of the atlas: those that are written are read, missing ones are computed."""
         arrays = archive.read(self.path, ROOMS_KIND, _list_array_names(self.entries)) if written else {}
         completed: dict[str, Array] = {}
         for entry in self.entries:
@@ -163,7 +163,7 @@ class RoomRows:
         return archive.read(self.path, ROOMS_KIND, _list_array_names(entries)) if self._arrays is None else self._arrays
 
     def _parse_rows(self, arrays: Mapping[str, Array], entry: Entry, number: type) -> Rows:
-        """What was written of a map."""
+        """Parse the rows that were written of a map."""
         of, places = arrays.get(entry.key, np.zeros(0)), arrays.get(f"{entry.key}.places")
         fits = of.ndim == (2 if places is None else 3) and len(of if places is None else places) == len(of) == entry.rooms
         fits &= not entry.rooms or of.shape[1:] == self._like
@@ -258,7 +258,7 @@ class RoomsIndex:
 
     @property
     def _unit(self) -> float:
-        """What a number of 1 is in eight bits: numbers up to six times the usual one have room."""
+        """Return the value that stands for 1 in eight bits: numbers up to six times the usual one have room."""
         return float(127 / min(1.0, 6 / np.sqrt(self.size)))
 
     def _quantise(self, vectors: Array) -> Array:
@@ -308,7 +308,8 @@ class RoomsIndex:
 
 
 def prepare_rooms_index(stored: StoredAtlas, rows: RoomRows, signature: str, size: int) -> RoomsIndex | None:
-    """The index of an atlas, made or completed where it is not; None where exact search is better, or `usearch` is missing.
+    """Return the index of an atlas, made or completed where it is not; None where exact search is better, or `usearch` is
+    missing.
 
     Args:
         rows: of its maps.

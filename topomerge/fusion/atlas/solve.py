@@ -389,7 +389,7 @@ class Journal(dict[Pair, tuple[PoseHypothesis, ...]]):
             out.write(json.dumps({"stamp": self._stamp, **entry}) + "\n")
 
     def _take(self, line: str) -> None:
-        """What a line says; nothing where it was cut, or is of other settings."""
+        """Add the entry of a line; skip one that was cut, or is of other settings."""
         try:
             entry = json.loads(line)
             if entry["stamp"] == self._stamp and "coarse" in entry:
@@ -413,7 +413,7 @@ class _Coarse(dict[Pair, float]):
 
 
 def _read_listing(folder: Path, settings: Mapping[str, Any]) -> Mapping[str, Any]:
-    """What stands in pairs.json; nothing where the file is missing, damaged or of another version or other settings."""
+    """Read pairs.json; return nothing where the file is missing, damaged or of another version or other settings."""
     try:
         listing: Mapping[str, Any] = json.loads((folder / PAIRS_FILE).read_text(encoding="utf-8"))
         return listing if listing["format"] == PAIRS_FORMAT and listing["stamp"] == _compute_stamp(settings) else {}
@@ -449,12 +449,12 @@ def _serialise_entry(pair: Pair, hypotheses: Sequence[PoseHypothesis]) -> dict[s
 
 
 def _parse_entry(entry: Mapping[str, Any]) -> tuple[Pair, tuple[PoseHypothesis, ...]]:
-    """What `_entry` gave."""
+    """Parse an entry of a line: the pair and its hypotheses."""
     return (entry["maps"][0], entry["maps"][1]), tuple(_parse_hypothesis(h) for h in entry["hypotheses"])
 
 
 def _compute_stamp(settings: Mapping[str, Any]) -> str:
-    """What registrations depend on beside the maps."""
+    """Hash all that registrations depend on beside the maps."""
     inputs = [__version__, load_model(), settings["scale"], str(settings["embedder"]), settings["same"]]
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:16]
 

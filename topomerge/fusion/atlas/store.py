@@ -158,7 +158,8 @@ def split_into_tiles(map: TopometricMap) -> list[Array]:
 
 
 def find_nearest_rooms(map: TopometricMap) -> Array:
-    """(n,) room of each occupied cell; of those without one that of the nearest cell with one, from above. 0 where none has."""
+    """Return (n,) room of each occupied cell; of those without one that of the nearest cell with one, from above. 0 where none
+    has."""
     owner = map.room.astype(np.int64)
     inside = owner >= 0
     if inside.all() or not inside.any():
@@ -196,7 +197,7 @@ def select_tile(map: TopometricMap, rooms: Sequence[int] | Array) -> TopometricM
 
 @dataclass(frozen=True)
 class Change:
-    """What an atlas shall hold.
+    """A change of an atlas: the maps and settings that it shall hold.
 
     Args:
         stored: its maps and settings.

@@ -165,7 +165,8 @@ def find_longer_version(name: str, old: TopometricMap, new: TopometricMap, store
 
 
 def replace_map(stored: StoredAtlas, longer: LongerVersion, new: Entry) -> tuple[StoredAtlas, Proposed]:
-    """An atlas in which the new map stands where the one before stood, and where it may lie in those that were linked with it.
+    """Return an atlas in which the new map stands where the one before stood, and where it may lie in those that were linked with
+    it.
 
     Args:
         new: entry of the new map, under any name.
@@ -269,16 +270,16 @@ class FolderWatcher:
         return compute_stamp(path, self.reader.options)
 
     def _list_inputs(self) -> list[Path]:
-        """What may be a map."""
+        """List the files that may be maps."""
         try:
-            there = sorted(p for p in self.folder.resolve().iterdir() if not p.name.startswith("."))
+            entries = sorted(p for p in self.folder.resolve().iterdir() if not p.name.startswith("."))
         except OSError as error:
             raise InputError(f"{self.folder}: can't be read ({error.strerror or error}); is it there?") from error
         simulated = list_simulation_files(self.folder)
-        described = {p.stem for p in there if p.suffix.lower() in (".yaml", ".yml")}  # their pictures are no maps of their own
+        described = {p.stem for p in entries if p.suffix.lower() in (".yaml", ".yml")}  # their pictures are no maps of their own
         kinds = {*list_suffixes(), ".tmap"}
-        there = [p for p in there if p.name not in simulated and not is_landmark_file(p)]
-        own = [p for p in there if not (p.suffix.lower() in PICTURES and p.stem in described)]
+        entries = [p for p in entries if p.name not in simulated and not is_landmark_file(p)]
+        own = [p for p in entries if not (p.suffix.lower() in PICTURES and p.stem in described)]
         for p in sorted({p for p in own if p.is_symlink() and not p.exists()} - self._broken):
             self.tell(f"{p}: is a link to what is not there; it is skipped until it is", True)
             self._broken.add(p)
@@ -299,7 +300,7 @@ class FolderWatcher:
             yield batch
 
     def _read_file(self, path: Path) -> _ReadFile | None:
-        """What a file gives; None where it changes meanwhile."""
+        """Read a file as a map; None where it changes meanwhile."""
         stamp, sources = self._compute_stamp(path), read_sources(self.atlas)
         try:
             digest = compute_digest(path, self.reader.options)
@@ -329,7 +330,7 @@ class FolderWatcher:
 
 
 class _Plan:
-    """What a batch changes of an atlas, found out when nobody else can change it."""
+    """The changes of an atlas by a batch, planned while nobody else can change it."""
 
     def __init__(self, watch: FolderWatcher, batch: list[_ReadFile]) -> None:
         self.watch, self.batch = watch, batch
@@ -376,8 +377,8 @@ class _Plan:
         first = next(iter(stored.entries), None)
         if first is not None and stored.settings["scale"] == "fixed":
             try:
-                there = requested.new.get(first.name) or stored.folder / first.file
-                check_units(self.watch.memory.summarise(there).extent, map)
+                first_map = requested.new.get(first.name) or stored.folder / first.file
+                check_units(self.watch.memory.summarise(first_map).extent, map)
             except InputError as error:
                 self.lines.append((f"{name}: {error}", True))
                 self.counts["unreadable"] += 1
@@ -412,11 +413,11 @@ def describe_file(file: str, name: str, map: TopometricMap, longer: LongerVersio
 def iter_outcome(result: AtlasResult, plan: _Plan) -> Iterator[str]:
     """Yield sentences on where the new maps lie, and which others were joined and taken apart."""
     names = [str(name) for name in result.names]
-    for name, words in plan.names.items():
+    for name, head in plan.names.items():
         n = result.find_component(names.index(name))
         others = [names[k] for k in result.components[n] if names[k] != name]
         apart = "stands apart" if result.complete else "stands apart so far, there is more to be tried"
-        yield f"{words}; lies with {_format_names(others)} ({result.get_probability(n):.2f})" if others else f"{words}; {apart}"
+        yield f"{head}; lies with {_format_names(others)} ({result.get_probability(n):.2f})" if others else f"{head}; {apart}"
     for link in result.rejected:
         pair = [names[k] for k in link.maps]
         if set(pair) in plan.links:
@@ -432,11 +433,11 @@ def iter_changes(after: Mapping[str, int], before: Mapping[str, int]) -> Iterato
         after, before: name -> component.
     """
     both = [name for name in after if name in before]
-    for one, two, words, between in ((before, after, "taken apart", " | "), (after, before, "joined now", " + ")):
+    for one, two, event, between in ((before, after, "taken apart", " | "), (after, before, "joined now", " + ")):
         for group in _iter_groups(both, one):
             parts = list(_iter_groups(group, two))
             if len(parts) > 1:
-                yield f"{words}: {between.join(map(_format_names, parts))}"
+                yield f"{event}: {between.join(map(_format_names, parts))}"
 
 
 def _iter_groups(names: list[str], component: Mapping[str, int]) -> Iterator[list[str]]:

@@ -135,9 +135,9 @@ def _group_edges_by_pair(table: Array) -> dict[tuple[int, int], list[Any]]:
     return dict(sorted(connections.items()))
 
 
-def _describe_edges(ways: list[Any], kind: str = "") -> Json:
+def _describe_edges(edges: list[Any], kind: str = "") -> Json:
     """Kind and width (m) of the widest way, then each way with its centre (m); a given kind stands for that of all."""
-    listed = [{"kind": kind or str(w["kind"]), "width": float(w["width"]), "centre": w["centre"].tolist()} for w in ways]
+    listed = [{"kind": kind or str(w["kind"]), "width": float(w["width"]), "centre": w["centre"].tolist()} for w in edges]
     widest = max(listed, key=lambda way: way["width"])
     return {"kind": widest["kind"], "width": widest["width"], "ways": listed}
 
@@ -187,7 +187,7 @@ def _iter_objects(map: TopometricMap) -> Iterator[tuple[Json, list[Json]]]:
 
 
 def _compute_area_centres(map: TopometricMap, floors: list[Any]) -> tuple[Array, Array]:
-    """(A,) room and (A, 3) a point well inside of each area; a room without areas counts as one."""
+    """Return (A,) room and (A, 3) a point well inside of each area; a room without areas counts as one."""
     bare = np.setdiff1d(np.arange(len(map.rooms)), map.areas["room"])
     owner = np.concatenate([map.areas["room"], bare]).astype(np.int64)
     centres = np.concatenate([map.areas["centroid"], map.rooms["centroid"][bare]])

@@ -195,7 +195,7 @@ def _build_feature(name: str, geometry: dict[str, Any] | None, properties: dict[
 
 
 def _build_polygons(floor: shapely.MultiPolygon, z: float, place: Place) -> dict[str, Any] | None:
-    """The geometry of a floor; null, as RFC 7946 has it, where there is none."""
+    """Return the geometry of a floor; null, as RFC 7946 has it, where there is none."""
     parts = [
         [place(np.column_stack([ring.coords, np.full(len(ring.coords), z)])) for ring in (part.exterior, *part.interiors)]
         for part in floor.geoms

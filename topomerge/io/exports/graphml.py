@@ -60,7 +60,7 @@ def _add_data(parent: Any, where: str, values: dict[str, Any]) -> None:
 
 
 def _read_row(row: Any, *left_out: str) -> dict[str, Any]:
-    """The columns of a table's row; points as three numbers, what is not known (nan) left out."""
+    """Return the columns of a table's row; points as three numbers, what is not known (nan) left out."""
     values: dict[str, Any] = {}
     for name in row.dtype.names:
         value = row[name].tolist()

@@ -237,9 +237,9 @@ class _BuildingModel(Model):
         property_set.Name = name
         return property_set
 
-    def _define(self, product: Any, facts: Any) -> None:
-        name = f"{product.GlobalId} {facts.GlobalId}"
-        self.create_rooted("IfcRelDefinesByProperties", name, RelatedObjects=[product], RelatingPropertyDefinition=facts)
+    def _define(self, product: Any, properties: Any) -> None:
+        name = f"{product.GlobalId} {properties.GlobalId}"
+        self.create_rooted("IfcRelDefinesByProperties", name, RelatedObjects=[product], RelatingPropertyDefinition=properties)
 
     def add_slab(self, r: int, floor: Any, z: float, storey: Any) -> Any:
         """Return the floor of a room."""
@@ -327,7 +327,7 @@ class _BuildingModel(Model):
         self._define(element, self._set("IfcPropertySet", f"Topomerge_{str(edge['kind']).title()}", i, HasProperties=properties))
 
     def _create_box(self, width: float, height: float) -> Any:
-        """What fills an opening or stands before a wall, along x from 0, y to both sides."""
+        """Create the box of a leaf or pane, which fills an opening or stands before a wall: along x from 0, y to both sides."""
         middle = self.create("IfcAxis2Placement2D", Location=self.create_point(width / 2, 0))
         box = self.create("IfcRectangleProfileDef", ProfileType="AREA", Position=middle, XDim=width, YDim=LEAF_THICKNESS)
         up = self.create("IfcDirection", DirectionRatios=[0.0, 0.0, 1.0])

@@ -118,7 +118,7 @@ def _build_level(map: TopometricMap, storey: int, route: Route, names: Sequence[
         name = "" if room is None else names[room] or f"room_{room}"
         more = {"lift_cabin": [TEXT, cabin[room]]} if room in cabin else {}
         number[node.id] = level.add(node.point, _make_unique(name, level), **more)
-    level.lanes = [(number[a], number[b]) for a, b in route.ways]
+    level.lanes = [(number[a], number[b]) for a, b in route.links]
     for i, edge in enumerate(map.edges):
         rooms = [r for r in edge["rooms"].tolist() if map.rooms["storey"][r] == storey]
         if rooms and str(edge["kind"]) == "door":
@@ -210,7 +210,7 @@ def _describe_lift(map: TopometricMap, lift: _Lift) -> dict[str, Any]:
 
 
 def _format_graph(name: str, levels: Sequence[_Level], lifts: Sequence[_Lift]) -> str:
-    """The graph that fleet adapters read: lanes have one direction, and vertices of floors and doors are left out."""
+    """Return the graph that fleet adapters read: lanes have one direction, and vertices of floors and doors are left out."""
     lines = [f"building_name: {_dump(name)}", "levels:"]
     for level in levels:
         used = sorted({end for lane in level.lanes for end in lane})

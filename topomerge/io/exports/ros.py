@@ -95,7 +95,7 @@ def _find_floor_cells(map: TopometricMap, storey: int) -> Array:
 
 
 def _find_near_cells(map: TopometricMap, rows: Array) -> Array:
-    """(n, 3) int64 occupied cells from the lowest floor to a person's height over the highest, in the floor's lattice."""
+    """Return (n, 3) int64 occupied cells from the lowest floor to a person's height over the highest, in the floor's lattice."""
     if not len(rows):
         return np.empty((0, 3), np.int64)
     points, z = map.grid.compute_centroids(), map.navigable.compute_centroids()[rows, 2]
@@ -104,7 +104,7 @@ def _find_near_cells(map: TopometricMap, rows: Array) -> Array:
 
 
 def _compute_levels(map: TopometricMap, rows: Array, first: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
-    """(nx, ny) int32 lowest navigable cell of each column, NEVER where there is none; and its room."""
+    """Return (nx, ny) int32 lowest navigable cell of each column, NEVER where there is none; and its room."""
     level, room = np.full(shape, NEVER, np.int32), np.full(shape, -1, np.int32)
     order = rows[np.argsort(-map.navigable.cells[rows, 2], kind="stable")]  # the lowest one is written last
     i, j = (map.navigable.cells[order, :2] - first).T
@@ -114,7 +114,7 @@ def _compute_levels(map: TopometricMap, rows: Array, first: Array, shape: tuple[
 
 
 def _count(at: tuple[Array, Array], above: Array, band: tuple[float, float], edge: float, shape: tuple[int, int]) -> Array:
-    """(nx, ny) number of cells in a band of heights above the floor."""
+    """Return (nx, ny) number of cells in a band of heights above the floor."""
     low, high = max(round(band[0] / edge), 1), max(round(band[1] / edge), 2)
     present = (above >= low) & (above < high)
     count = np.zeros(shape, np.int32)
@@ -123,7 +123,7 @@ def _count(at: tuple[Array, Array], above: Array, band: tuple[float, float], edg
 
 
 def _find_steep_floor(level: Array, walked: Array, edge: float) -> Array:
-    """(nx, ny) bool: floor that rises like stairs. `level` is known everywhere."""
+    """Return (nx, ny) bool: floor that rises like stairs. `level` is known everywhere."""
     if not walked.any():
         return walked
     wide = 2 * max(round(STEEP[0] / edge) // 2, 1) + 1
@@ -165,7 +165,7 @@ class Route:
 
     first: int = 0
     nodes: list[Node] = field(default_factory=list)
-    ways: list[Pixel] = field(default_factory=list)
+    links: list[Pixel] = field(default_factory=list)
     edges: list[Edge] = field(default_factory=list)
 
     def add(self, point: Any, **metadata: Any) -> int:
@@ -187,7 +187,7 @@ def plan_storey_route(map: TopometricMap, grid: Occupancy, storey: int, first: i
             _add_room(route, map, grid.crop(wide), clear[wide], r, doors)
     number = first + len(route.nodes)
     place = {node.id: node.point for node in route.nodes}
-    for a, b in route.ways:
+    for a, b in route.links:
         length = float(np.hypot(*np.subtract(place[a], place[b])))
         route.edges += [Edge(number, a, b, length), Edge(number + 1, b, a, length)]
         number += 2
@@ -224,12 +224,13 @@ def _add_room(route: Route, map: TopometricMap, grid: Occupancy, clear: Array, r
             doors[i] = route.add(grid.compute_centre(np.array(leaf)) if is_flight(edge) else point, **values)
         leaves[leaf] = doors[i] if leaf not in leaves else leaves[leaf]
         if leaves[leaf] != doors[i]:
-            route.ways.append((leaves[leaf], doors[i]))
+            route.links.append((leaves[leaf], doors[i]))
     _add_tree(route, grid, mask, clear, parent, leaves, root, middle)
 
 
 def _find_exit(map: TopometricMap, edge: Any, r: int) -> tuple[Array, Array]:
-    """(2,) where one leaves room r: the middle of a door, the nearer end of a flight; and (2,) the way on out of a flight."""
+    """Return (2,) where one leaves room r: the middle of a door, the nearer end of a flight; and (2,) the way on out of a
+    flight."""
     if not is_flight(edge):
         return np.asarray(edge["centre"][:2]), np.zeros(2)
     z = map.rooms["centroid"][r, 2]
@@ -241,7 +242,7 @@ def _find_exit(map: TopometricMap, edge: Any, r: int) -> tuple[Array, Array]:
 
 
 def _find_exit_pixel(reached: Array, grid: Occupancy, point: Array, out: Array) -> Pixel | None:
-    """The pixel from which one goes through a door, or onto a flight: straight on from its end, else beside it."""
+    """Return the pixel from which one goes through a door, or onto a flight: straight on from its end, else beside it."""
     if not out.any():
         return _find_nearest(reached, grid, point, DOOR_REACH)
     ahead = point + np.arange(0.0, FLIGHT_REACH, grid.size / 2)[:, None] * out
@@ -261,7 +262,7 @@ def _find_middle(inside: Array, clear: Array) -> Pixel:
 
 
 def _rasterize_disc(grid: Occupancy, point: Array, radius: float) -> tuple[tuple[slice, slice], Array]:
-    """The part of the pixels around a point, and which of them are near to it."""
+    """Return the part of the pixels around a point, and which of them are near to it."""
     first = np.maximum(np.floor((point - radius - grid.low) / grid.size).astype(int), 0)
     last = np.maximum(np.ceil((point + radius - grid.low) / grid.size).astype(int), first)
     box = (slice(first[0], last[0]), slice(first[1], last[1]))
@@ -273,7 +274,7 @@ def _rasterize_disc(grid: Occupancy, point: Array, radius: float) -> tuple[tuple
 
 
 def _find_nearest(mask: Array, grid: Occupancy, point: Array, radius: float) -> Pixel | None:
-    """The pixel of the mask nearest to a point."""
+    """Return the pixel of the mask nearest to a point."""
     box, disc = _rasterize_disc(grid, point, radius)
     options = np.argwhere(mask[box] & disc) + (box[0].start, box[1].start)
     if not len(options):
@@ -294,7 +295,7 @@ def _add_tree(
 ) -> None:
     """Ways from the root to all leaves (pixel -> node), with a node at every fork and bend."""
     if root in leaves:
-        route.ways.append((middle, leaves[root]))
+        route.links.append((middle, leaves[root]))
     nodes = {**leaves, root: middle}
     used: dict[Pixel, int] = {}  # pixel -> how many ways come into it from further out
     far = [leaf for leaf in leaves if leaf != root]
@@ -318,7 +319,7 @@ def _add_chain(route: Route, grid: Occupancy, mask: Array, clear: Array, chain: 
         if chain[i] not in nodes:
             nodes[chain[i]] = route.add(grid.compute_centre(np.array(chain[i])), kind="way")
     names = [nodes[chain[i]] for i in turns]
-    route.ways += [(a, b) for a, b in pairwise(names) if a != b]
+    route.links += [(a, b) for a, b in pairwise(names) if a != b]
 
 
 def _compute_predecessors(mask: Array, clear: Array, size: float, root: Pixel) -> dict[Pixel, Pixel]:
@@ -416,7 +417,7 @@ def prepare_files(map: TopometricMap, folder: Path, stem: str, storey: int | Non
 
 
 def _prepare_images(folder: Path, name: str, grid: Occupancy) -> list[tuple[Path, partial[None]]]:
-    """A grid's image and what says where it lies."""
+    """Return a grid's image and what says where it lies."""
     image = f"{name}.pgm"
     return [(folder / image, partial(_save_image, grid)), (folder / f"{name}.yaml", partial(_save_yaml, grid, image))]
 

@@ -50,8 +50,8 @@ def save(map: TopometricMap, path: Path) -> None:
                 )
                 bag.write(to, TOLD_AT, markers.store.serialize_cdr(markers.build_array(listed), ARRAY))
         (file,) = (Path(temporary) / "bag").glob("*.mcap")
-        with replace_on_success(path) as beside:
-            beside.write_bytes(file.read_bytes())
+        with replace_on_success(path) as temporary_path:
+            temporary_path.write_bytes(file.read_bytes())
 
 
 def _iter_topics(map: TopometricMap, markers: _MarkerFactory) -> Iterator[tuple[str, list[Any]]]:

@@ -98,7 +98,7 @@ def read_frame_poses(folder: Path, names: Sequence[str] = ()) -> list[FramePose]
 
 
 def _parse_frame_pose(frames: tuple[str, str], entry: Mapping[str, Any], levelled: tuple[Array, Array]) -> FramePose:
-    """The pose of the second frame in the first one, of an entry of `transforms` (docs/outputs.md)."""
+    """Return the pose of the second frame in the first one, of an entry of `transforms` (docs/outputs.md)."""
     x, y, z = (float(row[3]) for row in entry["matrix"][:3])
     pose = Sim3(math.radians(float(entry["yaw_deg"])), (x, y, z), float(entry["scale"]))
     matrix = None if all(map(is_level, levelled)) else np.array(entry["matrix"], np.float64)

@@ -90,7 +90,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Tally:
-    """What was written: kind of thing (nodes, links, …) -> how many the sources have and how many the file has."""
+    """Counts of what was written: kind of thing (nodes, links, …) -> how many the sources have and how many the file has."""
 
     counts: Mapping[str, tuple[int, int]]
     warnings: tuple[str, ...] = ()

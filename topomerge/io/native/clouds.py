@@ -97,7 +97,7 @@ def _iter_blocks(stream: IO[bytes], row: np.dtype, count: int) -> Iterator[Array
 
 
 def _move_rows(path: Path, rows: Array, motion: Motion) -> Array:
-    """The rows with their places and normals moved; what is not finite stays so."""
+    """Return the rows with their places and normals moved; what is not finite stays so."""
     with np.errstate(all="ignore"):
         points = _stack(rows, ("x", "y", "z"))
         moved = motion.move_points(points)

@@ -106,7 +106,7 @@ def _join_graphs(graphs: Sequence[KartoGraph], doubt: Doubt) -> int:
 
 
 def _list_values(of: Sequence[Any]) -> list[Any]:
-    """What a list holds, or a map of numbers."""
+    """List the values of a list, or of a map by number."""
     return [entry[1] if isinstance(entry, tuple) else entry for entry in of]
 
 
@@ -125,7 +125,7 @@ def _renumber(graph: KartoGraph, first: KartoGraph) -> None:
 
 
 def _list_scans(graph: KartoGraph) -> list[Members]:
-    """The scans of both files: each has its own."""
+    """Return the scans of both files: each has its own."""
     return [scan for archive in graph.archives for scan in archive.found[SCAN]]
 
 

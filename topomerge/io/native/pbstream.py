@@ -213,9 +213,9 @@ def _join_graphs(states: Sequence[_State], doubt: Doubt) -> tuple[bytes, int]:
         parts.append(_encode(fields))
         nodes.append(list(state.graph.nodes))
         own = np.array([state.graph.nodes[k] for k in nodes[-1]]).reshape(-1, 4, 4)
-        there = motion.move_poses(own)
-        places.append(there[:, :3, 3])
-        moved.append(dict(zip(nodes[-1], there, strict=True)))
+        placed = motion.move_poses(own)
+        places.append(placed[:, :3, 3])
+        moved.append(dict(zip(nodes[-1], placed, strict=True)))
     links = []
     for a, i, b, j in find_nearest_links(places):
         submaps = {k: states[a].source.motion.move_poses(p[None])[0] for k, p in states[a].graph.submaps.items()}

@@ -88,8 +88,8 @@ def read_pose_graph(path: Path) -> PoseGraph:
     return graph
 
 
-def _parse_line(graph: PoseGraph, words: list[str]) -> None:
-    tag, rest = words[0], words[1:]
+def _parse_line(graph: PoseGraph, columns: list[str]) -> None:
+    tag, rest = columns[0], columns[1:]
     if tag in VERTICES:
         number, values = _parse_id(rest[0] if rest else ""), _parse_numbers(tag, rest[1:], VERTICES[tag])
         if number in graph.vertices:
@@ -116,10 +116,10 @@ def _parse_id(word: str) -> int:
     return number
 
 
-def _parse_numbers(tag: str, words: list[str], count: int) -> Array:
-    if len(words) != count:
-        raise ValueError(f"{tag} has {len(words)} numbers, not {count}")
-    values = np.array([float(word) for word in words])
+def _parse_numbers(tag: str, columns: list[str], count: int) -> Array:
+    if len(columns) != count:
+        raise ValueError(f"{tag} has {len(columns)} numbers, not {count}")
+    values = np.array([float(word) for word in columns])
     if not (np.abs(values) < BEYOND).all():
         raise ValueError(f"{tag} has a number that is not finite")
     return values
@@ -217,7 +217,7 @@ def _build_edge(graph: PoseGraph, a: int, b: int, doubt: Doubt) -> tuple[str, tu
 
 
 def _format_information(doubt: Doubt, flat: bool) -> str:
-    """The upper triangle of the inverse covariance; of SE3 the vector part of the quaternion counts, half of a turn."""
+    """Return the upper triangle of the inverse covariance; of SE3 the vector part of the quaternion counts, half of a turn."""
     information = doubt.build_information()
     if flat:
         information = information[np.ix_([0, 1, 5], [0, 1, 5])]

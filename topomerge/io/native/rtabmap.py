@@ -74,7 +74,7 @@ class _Session:
     version: tuple[int, ...]
     poses: Poses
     tables: dict[str, dict[str, tuple[str, bool, bool]]]
-    said: tuple[str, ...]
+    warnings: tuple[str, ...]
     stamp: str
 
 
@@ -88,7 +88,7 @@ def join(sources: Sequence[Source], target: Path, doubt: Doubt) -> Tally:
     _check_versions(sessions)
     target.unlink(missing_ok=True)
     newest = max(sessions, key=lambda session: session.version)
-    warnings = [f"{session.source.path}: {text}" for session in sessions for text in session.said]
+    warnings = [f"{session.source.path}: {text}" for session in sessions for text in session.warnings]
     with closing(sqlite3.connect(target, uri=True, isolation_level=None)) as base:
         base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_BLOB)
         for setting in ("trusted_schema = OFF", "journal_mode = OFF", "synchronous = OFF"):
@@ -229,12 +229,12 @@ def _copy_session(
 
 
 def _count(base: sqlite3.Connection, schema: str, table: str) -> int:
-    there = base.execute(f"SELECT 1 FROM {schema}.sqlite_master WHERE type = 'table' AND name = ?", (table,)).fetchone()
-    return int(base.execute(f"SELECT COUNT(*) FROM {schema}.{table}").fetchone()[0]) if there else 0
+    exists = base.execute(f"SELECT 1 FROM {schema}.sqlite_master WHERE type = 'table' AND name = ?", (table,)).fetchone()
+    return int(base.execute(f"SELECT COUNT(*) FROM {schema}.{table}").fetchone()[0]) if exists else 0
 
 
 def _get_most(base: sqlite3.Connection, schema: str, kind: str) -> int:
-    """The largest number of a kind that any table uses; of maps, one more, as they count from 0."""
+    """Return the largest number of a kind that any table uses; of maps, one more, as they count from 0."""
     most = -1 if kind == MAP else 0
     for table, columns in TABLES.items():
         for column in (c for c, counted in columns.items() if counted == kind):
@@ -259,8 +259,8 @@ def _renumber_tags(session: _Session, placed: dict[int, Array], joined: dict[int
 
 
 def _copy_table(base: sqlite3.Connection, name: str, session: _Session, steps: dict[str, Any], tags: dict[int, int]) -> None:
-    there = {row[1] for row in base.execute(f"PRAGMA main.table_info({name})")}
-    columns = [c for c in session.tables[name] if c in there]
+    known = {row[1] for row in base.execute(f"PRAGMA main.table_info({name})")}
+    columns = [c for c in session.tables[name] if c in known]
     if not columns:
         return
     values = [_write_value(base, name, column, steps, tags) for column in columns]
@@ -283,19 +283,19 @@ def _write_value(base: sqlite3.Connection, table: str, column: str, steps: dict[
 
 
 def _choose_ending(base: sqlite3.Connection) -> str:
-    """What is put behind the names of nodes that another session has, so that no two are alike."""
-    there, own = (
+    """Choose the ending for names of nodes that another session has, too, so that no two are alike."""
+    joined, own = (
         {label for (label,) in base.execute(f"SELECT label FROM {schema}.Node WHERE label IS NOT NULL")}
         for schema in ("main", "source")
     )
     endings = (f"_{k}" for k in itertools.count(2))
-    return next(ending for ending in endings if not {f"{label}{ending}" for label in own & there} & (there | own))
+    return next(ending for ending in endings if not {f"{label}{ending}" for label in own & joined} & (joined | own))
 
 
 def _copy_admin(base: sqlite3.Connection, session: _Session) -> None:
     """The version and the preview; all that is drawn of one session's optimised graph is left out: RTAB-Map draws it again."""
-    there = {row[1] for row in base.execute("PRAGMA main.table_info(Admin)")}
-    columns = [c for c in ("version", "preview_image") if c in there and c in session.tables["Admin"]]
+    known = {row[1] for row in base.execute("PRAGMA main.table_info(Admin)")}
+    columns = [c for c in ("version", "preview_image") if c in known and c in session.tables["Admin"]]
     base.execute(f"INSERT INTO main.Admin ({', '.join(columns)}) SELECT {', '.join(columns)} FROM source.Admin LIMIT 1")
 
 

@@ -65,7 +65,7 @@ class _Graph:
         return [k for k, node in self.nodes.items() if node["layer"] == layer and not node.get("partition", 0)]
 
     def get_places(self, ids: Sequence[int]) -> Array:
-        """(n, 3) m."""
+        """Return (n, 3) m."""
         return np.array([self.nodes[k]["attributes"]["position"] for k in ids], np.float64).reshape(-1, 3)
 
     def find_parents(self) -> dict[int, int]:
@@ -149,7 +149,7 @@ def _check_node(node: Any) -> None:
 
 
 def _move_graph(graph: _Graph, motion: Motion) -> _Graph:
-    """The graph in the joined frame: all that is a place or a turn in the world."""
+    """Return the graph in the joined frame: all that is a place or a turn in the world."""
     nodes = {k: {**node, "attributes": _move_attributes(node["attributes"], motion)} for k, node in graph.nodes.items()}
     about = dict(graph.about)
     mesh = about.get("mesh")
@@ -199,21 +199,21 @@ def _turn(quaternion: Any, turn: Array) -> Any:
 
 def _share_labels(graph: _Graph, joined: _Graph) -> _Graph:
     """Numbers of classes as the joined graph counts them, where both name their classes."""
-    own, there = (dict((g.about.get("metadata") or {}).get("labelspaces") or {}) for g in (graph, joined))
+    own, base = (dict((g.about.get("metadata") or {}).get("labelspaces") or {}) for g in (graph, joined))
     spaces = {
-        name: ({int(n): str(w) for n, w in own[name]}, {str(w): int(n) for n, w in there[name]}) for name in own if name in there
+        name: ({int(n): str(w) for n, w in own[name]}, {str(w): int(n) for n, w in base[name]}) for name in own if name in base
     }
     moves: dict[str, dict[int, int]] = {}
-    for name, (words, numbers) in spaces.items():
-        for word in words.values():
+    for name, (labels, numbers) in spaces.items():
+        for word in labels.values():
             if word not in numbers:
-                numbers[word] = max([*numbers.values(), *words, -1]) + 1
-        moves[name] = {number: numbers[word] for number, word in words.items()}
+                numbers[word] = max([*numbers.values(), *labels, -1]) + 1
+        moves[name] = {number: numbers[word] for number, word in labels.items()}
         joined.about["metadata"] = {
             **joined.about["metadata"],
-            "labelspaces": {**there, name: [[n, w] for w, n in numbers.items()]},
+            "labelspaces": {**base, name: [[n, w] for w, n in numbers.items()]},
         }
-        there[name] = [[n, w] for w, n in numbers.items()]
+        base[name] = [[n, w] for w, n in numbers.items()]
     nodes = {}
     for k, node in graph.nodes.items():
         change = moves.get(f"_l{node['layer']}p{node.get('partition', 0)}", {})
@@ -292,10 +292,10 @@ def _pair_rooms(joined: _Graph, graph: _Graph, pairs: Mapping[int, int]) -> dict
         if other not in out.values() and count >= SHARED_PLACES * sizes[room]:
             out[room] = other
     bare = [r for r in graph.list_nodes(ROOMS) if not sizes[r]]
-    there = [r for r in joined.list_nodes(ROOMS) if r not in out.values()]
-    for room in bare if there else ():
-        apart = np.linalg.norm(joined.get_places(there) - graph.get_places([room]), axis=1)
-        other = there[int(apart.argmin())]
+    free_rooms = [r for r in joined.list_nodes(ROOMS) if r not in out.values()]
+    for room in bare if free_rooms else ():
+        apart = np.linalg.norm(joined.get_places(free_rooms) - graph.get_places([room]), axis=1)
+        other = free_rooms[int(apart.argmin())]
         if apart.min() <= SAME_ROOM and other not in out.values():
             out[room] = other
     return out

@@ -101,7 +101,8 @@ def _build_poses(path: Path, layout: str, numbers: Array, rows: Array) -> Array:
 
 
 def _move(source: Source, layout: str, poses: Array) -> Array:
-    """The poses in the joined frame. Those of a camera of KITTI are moved as what the scans are read with: as the laser's."""
+    """Return the poses in the joined frame. Those of a camera of KITTI are moved as what the scans are read with: as the
+    laser's."""
     calibration = source.path.with_name("calib.txt")
     laser = read_laser_calibration(calibration) if layout == "KITTI" and calibration.is_file() else None
     if laser is None:

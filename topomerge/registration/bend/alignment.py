@@ -82,7 +82,7 @@ class Alignment:
         return out
 
     def compute_own_frame(self, k: int) -> Array:
-        """(3, 3) which brings moves in the common frame into that of a map."""
+        """Return (3, 3) which brings moves in the common frame into that of a map."""
         out = np.eye(3)
         out[:2, :2] = self.poses[k].inverse().matrix[:2, :2]
         return out

@@ -217,6 +217,7 @@ def settle_all(alignment: Alignment, drifts: Sequence[Drift]) -> SettledMoves | 
     for k, sigma in enumerate(LINE_SIGMAS):
         alignment.misfit[:] = 0.0
         parts = [alignment.measure_by_lines(*pair, sigma) for pair in alignment.pairs]
+        # The drift is estimated once lines are near: so what is straight is not bent by noise (docs/adr/0014).
         settled = alignment.settle(parts, drifts, estimated=k >= COARSE_LINES)
     return settled
 

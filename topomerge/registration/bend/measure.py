@@ -13,8 +13,10 @@ from topomerge.registration.bend.pieces import Pieces
 from topomerge.types import Array, Sim3
 
 SECTORS = 4  # of the directions that walls face; what faces none, or away from all, is compared with all walls
+# Without sides, pieces snap to the other face of a wall, 0.15 m off (docs/adr/0014).
 FACES_ALIKE = -0.3  # cosine, below which two faces are two sides of a wall
 PIECE_POINTS = 200  # wall columns that a piece is registered by
+# Furniture is moved between sessions: pieces go by what is higher, where the map looked that high (docs/adr/0014).
 LEAST_TALL = 0.2  # share of the walls around a piece, below which all of them are taken
 CONTEXT = 1.0  # m around the walls of a piece that are registered with it
 MISSED = 0.05  # of a wall's likelihood, where no wall is near
@@ -54,7 +56,8 @@ class Target:
         self._rasters = _build_rasters(fields, self.main)
 
     def compute_gain(self, sigma: float) -> tuple[Array, Array]:
-        """(5, nx, ny) float32 what a wall column that faces each sector, or none, gains there; the corner of the raster, m."""
+        """Return (5, nx, ny) float32 what a wall column that faces each sector, or none, gains there; the corner of the raster,
+        m."""
         likelihood = np.log(MISSED + (1 - MISSED) * np.exp(-(DISTANCE_STEPS**2) / (2 * sigma**2))) - np.log(INDIFFERENT)
         level, origin, on_free, seen = self._rasters
         table = np.zeros(256, np.float32)
@@ -212,8 +215,8 @@ def build_wall_lines(fields: PlanFields, middles: Array) -> WallLines:
 def measure_lines(
     pieces: Pieces, chosen: Array, lines: WallLines, moves: Array, into: Sim3, onto: tuple[PlanFields, WallLines], sigma: float
 ) -> tuple[Array, Array, Array, Array]:
-    """The chosen pieces of a storey that have partners (k,), their moves (k, 3) in their own frame, the information (k, 3, 3);
-    and (2,) sums of weights and of weighted squared distances, m2.
+    """Return the chosen pieces of a storey that have partners (k,), their moves (k, 3) in their own frame, the information (k, 3,
+    3); and (2,) sums of weights and of weighted squared distances, m2.
 
     Args:
         lines: of the pieces' storey, whose walls are rows of `pieces.walls` from the first one of the storey on.

@@ -16,6 +16,7 @@ from topomerge.matching.poses import PlanFields
 from topomerge.registration.storeys import find_slices, is_extruded
 from topomerge.types import Array, TopometricMap, VoxelGrid
 
+# Blocks, not rooms alone: corridors and halls bend within themselves, and maps without rooms must bend, too (docs/adr/0014).
 PIECE_SIZE = 5.0  # m, of a piece along a main direction; rooms up to `WHOLE_SIZE` are not cut
 WHOLE_SIZE = 7.5
 ROOM_WALL_REACH = 0.6  # m around a room's floor: the walls there are its walls
@@ -55,8 +56,8 @@ class Pieces:
 
 
 def build_pieces(storeys: Sequence[PlanFields], map: TopometricMap | None = None) -> Pieces:
-    """The pieces of a map's storeys: its rooms, in parts of some metres where they are large; of a map without rooms blocks along
-    its main direction."""
+    """Return the pieces of a map's storeys: its rooms, in parts of some metres where they are large; of a map without rooms
+    blocks along its main direction."""
     parts = []
     for number, fields in enumerate(storeys):
         if len(fields.walls) < LEAST_WALLS:
@@ -132,7 +133,8 @@ def _find_bridges(joints: Array, anchors: Array) -> Array:
 
 
 def _find_wall_rooms(fields: PlanFields, map: TopometricMap) -> Array:
-    """(w,) int32 room whose floor is nearest to each wall column of a storey, -1 where none is within `ROOM_WALL_REACH`."""
+    """Return (w,) int32 room whose floor is nearest to each wall column of a storey, -1 where none is within
+    `ROOM_WALL_REACH`."""
     plan, labels = fields.plan, np.full(fields.plan.wall.shape, -1, np.int32)
     inside = map.navigable_room >= 0
     places = map.navigable.compute_centroids(map.navigable.cells[inside])
@@ -212,8 +214,8 @@ def detect_sensor(map: TopometricMap | VoxelGrid) -> str:
 
 
 def select_drifts(sensors: Sequence[str]) -> list[Drift]:
-    """The drift of each of several maps. One that was raised from lines is taken for a drawing, which does not bend, among maps
-    that were measured in space; among maps of lines alone, nobody knows which ones were measured.
+    """Return the drift of each of several maps. One that was raised from lines is taken for a drawing, which does not bend, among
+    maps that were measured in space; among maps of lines alone, nobody knows which ones were measured.
 
     Raises:
         InputError: a sensor that is not in `drift.json`.
