@@ -90,13 +90,9 @@ class Schedule:
 
 
 class Job(Protocol):
-    """The job of a task, as the loop runs it.
+    """The job of a task, as the loop runs it."""
 
-    Args:
-        unit: name of what `count_items` counts.
-    """
-
-    unit: str
+    unit: str  # what `count_items` counts, for messages
 
     @property
     def network(self) -> torch.nn.Module:
