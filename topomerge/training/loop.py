@@ -478,11 +478,7 @@ class ExportedJob(NetworkJob):
 
 
 def run_network(job: Job, settings: NetworkTask, steps: int, log_line: LogFn) -> dict[str, float]:
-    """Train a job of a task, and leave a run's folder.
-
-    Returns:
-        The row of the best epoch.
-    """
+    """Train a job of a task, leave a run's folder, and return the row of the best epoch."""
     check_exporter()
     state, is_main_process = State(), get_rank() == 0
     task = TASKS[settings.task]
