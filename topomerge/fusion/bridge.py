@@ -99,7 +99,8 @@ class Bridge:
     Args:
         every: s between two updates, at least.
         share: of a core that updates may take.
-        counts: messages by what became of them: taken, standing (the robot had not moved), without a pose, broken.
+        counts: messages by what became of them: taken, standing (the robot had not moved), without a pose, broken, dropped.
+        outbox: operations for rosbridge that wait.
     """
 
     merger: LiveMerger
