@@ -6,7 +6,7 @@ from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, ExecuteProcess
 from launch.substitutions import LaunchConfiguration
 
-DEFAULTS = {"robots": "['a=/a/scan,/a/odom', 'b=/b/scan,/b/odom']", "kind": "scan", "folder": "topomerge_live"}
+DEFAULTS = {"robots": "['a=/a/scan,/a/odom', 'b=/b/scan,/b/odom']", "folder": "topomerge_live"}
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -5,75 +5,120 @@ It needs `rclpy` and the installed package `topomerge` only. What is kept and be
 
 from __future__ import annotations
 
-import json
 import queue
+import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import rclpy
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import OccupancyGrid, Odometry
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import LaserScan, PointCloud2
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
-from topomerge.fusion.bridge import EVENTS_TOPIC, TRANSFORMS_TOPIC, Bridge, parse_robot
-from topomerge.fusion.live import LiveMerger
-from topomerge.io.bag_file import Message
+from topomerge.errors import InputError
+from topomerge.fusion.bridge import EVENTS_TOPIC, TRANSFORMS_TOPIC, Bridge, parse_robots
+from topomerge.fusion.live import LiveMerger, describe_event
+from topomerge.io.bag_file import LASER_SCAN, OCCUPANCY_GRID, POINT_CLOUD, TRANSFORMS, Message
+from topomerge.io.streams import ODOMETRY, POSE, UNSURE_POSE
 
-TYPES = {"scan": LaserScan, "cloud": PointCloud2, "grid": OccupancyGrid}
+TYPES = {
+    LASER_SCAN: LaserScan, POINT_CLOUD: PointCloud2, OCCUPANCY_GRID: OccupancyGrid, TRANSFORMS: TFMessage,
+    ODOMETRY: Odometry, POSE: PoseStamped, UNSURE_POSE: PoseWithCovarianceStamped,
+}  # fmt: skip
+DEPTH = 100  # messages that wait for this node, as of tf2: static transforms of several publishers come at once
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class TopomergeNode(Node):
-    """Parameters: `robots` (["a=/a/scan,/a/odom", ...]), `kind` (scan, cloud or grid), `folder` (of the state)."""
+    """Parameters: `robots` (["a=/a/scan,/a/odom", ...]), `folder` (of the state).
+
+    Raises:
+        InputError: a parameter is wrong.
+    """
 
     def __init__(self) -> None:
         super().__init__("topomerge")
-        robots = [parse_robot(text) for text in self.declare_parameter("robots", ["a=/a/scan,/a/odom"]).value]
-        kind = TYPES[self.declare_parameter("kind", "scan").value]
+        robots = parse_robots(self.declare_parameter("robots", ["a=/a/scan,/a/odom"]).value)
         folder = self.declare_parameter("folder", "topomerge_live").value
-        self.inbox: queue.Queue[Message | None] = queue.Queue(maxsize=500)
-        self.bridge = Bridge(LiveMerger(Path(folder)), robots, self.tell)
-        self.events = self.create_publisher(String, EVENTS_TOPIC, 10)
-        self.transforms = self.create_publisher(TFMessage, TRANSFORMS_TOPIC, LATCHED)
-        for robot in robots:
-            self.bridge.merger.get_robot(robot.name)
-            self.listen(robot.scans, kind, LATCHED if kind is OccupancyGrid else qos_profile_sensor_data)
-        for topic in {topic for robot in robots for topic in robot.poses}:
-            is_transform = topic.rpartition("/")[2] in ("tf", "tf_static")
-            profile = LATCHED if topic.endswith("tf_static") else qos_profile_sensor_data
-            self.listen(topic, TFMessage if is_transform else Odometry, profile)
-        self.worker = threading.Thread(target=self.bridge.run, args=(self.receive(),))
+        self.inbox: queue.Queue[Message] = queue.Queue(maxsize=500)
+        self.bridge = Bridge(LiveMerger(Path(folder)), robots, lambda event: self.get_logger().info(describe_event(event)))
+        self.failure: BaseException | None = None
+        self.senders = {
+            EVENTS_TOPIC: self.create_publisher(String, EVENTS_TOPIC, 10),
+            TRANSFORMS_TOPIC: self.create_publisher(TFMessage, TRANSFORMS_TOPIC, LATCHED),
+        }
+        self.bridge.outbox.extend(self.bridge.greet())
+        self.awaited = set(self.bridge.list_topics())
+        self.create_timer(1.0, self.subscribe_to_new)
+        self.worker = threading.Thread(target=self.work)
         self.worker.start()
 
-    def listen(self, topic: str, kind: type, profile: Any) -> None:
-        """Put the messages of a topic into the inbox; the newest ones wait where it is full."""
+    def subscribe_to_new(self) -> None:
+        """Subscribe to the topics that somebody publishes by now, each by its type and as reliably as it is published."""
+        for topic in sorted(self.awaited):
+            found = self.get_publishers_info_by_topic(topic)
+            if not found:
+                continue
+            self.awaited.remove(topic)
+            name = found[0].topic_type
+            if name in TYPES:
+                self.create_subscription(TYPES[name], topic, self.build_listener(topic), match_publishers(found))
+            else:
+                self.get_logger().error(f"{topic}: {name} is not read; these are: {', '.join(TYPES)}")
+
+    def build_listener(self, topic: str) -> Any:
+        """Build what puts the messages of a topic into the inbox; the newest ones wait where it is full."""
 
         def put(content: Any) -> None:
             if self.inbox.full():
                 self.inbox.get_nowait()
+                self.bridge.counts["dropped"] += 1
             self.inbox.put_nowait(Message(topic, 0, self.get_clock().now().nanoseconds * 1e-9, content))
 
-        self.create_subscription(kind, topic, put, profile)
+        return put
+
+    def work(self) -> None:
+        """Join maps until the node ends; where that fails, the node ends."""
+        try:
+            self.bridge.run(self.receive())
+        except InputError as error:
+            self.failure = error
+        except BaseException as error:  # a fault: with its traceback
+            self.failure = error
+            raise
+        finally:
+            rclpy.try_shutdown()
 
     def receive(self) -> Iterator[Message | None]:
-        """Yield what comes, until the node ends; the transforms that have gathered are published between messages."""
+        """Yield what comes, until the node ends; what has gathered is published between messages."""
         while rclpy.ok():
-            for operation in self.bridge.take_outbox():
-                if operation["op"] == "publish" and operation["topic"] == TRANSFORMS_TOPIC:
-                    self.transforms.publish(TFMessage(transforms=[self.convert(t) for t in operation["msg"]["transforms"]]))
+            while self.bridge.outbox:
+                self.publish(self.bridge.outbox.popleft())
             try:
                 yield self.inbox.get(timeout=0.2)
             except queue.Empty:
                 yield None
 
-    def convert(self, listed: dict[str, Any]) -> TransformStamped:
+    def publish(self, operation: Mapping[str, Any]) -> None:
+        """Publish what rosbridge would: an event as JSON, or transforms."""
+        if operation["op"] != "publish":
+            return
+        content = operation["msg"]
+        if operation["topic"] == EVENTS_TOPIC:
+            self.senders[EVENTS_TOPIC].publish(String(data=content["data"]))
+        else:
+            transforms = [self.convert(listed) for listed in content["transforms"]]
+            self.senders[TRANSFORMS_TOPIC].publish(TFMessage(transforms=transforms))
+
+    def convert(self, listed: Mapping[str, Any]) -> TransformStamped:
         """Convert a transform, stamped now."""
         out = TransformStamped()
         out.header.stamp, out.header.frame_id = self.get_clock().now().to_msg(), listed["header"]["frame_id"]
@@ -83,16 +128,28 @@ class TopomergeNode(Node):
                 setattr(getattr(out.transform, part), axis, float(value))
         return out
 
-    def tell(self, event: Any) -> None:
-        """Publish an event as JSON."""
-        self.events.publish(String(data=json.dumps(dict(event))))
-        self.get_logger().info(json.dumps(dict(event)))
+
+def match_publishers(found: Collection[Any]) -> QoSProfile:
+    """Match what all publishers of a topic offer."""
+    offers = [info.qos_profile for info in found]
+    reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
+    latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
+    return QoSProfile(
+        depth=DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
 
 
-def main() -> None:
-    """Run until a shutdown; the state is written then."""
+def main() -> int:
+    """Run until a shutdown; the state is written then. Return 1 where a parameter was wrong or the work failed."""
     rclpy.init()
-    node = TopomergeNode()
+    try:
+        node = TopomergeNode()
+    except (InputError, ParameterException) as error:
+        print(f"topomerge: {error}", file=sys.stderr)
+        rclpy.try_shutdown()
+        return 1
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
@@ -101,7 +158,10 @@ def main() -> None:
         rclpy.try_shutdown()
         node.worker.join()
         node.destroy_node()
+    counts = ", ".join(f"{n} {what}" for what, n in sorted(node.bridge.counts.items())) or "nothing came"
+    print(f"topomerge: {node.failure or counts}", file=sys.stderr)
+    return 1 if node.failure else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

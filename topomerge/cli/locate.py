@@ -88,39 +88,37 @@ def run_bridge(args: argparse.Namespace) -> int:
     """`topomerge bridge`: robots whose maps are joined while they drive."""
     from pathlib import Path
 
-    from topomerge.fusion.bridge import Bridge, parse_robot
-    from topomerge.fusion.live import LiveMerger, describe_event
-    from topomerge.io.streams import StreamCounts, read_foxglove, read_mcap, read_rosbridge
+    from topomerge.fusion.bridge import Bridge, parse_robots
+    from topomerge.fusion.live import STATE_FILE, LiveMerger, describe_event
+    from topomerge.io.streams import FOXGLOVE, Connection, StreamCounts, read_foxglove, read_mcap, read_rosbridge
 
     if sum(bool(way) for way in (args.rosbridge, args.foxglove, args.mcap)) != 1:
         raise InputError("bridge: give one of --rosbridge, --foxglove and --mcap")
-    if not args.robots:
-        raise InputError("bridge: name the robots: --robot NAME=SCANS[,POSES], as --robot a=/a/scan,/a/odom")
-    robots = [parse_robot(text) for text in args.robots]
-    if len({robot.name for robot in robots}) < len(robots):
-        raise InputError("--robot: two have one name; give each its own")
 
     def tell(event: Mapping[str, Any]) -> None:
         print_line(json.dumps(event, ensure_ascii=False) if args.json else describe_event(event))
         with guard_printing():
             sys.stdout.flush()
 
-    bridge = Bridge(LiveMerger(Path(args.output)), robots, tell, **collect_given(args, "every"))
+    bridge = Bridge(LiveMerger(Path(args.output)), parse_robots(args.robots), tell, **collect_given(args, "every"))
     topics, counts = bridge.list_topics(), StreamCounts()
-    for robot in robots:
-        bridge.merger.get_robot(robot.name)
     try:
         if args.rosbridge:
-            bridge.run(read_rosbridge(args.rosbridge, topics, counts, bridge.take_outbox))
+            with Connection(args.rosbridge, (), bridge.outbox, bridge.greet) as connection:
+                bridge.run(read_rosbridge(connection, topics, counts))
         elif args.foxglove:
-            bridge.run(read_foxglove(args.foxglove, topics, counts))
+            with Connection(args.foxglove, FOXGLOVE) as connection:
+                bridge.run(read_foxglove(connection, topics, counts))
         else:
             bridge.run(read_mcap(sys.stdin.buffer, topics, counts))
     except KeyboardInterrupt:
         pass
     if not args.quiet:
         message = ", ".join(f"{n} {what}" for what, n in sorted(bridge.counts.items())) or "nothing came"
-        print_line(f"{counts.read} messages: {message}; {counts.broken} unreadable -> {args.output}", sys.stderr)
+        left_out = sum(robot.left_out for robot in bridge.merger.robots.values())
+        full = f", {left_out:,} points left out, as a map was full" if left_out else ""
+        kept = f"-> {args.output}" if (Path(args.output) / STATE_FILE).exists() else "(nothing is written)"
+        print_line(f"{counts.read} messages: {message}{full}; {counts.broken} unreadable {kept}", sys.stderr)
     return 0 if bridge.merger.links else 2
 
 
@@ -176,7 +174,7 @@ BRIDGE = Command(
             action="append",
             default=[],
             metavar="NAME=SCANS[,POSES]",
-            help="a robot: topic of its scans, clouds or grids, and of its poses (odometry or transforms; /tf always counts)",
+            help="a robot: topic of its scans, clouds or grids, and of its poses (odometry, poses, a tf of its own; default /tf)",
         ),
         build_option("--rosbridge", default="", metavar="URL", help="rosbridge server, as ws://localhost:9090; answers go back"),
         build_option("--foxglove", default="", metavar="URL", help="Foxglove websocket server, as ws://localhost:8765"),

@@ -6,6 +6,7 @@ Updates run beside the stream, one at a time, and leave most of the processor to
 from __future__ import annotations
 
 import json
+import logging
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
@@ -29,11 +30,15 @@ from topomerge.io.bag_file import (
 )
 from topomerge.io.grid import classify, extrude
 from topomerge.io.piece import ReadOptions
-from topomerge.io.streams import MESSAGE_ERRORS, PoseBook, Received, infer_kind, read_time, take_poses
+from topomerge.io.pose_book import FramePose, PoseBook, find_pose, read_time, take_poses
+from topomerge.io.streams import MESSAGE_ERRORS, Received, infer_kind
 from topomerge.types import PointCloud
 
+log = logging.getLogger(__name__)
 SHARED_POSES = ("/tf", "/tf_static")
 WAITING = 40  # scans whose pose has not come yet
+SAVING = 60.0  # s between two times that the state is written where nothing is to be told
+SETTLED = 3  # scans of a robot after which its frame stays: until then the one above it may not have come yet
 EVENTS_TOPIC, TRANSFORMS_TOPIC = "/topomerge/events", "/topomerge/transforms"
 LIVE_NAME = Path("live")  # of what has no file
 
@@ -52,17 +57,39 @@ class RobotTopics:
     poses: tuple[str, ...] = SHARED_POSES
 
 
+class MixedPosesError(InputError):
+    """Poses of two robots come under one name."""
+
+
 def parse_robot(text: str) -> RobotTopics:
-    """Parse ``NAME=SCANS[,POSES...]``.
+    """Parse ``NAME=SCANS[,POSES...]``. Transforms of a topic of its own, as ``/a/tf``, come in place of those of all robots.
 
     Raises:
         InputError: it is something else.
     """
-    name, sign, topics = text.partition("=")
-    scans, *poses = [topic.strip() for topic in topics.split(",")]
-    if not (name and sign and scans) or not all(poses):
-        raise InputError(f"--robot {text}: must be NAME=SCANS[,POSES], as a=/a/scan,/a/odom")
-    return RobotTopics(name, scans, (*poses, *SHARED_POSES))
+    name, sign, listed = text.partition("=")
+    topics = [topic.strip().strip("/") for topic in listed.split(",")]
+    if not (name and sign and all(topics)):
+        raise InputError(f"robot {text}: must be NAME=SCANS[,POSES], as a=/a/scan,/a/odom")
+    scans, *poses = [f"/{topic}" for topic in topics]
+    own = [topic for topic in poses if topic.endswith("/tf")]
+    return RobotTopics(name, scans, tuple(dict.fromkeys((*poses, *([f"{topic}_static" for topic in own] or SHARED_POSES)))))
+
+
+def parse_robots(texts: Sequence[str]) -> list[RobotTopics]:
+    """Parse the robots, each as `parse_robot`.
+
+    Raises:
+        InputError: none, or two that have one name or one topic of scans.
+    """
+    robots = [parse_robot(text) for text in texts]
+    if not robots:
+        raise InputError("robots: name them: NAME=SCANS[,POSES], as a=/a/scan,/a/odom")
+    if len({robot.name for robot in robots}) < len(robots):
+        raise InputError("robots: two have one name; give each its own")
+    if len({robot.scans for robot in robots}) < len(robots):
+        raise InputError("robots: two have one topic of scans; give each its own")
+    return robots
 
 
 @dataclass(eq=False)
@@ -72,7 +99,8 @@ class Bridge:
     Args:
         every: s between two updates, at least.
         share: of a core that updates may take.
-        counts: messages by what became of them: taken, standing (the robot had not moved), without a pose, broken.
+        counts: messages by what became of them: taken, standing (the robot had not moved), without a pose, broken, dropped.
+        outbox: operations for rosbridge that wait.
     """
 
     merger: LiveMerger
@@ -84,76 +112,113 @@ class Bridge:
     outbox: deque[Mapping[str, Any]] = field(default_factory=lambda: deque(maxlen=200))
 
     def __post_init__(self) -> None:
-        self._books = {robot.name: PoseBook() for robot in self.robots}
+        owners = {
+            topic: tuple(robot.name for robot in self.robots if topic in robot.poses)
+            for robot in self.robots
+            for topic in robot.poses
+        }
+        books = {names: PoseBook(names) for names in owners.values()}
+        self._books = {topic: books[names] for topic, names in owners.items()}
+        self._own_books = {  # those of the fewest robots count first
+            robot.name: sorted((b for b in books.values() if robot.name in b.owners), key=lambda b: len(b.owners))
+            for robot in self.robots
+        }
         self._moving: dict[str, str] = {}
+        self._movers: dict[tuple[PoseBook, str], str] = {}
+        self._mixed = False
+        self._told: set[str] = set()
         self._waiting: deque[tuple[RobotTopics, Message]] = deque(maxlen=WAITING)
-        self._free = 0.0
-        self._advertised = False
+        self._free, self._saved = 0.0, time.monotonic()
+        self._transforms = self._build_transforms()
+        for robot in self.robots:
+            self.merger.get_robot(robot.name)
 
     def list_topics(self) -> list[str]:
         """List all topics that are read."""
         return list(dict.fromkeys(t for robot in self.robots for t in (robot.scans, *robot.poses)))
 
-    def take_outbox(self) -> list[Mapping[str, Any]]:
-        """Take the operations for rosbridge that have gathered."""
-        out = list(self.outbox)
-        self.outbox.clear()
-        return out
+    def greet(self) -> list[Mapping[str, Any]]:
+        """List the operations for a rosbridge that was just connected: what is published, and the transforms that hold."""
+        kinds = {EVENTS_TOPIC: "std_msgs/String", TRANSFORMS_TOPIC: "tf2_msgs/TFMessage"}
+        topics = [
+            {"op": "advertise", "topic": topic, "type": of, "latch": topic == TRANSFORMS_TOPIC} for topic, of in kinds.items()
+        ]
+        return [*topics, *([self._transforms] if self._transforms["msg"]["transforms"] else [])]
 
     def run(self, source: Received) -> None:
-        """Go through a stream to its end, or until an interrupt; the state is written either way."""
-        with ThreadPoolExecutor(1, "update") as workers:
-            running: Future[list[dict[str, Any]]] | None = None
-            began = 0.0
-            try:
-                for message in source:
-                    if message is not None:
-                        self.take(message)
-                    if running is not None and running.done():
-                        self._finish(running.result(), time.monotonic() - began)
-                        running = None
-                    if running is None and time.monotonic() >= self._free and (clouds := self.merger.take_changed()):
-                        began = time.monotonic()
-                        running = workers.submit(self.merger.update, clouds)
-                if running is not None:
-                    self._finish(running.result(), 0.0)
-                    running = None
-                self._finish(self.merger.update(), 0.0)
-            finally:
-                if running is not None:
-                    running.result()
-                self.merger.save()
+        """Go through a stream to its end, or until an interrupt; the state is written either way.
+
+        Raises:
+            MixedPosesError: poses of two robots come under one name; the state stays as it was written last.
+        """
+        try:
+            with ThreadPoolExecutor(1, "update") as workers:
+                self._go_through(source, workers)
+            self._finish(self.merger.update(), 0.0)
+        finally:
+            self._save()
+
+    def _go_through(self, source: Received, workers: ThreadPoolExecutor) -> None:
+        running: Future[list[dict[str, Any]]] | None = None
+        began = 0.0
+        try:
+            for message in source:
+                if message is not None:
+                    self.take(message)
+                if running is not None and running.done():
+                    done, running = running, None
+                    self._finish(done.result(), time.monotonic() - began)
+                if running is None and time.monotonic() >= self._free and (clouds := self.merger.take_changed()):
+                    began = time.monotonic()
+                    running = workers.submit(self.merger.update, clouds)
+        finally:
+            if running is not None:
+                self._finish(running.result(), 0.0)
 
     def _finish(self, events: Sequence[Mapping[str, Any]], took: float) -> None:
         """Tell what an update found."""
         self._free = time.monotonic() + max(self.every, took * (1 / self.share - 1))
+        self._tell_all(events)
+        if events:
+            self._transforms = self._build_transforms()
+            self.outbox.append(self._transforms)
+        if events or time.monotonic() - self._saved > SAVING:
+            self._save()
+
+    def _save(self) -> None:
+        if not self._mixed:
+            self.merger.save()
+            self._saved = time.monotonic()
+
+    def _tell_all(self, events: Sequence[Mapping[str, Any]]) -> None:
         for event in events:
             self.tell(event)
-            self._publish(EVENTS_TOPIC, "std_msgs/String", {"data": json.dumps(event)})
-        if events:
-            transforms = [_build_transform(*edge) for edge in self.merger.list_transforms()]
-            self._publish(TRANSFORMS_TOPIC, "tf2_msgs/TFMessage", {"transforms": transforms})
-            self.merger.save()
+            self.outbox.append({"op": "publish", "topic": EVENTS_TOPIC, "msg": {"data": json.dumps(event)}})
 
-    def _publish(self, topic: str, kind: str, content: Mapping[str, Any]) -> None:
-        if not self._advertised:
-            for name, of in ((EVENTS_TOPIC, "std_msgs/String"), (TRANSFORMS_TOPIC, "tf2_msgs/TFMessage")):
-                self.outbox.append({"op": "advertise", "topic": name, "type": of})
-            self._advertised = True
-        self.outbox.append({"op": "publish", "topic": topic, "type": kind, "msg": content})
+    def _build_transforms(self) -> Mapping[str, Any]:
+        transforms = [_build_transform(*edge) for edge in self.merger.list_transforms()]
+        return {"op": "publish", "topic": TRANSFORMS_TOPIC, "msg": {"transforms": transforms}}
 
     def take(self, message: Message) -> None:
-        """Put a message where it belongs; one that can't be used is counted."""
+        """Put a message where it belongs; one that can't be used is counted.
+
+        Raises:
+            MixedPosesError: poses of two robots come under one name.
+        """
         try:
+            if message.topic in self._books:
+                book = self._books[message.topic]
+                moving = take_poses(book, message, f"{' '.join(book.owners)} sensor")
+                if len(book.owners) == 1:
+                    self._moving.setdefault(book.owners[0], moving)
             for robot in self.robots:
-                if message.topic in robot.poses:
-                    moving = take_poses(self._books[robot.name], message, f"{robot.name} sensor")
-                    self._moving.setdefault(robot.name, moving)
                 if message.topic == robot.scans:
                     self._take_scan(robot, message)
             for _ in range(len(self._waiting)):  # poses often come after their scans
                 robot, waiting = self._waiting.popleft()
                 self._take_scan(robot, waiting)
+        except MixedPosesError:
+            raise
         except (InputError, *MESSAGE_ERRORS):
             self.counts["broken"] += 1
 
@@ -164,17 +229,46 @@ class Bridge:
             self.counts["taken"] += 1
             return
         decode = {LASER_SCAN: decode_laser_scan, POINT_CLOUD: decode_point_cloud}[kind]
-        frame, book = str(header.frame_id) or f"{robot.name} sensor", self._books[robot.name]
-        found = book.find_pose(frame, read_time(header, message))
-        if found is None and self._moving.get(robot.name):
-            found = book.find_pose(self._moving[robot.name], read_time(header, message))  # taken as the same frame
+        found = self._find_pose(robot, str(header.frame_id), read_time(header, message))
         if found is None:
             if len(self._waiting) == WAITING:
                 self.counts["without a pose"] += 1
             self._waiting.append((robot, message))
             return
-        taken = self.merger.get_robot(robot.name, found[0]).add_scan(decode(LIVE_NAME, message)[0], found[1])
+        growing = self.merger.get_robot(robot.name, found.frame)
+        taken = growing.add_scan(decode(LIVE_NAME, message)[0], found.pose)
         self.counts["taken" if taken else "standing"] += 1
+        if growing.left_out and f"{robot.name} full" not in self._told:
+            self._told.add(f"{robot.name} full")
+            self._tell_all([{"event": "full", "robots": [robot.name], "points": len(growing.points)}])
+
+    def _find_pose(self, robot: RobotTopics, frame: str, when: float) -> FramePose | None:
+        """Where a frame of a robot stood, in that in which its map grows."""
+        growing, books = self.merger.get_robot(robot.name), self._own_books[robot.name]
+        top = growing.frame if len(growing.poses) >= SETTLED else ""
+        found = find_pose(books, frame or f"{robot.name} sensor", when, top)
+        if found is None and self._moving.get(robot.name):
+            found = find_pose(books, self._moving[robot.name], when, top)  # taken as the same frame
+        if found is None:
+            return None
+        for book, moved in found.moved.items():
+            if len(book.owners) > 1:
+                other = self._movers.setdefault((book, moved), robot.name)
+                if other != robot.name:
+                    self._mixed = True
+                    raise MixedPosesError(
+                        f"robots {other} and {robot.name}: poses of both come as those of {moved!r}, and can't be told apart; "
+                        f"name topics of their own, as {other}=/{other}/scan,/{other}/tf, or give their frames names of their own"
+                    )
+                break
+        if top and found.frame != top:
+            if f"{robot.name} elsewhere" not in self._told:
+                self._told.add(f"{robot.name} elsewhere")
+                log.warning(
+                    "robot %s: poses are in %r, its map in %r; scans wait for poses in that", robot.name, found.frame, top
+                )
+            return None
+        return found
 
 
 def read_grid(message: Message) -> PointCloud:

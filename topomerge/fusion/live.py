@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import json
 import logging
+import os
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
@@ -143,10 +145,10 @@ class LiveMerger:
     """The robots and what is believed of their maps.
 
     Args:
-        folder: where the state is kept; a state that is there is gone on with.
+        folder: where the state is kept, made when there is something to keep; a state that is there is gone on with.
 
     Raises:
-        InputError: the state is damaged.
+        InputError: the state is damaged, or the folder holds something else or can't be written.
     """
 
     folder: Path
@@ -158,11 +160,19 @@ class LiveMerger:
     asked: dict[tuple[str, str], tuple[Any, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        self._kept: dict[str, tuple[Any, ...]] = {}
+        self._warned = False
+        if self.folder.exists() and not self.folder.is_dir():
+            raise InputError(f"{self.folder}: is a file; give the name of a folder")
+        if not os.access(next(place for place in (self.folder, *self.folder.absolute().parents) if place.exists()), os.W_OK):
+            raise InputError(f"{self.folder}: can't be written; give a folder that is yours")
         if (self.folder / STATE_FILE).exists():
             self._load()
+        elif self.folder.exists() and any(not path.name.startswith(".") for path in self.folder.iterdir()):
+            raise InputError(f"{self.folder}: holds something else, and no {STATE_FILE}; give a new folder")
 
     def get_robot(self, name: str, frame: str = "") -> GrowingMap:
-        """Return the map of a robot, a new one of a new robot.
+        """Return the map of a robot, a new one of a new robot or in another frame.
 
         Raises:
             InputError: there are too many, or the name can't be that of a file.
@@ -174,9 +184,9 @@ class LiveMerger:
             if len(self.robots) >= self.settings.most_robots:
                 raise InputError(f"robot {name}: is one too many; at most {self.settings.most_robots} are kept")
             self.robots[name] = GrowingMap(frame or name, self.settings)
-        robot = self.robots[name]
-        robot.frame = frame or robot.frame
-        return robot
+        if frame and frame != self.robots[name].frame:
+            self.robots[name] = GrowingMap(frame, self.settings)
+        return self.robots[name]
 
     def set_grid(self, name: str, cloud: PointCloud, frame: str = "") -> None:
         """Take the map that a robot made by itself, in place of the one before."""
@@ -269,7 +279,8 @@ class LiveMerger:
     def list_transforms(self) -> list[tuple[str, str, Sim3]]:
         """List the frames of joined robots: parent, child and the pose of the child in it; each robot has one parent at most.
 
-        The surest links hold; a robot that comes first by its name is the root of those that are joined with it.
+        The surest links hold; a robot that comes first by its name is the root of those that are joined with it. Where frames
+        of robots have one name, they are listed as ``NAME/FRAME``.
         """
         tree: dict[str, list[tuple[str, Sim3]]] = {name: [] for name in self.robots}
         group = {name: name for name in self.robots}
@@ -281,7 +292,7 @@ class LiveMerger:
             tree[b].append((a, link.pose.inverse()))
             old, new = group[b], group[a]
             group = {name: new if of == old else of for name, of in group.items()}
-        out, placed = [], set()
+        out, placed, frames = [], set(), self._name_frames()
         for root in sorted(tree):
             queue = [root] if root not in placed else []
             placed.add(root)
@@ -290,22 +301,41 @@ class LiveMerger:
                     if child not in placed:
                         placed.add(child)
                         queue.append(child)
-                        out.append((self.robots[parent].frame, self.robots[child].frame, pose))
+                        out.append((frames[parent], frames[child], pose))
         return out
 
+    def _name_frames(self) -> dict[str, str]:
+        """Names of the robots' frames, no two alike."""
+        number = Counter(robot.frame for robot in self.robots.values())
+        alike = {name: f"{name}/{robot.frame}" for name, robot in self.robots.items() if number[robot.frame] > 1}
+        if alike and self.links and not self._warned:
+            self._warned = True
+            log.warning("robots %s: their frames have one name; published as %s", ", ".join(alike), ", ".join(alike.values()))
+        return {name: alike.get(name, robot.frame) for name, robot in self.robots.items()}
+
     def save(self) -> None:
-        """Write the state and the maps; a process that is killed leaves the state before or after."""
+        """Write what is new of the state and the maps, if anything came; a killed process leaves each file as before or after."""
+        seen = {name: robot for name, robot in self.robots.items() if len(robot.points) or robot.grid is not None}
+        if not seen:
+            return
         self.folder.mkdir(parents=True, exist_ok=True)
-        for name, robot in self.robots.items():
+        for name, robot in seen.items():
+            now = (robot.keys, robot.grid, self.maps.get(name))  # each is replaced, never changed
+            before = self._kept.get(name, ())
+            if len(before) == len(now) and all(a is b for a, b in zip(before, now, strict=True)):
+                continue
             arrays = {"points": robot.points, "pose_of": robot.pose_of, "poses": robot.poses, "keys": robot.keys}
+            if robot.grid is not None:
+                arrays["grid"] = robot.grid.points
             archive.write(arrays, self.folder / f"{name}.npz", effort=1)
             if name in self.maps:
                 save_map(self.maps[name], self.folder / f"{name}.tmap")
+            self._kept[name] = now
         links = [
             {"robots": list(link.robots), "matrix": link.pose.matrix.tolist(), "probability": link.probability}
             for link in self.links.values()
         ]
-        frames = {name: robot.frame for name, robot in self.robots.items()}
+        frames = {name: robot.frame for name, robot in seen.items()}
         state = {"format": STATE_FORMAT, "robots": frames, "cell": self.settings.cell, "links": links}
         with replace_on_success(self.folder / STATE_FILE) as temporary:
             temporary.write_text(json.dumps(state, indent=1) + "\n", encoding="utf-8")
@@ -318,9 +348,11 @@ class LiveMerger:
                 raise InputError(f"{path}: of another version; give another folder with -o")
             for name, frame in state["robots"].items():
                 robot = self.get_robot(str(name), str(frame))
-                for key, array in read_robot(self.folder / f"{name}.npz").items():
+                arrays = read_robot(self.folder / f"{name}.npz")
+                robot.grid = PointCloud(arrays.pop("grid"), upright=True) if "grid" in arrays else None
+                for key, array in arrays.items():
                     setattr(robot, key, array)
-                robot.changed = len(robot.points) > 0
+                robot.changed = True
             for listed in state["links"]:
                 a, b = map(str, listed["robots"])
                 pose = Sim3.from_matrix(np.array(listed["matrix"], float))
@@ -333,8 +365,8 @@ class LiveMerger:
             raise InputError(f"{path}: damaged ({reason}); give another folder with -o") from error
 
 
-def read_robot(path: Path) -> Mapping[str, Array]:
-    """Read what a robot saw.
+def read_robot(path: Path) -> dict[str, Array]:
+    """Read what a robot saw: `points`, `pose_of`, `poses` and `keys`; `grid` where it made one.
 
     Raises:
         InputError: damaged.
@@ -346,12 +378,18 @@ def read_robot(path: Path) -> Mapping[str, Array]:
     good = good and bool(np.isfinite(points).all() and np.isfinite(poses).all() and (np.diff(keys) > 0).all())
     if not good or (len(pose_of) and not 0 <= int(pose_of.min()) <= int(pose_of.max()) < len(poses)):
         raise InputError(f"{path}: damaged; give another folder with -o")
-    kinds = {"points": np.float32, "pose_of": np.int32, "poses": np.float64, "keys": np.int64}
-    return {name: arrays[name].astype(kind) for name, kind in kinds.items()}
+    grid = arrays.get("grid", points)
+    if grid.ndim != 2 or grid.shape[1:] != (3,) or not np.isfinite(grid).all():
+        raise InputError(f"{path}: damaged; give another folder with -o")
+    kinds = {"points": np.float32, "pose_of": np.int32, "poses": np.float64, "keys": np.int64, "grid": np.float32}
+    return {name: arrays[name].astype(kind) for name, kind in kinds.items() if name in arrays}
 
 
 def describe_event(event: Mapping[str, Any]) -> str:
     """Describe what has changed in a line."""
+    if event["event"] == "full":
+        name, points = event["robots"][0], event["points"]
+        return f"{name}: its map is full ({points:,} points); what it sees elsewhere is left out: go on with it under a new name"
     a, b = event["robots"]
     text = f"{event['probability']:.2f}"
     if event["event"] == "settle":

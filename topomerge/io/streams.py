@@ -9,9 +9,13 @@ import base64
 import binascii
 import io
 import json
+import logging
 import struct
+import time
 import zlib
+from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
@@ -22,16 +26,25 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.io.bag_file import LASER_SCAN, OCCUPANCY_GRID, POINT_CLOUD, TRANSFORMS, Message
 
+log = logging.getLogger(__name__)
 LARGEST_MESSAGE = 64 << 20  # bytes of a record, a chunk or a websocket message
 LONGEST_ARRAY = 8_000_000  # numbers of an array of a message
-ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
-READ_LIVE = (LASER_SCAN, POINT_CLOUD, OCCUPANCY_GRID, TRANSFORMS, ODOMETRY, POSE)
+ODOMETRY, POSE, UNSURE_POSE = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+)
+READ_LIVE = (LASER_SCAN, POINT_CLOUD, OCCUPANCY_GRID, TRANSFORMS, ODOMETRY, POSE, UNSURE_POSE)
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK = 3, 4, 5, 6  # kinds of records
-FOXGLOVE = "foxglove.websocket.v1"
-MOST_TRANSFORMS = 1000  # of a message
+FOXGLOVE = ("foxglove.sdk.v1", "foxglove.websocket.v1")  # since foxglove_bridge 3, and before: they differ in name only
+MOST_CHANNELS = 1000  # that are read at a time
 WAIT = 0.2  # s that a source waits for a message before it yields None
 OPENING = 10.0  # s that a server may take to answer
+PAUSES = (0.5, 30.0)  # s before the first try to connect again, and at most: each pause is twice as long as the one before
+LASTING = 5.0  # s after which a connection counts as one that works
+PATIENCE = 600.0  # s of tries after which it is over
+ASK_AGAIN = 5.0  # s after which a topic is asked for again from which nothing came: rosbridge refuses one that is not there yet
 MESSAGE_ERRORS = (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError, struct.error)
 Received = Iterator[Message | None]  # None: nothing came for a while
 
@@ -108,103 +121,202 @@ def build_message(topic: str, content: Any, number: int) -> Message:
     return Message(topic, number, 0.0, converted)
 
 
-def read_rosbridge(
-    address: str, topics: Collection[str], counts: StreamCounts, outbox: Callable[[], Sequence[Mapping[str, Any]]]
-) -> Received:
-    """Receive messages of a rosbridge server.
+class Connection:
+    """A websocket that is opened again when it is lost.
 
     Args:
         address: ``ws://host:9090``.
-        topics: their names.
-        outbox: operations to send, such as ``publish``, asked for between messages.
+        protocols: names of those that are offered.
+        outbox: operations that are sent between messages; what can't be sent stays in it.
+        greet: gives the operations that are sent first over every new connection.
 
     Raises:
         InputError: nobody answers there.
     """
-    with _connect(address, ()) as link:
-        for topic in topics:
-            link.send(json.dumps({"op": "subscribe", "topic": topic}))
-        for text in _iter_received(link):
-            for operation in outbox():
-                link.send(json.dumps(operation))
-            if text is None:
-                yield None
-                continue
+
+    def __init__(
+        self,
+        address: str,
+        protocols: Sequence[str] = (),
+        outbox: deque[Mapping[str, Any]] | None = None,
+        greet: Callable[[], Sequence[Mapping[str, Any]]] = tuple,
+    ) -> None:
+        self.address, self.protocols, self.greet = address, protocols, greet
+        self.outbox = deque() if outbox is None else outbox
+        self._pause, self._until = PAUSES[0], 0.0
+        self._open()
+
+    def __enter__(self) -> Connection:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Send what is left, and close."""
+        if self._link is not None:
             try:
-                decoded = json.loads(text)
-                if decoded.get("op") != "publish" or decoded.get("topic") not in topics:
-                    continue
-                message = build_message(decoded["topic"], decoded["msg"], counts.read + 1)
-            except MESSAGE_ERRORS:
-                counts.broken += 1
-                continue
-            counts.read += 1
-            yield message
+                self._send_all()
+            except OSError as error:
+                log.warning("%s: the last %d operations were not sent (%s)", self.address, len(self.outbox), error)
+            self._link.close()
 
-
-def read_foxglove(address: str, topics: Collection[str], counts: StreamCounts) -> Received:
-    """Receive messages of a Foxglove websocket server, whose channels are CDR.
-
-    Raises:
-        InputError: nobody answers there.
-    """
-    requested: dict[int, tuple[str, str]] = {}
-    with _connect(address, (FOXGLOVE,)) as link:
-        for received in _iter_received(link):
-            if received is None:
-                yield None
-                continue
+    def receive(self) -> Iterator[str | bytes | None]:
+        """Yield what comes, and None where nothing came for a while, until the connection is lost for good."""
+        while self._link is not None:
             try:
-                if isinstance(received, str):
-                    decoded = json.loads(received)
-                    offered = decoded.get("channels", []) if decoded.get("op") == "advertise" else []
-                    new = [
-                        c for c in offered if c["topic"] in topics and c.get("encoding") == "cdr" and len(requested) < len(topics)
-                    ]
-                    for channel in new:
-                        requested[len(requested) + 1] = channel["topic"], normalise_type(channel["schemaName"])
-                        subscription = {"id": len(requested), "channelId": int(channel["id"])}
-                        link.send(json.dumps({"op": "subscribe", "subscriptions": [subscription]}))
-                    continue
-                code, number, nanoseconds = struct.unpack_from("<BIQ", received)
-                if code != 1 or number not in requested:
-                    continue
-                topic, kind = requested[number]
-                message = Message(topic, counts.read + 1, nanoseconds * 1e-9, deserialise(bytes(received[13:]), kind))
-            except MESSAGE_ERRORS:
-                counts.broken += 1
+                self._send_all()
+                received = self._receive_one()
+            except OSError as error:
+                yield from self._open_again(error)
                 continue
-            counts.read += 1
-            yield message
+            yield received
+
+    def request(self, operation: Mapping[str, Any]) -> None:
+        """Send an operation that a new connection makes void, before those of the outbox."""
+        self._requests.append(operation)
+
+    def _open(self) -> None:
+        self._link = _connect(self.address, self.protocols)
+        self.opened = time.monotonic()
+        self._requests = deque(self.greet())
+
+    def _open_again(self, error: Exception) -> Iterator[None]:
+        """Yield None until the connection is open again; after `PATIENCE` it is given up."""
+        if self._until == 0.0 or time.monotonic() - self.opened > LASTING:
+            self._pause, self._until = PAUSES[0], time.monotonic() + PATIENCE
+            log.warning("%s: the connection is lost (%s); trying again for %.0f s", self.address, error, PATIENCE)
+        self._link = None
+        while self._link is None and time.monotonic() < self._until:
+            after = time.monotonic() + self._pause
+            self._pause = min(2 * self._pause, PAUSES[1])
+            while time.monotonic() < after:
+                time.sleep(min(WAIT, self._pause))
+                yield None
+            try:
+                self._open()
+            except InputError as refusal:
+                log.info("%s", refusal)
+        if self._link is None:
+            log.warning("%s: is given up; start again with the same folder to go on", self.address)
+
+    def _send_all(self) -> None:
+        """Send what waits.
+
+        Raises:
+            OSError: the connection is lost.
+        """
+        for waiting in (self._requests, self.outbox):
+            while waiting:
+                with _name_loss():
+                    self._link.send(json.dumps(waiting[0]))
+                waiting.popleft()
+
+    def _receive_one(self) -> str | bytes | None:
+        with _name_loss():
+            try:
+                received: str | bytes = self._link.recv(timeout=WAIT)
+            except TimeoutError:
+                return None
+            return received
+
+
+@contextmanager
+def _name_loss() -> Iterator[None]:
+    """Raise an OSError where a connection is lost."""
+    from websockets.exceptions import ConnectionClosed
+
+    try:
+        yield
+    except ConnectionClosed as error:
+        raise OSError(_shorten(error)) from error
+
+
+def _shorten(error: Exception) -> str:
+    return " ".join(str(error).split())[:160] or type(error).__name__
+
+
+def read_rosbridge(connection: Connection, topics: Collection[str], counts: StreamCounts) -> Received:
+    """Receive messages of a rosbridge server."""
+    opened, silent, ask = 0.0, set(topics), 0.0
+    for text in connection.receive():
+        if connection.opened != opened:
+            opened, silent, ask = connection.opened, set(topics), 0.0
+        if silent and time.monotonic() >= ask:
+            ask = time.monotonic() + ASK_AGAIN
+            for topic in sorted(silent):
+                connection.request({"op": "subscribe", "topic": topic})
+        if text is None:
+            yield None
+            continue
+        try:
+            decoded = json.loads(text)
+            if decoded.get("op") != "publish" or decoded.get("topic") not in topics:
+                continue
+            silent.discard(decoded["topic"])
+            message = build_message(decoded["topic"], decoded["msg"], counts.read + 1)
+        except MESSAGE_ERRORS:
+            counts.broken += 1
+            continue
+        counts.read += 1
+        yield message
+
+
+def read_foxglove(connection: Connection, topics: Collection[str], counts: StreamCounts) -> Received:
+    """Receive messages of a Foxglove websocket server, whose channels are CDR."""
+    opened, last = 0.0, 0
+    requested: dict[int, tuple[int, str, str]] = {}  # channel, topic and type, by the number of the subscription
+    for received in connection.receive():
+        if connection.opened != opened:
+            opened, requested = connection.opened, {}
+        if received is None:
+            yield None
+            continue
+        try:
+            if isinstance(received, str):
+                decoded = json.loads(received)
+                if decoded.get("op") == "unadvertise":
+                    gone = set(decoded["channelIds"])
+                    requested = {number: of for number, of in requested.items() if of[0] not in gone}
+                elif decoded.get("op") == "advertise":
+                    for channel in decoded["channels"]:
+                        if channel["topic"] in topics and channel.get("encoding") == "cdr" and len(requested) < MOST_CHANNELS:
+                            last += 1
+                            requested[last] = int(channel["id"]), channel["topic"], normalise_type(channel["schemaName"])
+                            subscription = {"id": last, "channelId": requested[last][0]}
+                            connection.request({"op": "subscribe", "subscriptions": [subscription]})
+                continue
+            code, number, nanoseconds = struct.unpack_from("<BIQ", received)
+            if code != 1 or number not in requested:
+                continue
+            _, topic, kind = requested[number]
+            message = Message(topic, counts.read + 1, nanoseconds * 1e-9, deserialise(bytes(received[13:]), kind))
+        except MESSAGE_ERRORS:
+            counts.broken += 1
+            continue
+        counts.read += 1
+        yield message
 
 
 def _connect(address: str, protocols: Sequence[str]) -> Any:
     try:
-        from websockets.exceptions import WebSocketException
+        from websockets.exceptions import InvalidStatus, WebSocketException
         from websockets.sync.client import connect
         from websockets.typing import Subprotocol
     except ImportError as error:
-        raise InputError("a websocket needs websockets: pip install 'topomerge[studio]'") from error
+        raise InputError("a websocket needs websockets: pip install 'topomerge[bridge]'") from error
     if not address.startswith(("ws://", "wss://")):
         raise InputError(f"{address}: is no websocket; give its address, as ws://localhost:9090")
+    wish = f"one that speaks {' or '.join(protocols)}" if protocols else "rosbridge"
     try:
         chosen = [Subprotocol(name) for name in protocols] or None
-        return connect(address, subprotocols=chosen, max_size=LARGEST_MESSAGE, open_timeout=OPENING, close_timeout=1)
+        opening = connect(address, subprotocols=chosen, max_size=LARGEST_MESSAGE, open_timeout=OPENING, close_timeout=1)
+        link = opening.__enter__()  # without it since websockets 17.1: a warning; `Connection` closes it
+    except InvalidStatus as error:
+        raise InputError(f"{address}: the server refuses ({_shorten(error)}); is it {wish}?") from error
     except (OSError, WebSocketException, ValueError, TimeoutError) as error:
-        reason = " ".join(str(error).split())[:160] or type(error).__name__
-        raise InputError(f"{address}: no websocket server answers there ({reason}); is it running?") from error
-
-
-def _iter_received(link: Any) -> Iterator[str | bytes | None]:
-    from websockets.exceptions import ConnectionClosed
-
-    while True:
-        try:
-            yield link.recv(timeout=WAIT)
-        except TimeoutError:
-            yield None
-        except ConnectionClosed:
-            return
+        raise InputError(f"{address}: no websocket server answers there ({_shorten(error)}); is it running?") from error
+    if protocols and link.subprotocol is None:
+        link.close()
+        raise InputError(f"{address}: the server took none of the subprotocols that were offered; is it {wish}?")
+    return link
 
 
 @cache
@@ -316,97 +428,3 @@ def _unpack_chunk(data: bytes) -> bytes:
     if len(plain) != size or (check and zlib.crc32(plain) != check):
         raise ValueError("a chunk is damaged")
     return bytes(plain)
-
-
-class PoseBook:
-    """Where frames stood of late; only the newest poses are held.
-
-    Args:
-        held: samples of each frame.
-    """
-
-    GAP = 0.25  # s between a scan and the nearest pose, at most
-    FRAMES = 500  # frames at most: a stranger may name any number
-
-    def __init__(self, held: int = 400) -> None:
-        self.held = held
-        self._edges: dict[str, tuple[str, list[tuple[float, Any]]]] = {}
-        self._static: dict[str, tuple[str, Any]] = {}
-
-    def add(self, parent: str, child: str, time: float, position: Any, turn: Any, static: bool = False) -> bool:
-        """Take in where `child` stands in `parent`; False where it is no pose."""
-        values = np.array([position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w], float)
-        parent, child = parent.strip("/"), child.strip("/")
-        known = child in self._edges or child in self._static
-        if not np.isfinite(values).all() or not 0.9 < np.linalg.norm(values[3:]) < 1.1 or parent == child:
-            return False
-        if not known and len(self._edges) + len(self._static) >= self.FRAMES:
-            return False
-        matrix = _build_matrix(values)
-        if static:
-            self._static[child] = parent, matrix
-            return True
-        _, samples = self._edges.get(child, (parent, []))
-        samples = [s for s in samples[-self.held :] if s[0] < time]
-        self._edges[child] = parent, [*samples, (time, matrix)]
-        return True
-
-    def find_pose(self, frame: str, time: float) -> tuple[str, Any] | None:
-        """Find the topmost frame and the (4, 4) pose of a frame in it; None where it is not known at that time yet."""
-        from topomerge.io.trajectory import Trajectory
-
-        name, pose, moving = frame.strip("/"), np.eye(4), False
-        for _ in range(32):
-            if name in self._static:
-                name, matrix = self._static[name]
-                pose = matrix @ pose
-            elif name in self._edges:
-                parent, samples = self._edges[name]
-                track = Trajectory(np.array([m for _, m in samples]), np.array([t for t, _ in samples]))
-                if time > samples[-1][0] or track.measure_gap(np.array([time]))[0] > self.GAP:
-                    return None  # a newer one is on its way: the robot has moved since the last one
-                pose, name, moving = track.interpolate(np.array([time]))[0] @ pose, parent, True
-            else:
-                break
-        return (name, pose) if moving else None
-
-
-def _build_matrix(values: Any) -> Any:
-    from scipy.spatial.transform import Rotation
-
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat(values[3:]).as_matrix()
-    matrix[:3, 3] = values[:3]
-    return matrix
-
-
-def take_poses(book: PoseBook, message: Message, fallback: str) -> str:
-    """Take the poses of a message of transforms, odometry or poses into a book.
-
-    Args:
-        fallback: frame that moves, where the message names none.
-
-    Returns:
-        The frame that moves; empty where it holds no pose that can be used.
-    """
-    content = message.content
-    if hasattr(content, "transforms"):
-        static, taken = message.topic.endswith("tf_static"), ""
-        for one in content.transforms[:MOST_TRANSFORMS]:
-            where, child = one.transform, str(one.child_frame_id)
-            good = book.add(
-                str(one.header.frame_id), child, read_time(one.header, message), where.translation, where.rotation, static
-            )
-            taken = child if good and not static else taken
-        return taken
-    pose = content.pose.pose if hasattr(content.pose, "pose") else content.pose
-    child = str(getattr(content, "child_frame_id", "")) or fallback
-    time = read_time(content.header, message)
-    return child if book.add(str(content.header.frame_id), child, time, pose.position, pose.orientation) else ""
-
-
-def read_time(header: Any, message: Message) -> float:
-    """Read the time of a header, s; that of the recording where it has none."""
-    stamp = header.stamp
-    time = float(stamp.sec) + float(stamp.nanosec) * 1e-9
-    return time if time else message.recorded
