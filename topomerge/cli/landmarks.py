@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from topomerge.cli.console import Command, build_option, check_inputs, print_line, print_text, write_all, write_out
+from topomerge.cli.console import Command, build_option, check_inputs, print_line, print_text, warn, write_all, write_out
 from topomerge.cli.options import build_json_option, build_quiet_option, collect_given, parse_whole_number
 from topomerge.errors import InputError
 
@@ -45,6 +45,8 @@ def run_mark(args: argparse.Namespace) -> int:
         added = _build_added(args)
         marked = add_landmarks(_drop_source(map, added.sources) if args.source else map, added)
         what = f"{len(added)} added"
+        if hasattr(args, "at") and (marked.landmarks.table["room"][-len(added) :] < 0).all():
+            warn([f"{args.input}: no room is at {','.join(f'{v:g}' for v in args.at)} (--at: m in the frame of the map)"])
     write_all([(args.input, partial(save_map, marked))])
     if not args.quiet:
         print_line(f"{what}, {len(marked.landmarks)} landmark{'s' * (len(marked.landmarks) != 1)} in all -> {args.input}")

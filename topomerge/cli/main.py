@@ -175,7 +175,7 @@ def build_parser() -> argparse.ArgumentParser:
         allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"topomerge {__version__}")
-    parser.set_defaults(run=None, paths=(), one_input="", commands=COMMANDS, prog=parser.prog)
+    parser.set_defaults(run=None, paths=(), one_input="", several="", commands=COMMANDS, prog=parser.prog)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     for command in COMMANDS:
         _add(commands, command)
@@ -194,7 +194,9 @@ def _add(commands: Any, command: Command) -> None:
     for flags, settings in command.arguments:
         parser.add_argument(*flags, **settings)
     parser.add_argument("-v", "--verbose", action="count", default=0, help="print more; twice: also tracebacks")
-    parser.set_defaults(run=command.run, paths=command.paths, one_input=command.one_input, prog=parser.prog)
+    several = next((flags[0] for flags, settings in command.arguments if settings.get("nargs") in ("*", "+")), "")
+    about = {"run": command.run, "paths": command.paths, "one_input": command.one_input, "several": several}
+    parser.set_defaults(**about, prog=parser.prog)
 
 
 def _collect_paths(args: argparse.Namespace) -> tuple[list[str], list[str]]:
@@ -284,7 +286,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = build_parser()
     try:
         args, unknown = parser.parse_known_args(_join_signed_values(sys.argv[1:] if argv is None else argv))
-        if unknown:
+        if unknown and args.several and not any(word.startswith("-") for word in unknown):
+            setattr(args, args.several, [*getattr(args, args.several), *unknown])  # files behind the options
+        elif unknown:
             one_input = "" if unknown[0].startswith("-") or not args.one_input else f": {args.one_input}"
             parser.prog = args.prog  # so that the help of the command is named
             parser.error(f"unrecognized arguments: {' '.join(unknown)}{one_input}")

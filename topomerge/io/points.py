@@ -304,9 +304,10 @@ def read_chunks(
         warnings.append(f"{file_format.name} states its own unit and up axis: --unit and --up are not applied")
         reading = replace(reading, unit=None, up=None)
     up = None if file_format.fixed else reading.up or file_format.up
-    gatherer = Gatherer(str(path), up, reading.factor, chunk, warnings)
+    tables, ignored = read_tables_beside(path, reading.poses, list_suffixes())
+    gatherer = Gatherer(str(path), up, reading.factor, chunk, warnings + ignored)
     pieces = _iter_pieces(path, file_format, reading)
-    companions = [Piece(np.empty((0, 3)), landmarks=found) for found in read_tables_beside(path, reading.poses)]
+    companions = [Piece(np.empty((0, 3)), landmarks=found) for found in tables]
     pieces = itertools.chain(companions, pieces)
     return _iter_chunks(path, pieces, gatherer, progress)
 
