@@ -21,6 +21,7 @@ from topomerge.cli.console import (
 from topomerge.cli.options import (
     READING_NAMES,
     READING_OPTIONS,
+    SELECTIVE,
     build_json_option,
     build_output_option,
     build_quiet_option,
@@ -39,7 +40,7 @@ PORT = 7654
 def run_locate(args: argparse.Namespace) -> int:
     """`topomerge locate`: where in an atlas a scan was taken. Status 2: not here, or it can't be told."""
     check_inputs([args.input])
-    check_cloud_options([args.input], args, ("up", "unit", "scale", "poses", "spacing", "extrude", "ceiling", "doors", "tag_size"))
+    check_cloud_options([args.input], args, [name for name in READING_NAMES if name not in ("drawing", "text", *SELECTIVE)])
     from dataclasses import replace
 
     from topomerge.fusion.atlas.locate import LOCATE, locate
@@ -168,8 +169,8 @@ SERVE = Command(
         build_quiet_option(),
     ),
     paths=("atlas",),
-    description="Answer line JSON over a socket: each line asks with points or the ranges of a laser, and landmarks, and gets one "
-    "line back.",
+    description="Answer line JSON over a socket: each line asks with points or the ranges of a laser, and landmarks, and gets "
+    "one line back.",
 )
 BRIDGE = Command(
     "bridge",

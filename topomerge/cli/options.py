@@ -108,7 +108,7 @@ def is_taker(path: str, name: str) -> bool:
     place, suffixes = Path(path), SELECTIVE[name][2]
     if not place.is_dir():
         return place.suffix.lower() in suffixes
-    return not suffixes or name == "topic" and any(file.suffix.lower() in suffixes for file in place.iterdir())
+    return not suffixes or (name == "topic" and any(file.suffix.lower() in suffixes for file in place.iterdir()))
 
 
 def is_map(path: str) -> bool:
@@ -276,8 +276,10 @@ READING_OPTIONS = (  # all that readers of a single input take
     ),
     TOPIC,
 )
-READING_NAMES = ("scale", "resolution", "extrude", "spacing", "tag_size", "up", "unit", "drawing", "ceiling", "doors", "poses")
-READING_NAMES += ("topic", "one_frame", "text", "page")
+READING_NAMES = (
+    *("scale", "resolution", "extrude", "spacing", "tag_size", "up", "unit", "drawing", "ceiling", "doors", "poses", "topic"),
+    *("one_frame", "text", "page"),
+)
 PICTURES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff", ".pdf")
 SELECTIVE = {  # of `CLOUD_OPTIONS`: inputs that take it, in words and as suffixes; none: folders
     "one_frame": ("folders of files", "folder", ()),

@@ -69,19 +69,20 @@ def read_tables_beside(path: Path, poses: str | None, suffixes: Sequence[str]) -
             if _is_alone(path, suffixes):
                 table = shared
             else:
-                told.append(f"{shared}: lies beside several files and was not read; name it {path.stem}.{name} if it is of this one")
+                told.append(
+                    f"{shared}: lies beside several files and was not read; name it {path.stem}.{name} if it is this one's"
+                )
         if table is not None:
             found.append(read(table))
-            if lost := int((found[-1].is_kind("text", "tag", "object", "name") & ~is_located(found[-1])).sum()):
-                told.append(f"{table}: {lost} landmark{'s' * (lost != 1)} without a place, a room and a storey: say where; they help little")
+            if lost := count_lost(found[-1]):
+                told.append(f"{table}: {lost} landmark{'s' * (lost != 1)} without a place, a room and a storey; say where")
     return found, told
 
 
-def is_located(landmarks: Landmarks) -> Array:
-    """Return (n,) bool: does it have a place, a room or a storey?"""
-    table = landmarks.table
-    located: Array = np.isfinite(table["position"]).all(axis=1) | (table["room"] >= 0) | (table["storey"] >= 0)
-    return located
+def count_lost(landmarks: Landmarks) -> int:
+    """Count the signs, tags, objects and names that have neither a place nor a room nor a storey."""
+    table = landmarks.table[landmarks.is_kind("text", "tag", "object", "name")]
+    return int((np.isnan(table["position"]).any(axis=1) & (table["room"] < 0) & (table["storey"] < 0)).sum())
 
 
 def _is_alone(path: Path, suffixes: Sequence[str]) -> bool:

@@ -133,9 +133,9 @@ def _iter_cells(path: Path) -> Iterator[dict[str, Any]]:
         yield from own
         given = {(f"C{row.get('room')}", row["value"]) for row in own}
         for cell in root.iter():
-            if _get_name(cell).endswith("Space") and (row := _read_cell(cell, points)):
-                if (_get_id(cell), row["value"]) not in given:
-                    yield row
+            row = _read_cell(cell, points) if _get_name(cell).endswith("Space") else None
+            if row and (_get_id(cell), row["value"]) not in given:
+                yield row
     except (xml.ParseError, ValueError, RecursionError, LookupError) as error:
         raise build_damage_error(path, "IndoorGML", error) from error
 

@@ -4,7 +4,7 @@
 |---|---|
 | `{"points": [[x, y, z], …], "place": [x, y, z], "id": …}` | `{"id": …, "status": "located", …}` (`Location.serialise`) |
 | `{"ranges": […], "angle_min": …, "angle_increment": …, "height": …}` | the same, of a slice of a laser |
-| either, and `"landmarks": [{"kind": "text", "value": "2.113", "position": [x, y, z]}, …]` | the same, with what it knows beside walls |
+| either, and `"landmarks": [{"kind": "text", "value": "2.113", "position": [x, y, z]}, …]` | the same, by these, too |
 | anything else | `{"id": …, "error": "…"}`; the connection stays open unless a line is too long |
 """
 
