@@ -31,6 +31,19 @@ def test_whole_or_absent(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.tmap"] and target.read_text() == "whole"
 
 
+def test_permissions_stay_and_what_is_protected_too(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    path.chmod(0o440)
+    with pytest.raises(InputError, match="is write-protected; make it writable"), replace_on_success(path):
+        pass
+    assert path.read_text() == "old"
+    path.chmod(0o640)
+    with replace_on_success(path) as temporary:
+        temporary.write_text("new")
+    assert path.read_text() == "new" and path.stat().st_mode & 0o777 == 0o640
+
+
 def test_a_link_is_followed(tmp_path):
     (tmp_path / "real").mkdir()
     (tmp_path / "real" / "a.txt").write_text("old")

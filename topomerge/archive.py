@@ -57,16 +57,19 @@ def convert_to_plain(value: Any) -> Any:
 def replace_on_success(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path` with the same name; rename it to `path` on success, delete it on any error.
 
-    A link is followed: what it points to is replaced.
+    A link is followed: what it points to is replaced. The permissions of what is replaced stay.
 
     Raises:
-        InputError: the folder does not exist or can't be written, or `path` is no regular file.
+        InputError: the folder does not exist or can't be written, or `path` is no regular file, or write-protected.
     """
     path = Path(path)
     if path.is_symlink():
         path = Path(os.path.realpath(path))
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: is no file that could be replaced; give the name of a file")
+    mode = path.stat().st_mode & 0o777 if path.exists() else None
+    if mode is not None and not mode & 0o222:
+        raise InputError(f"{path}: is write-protected; make it writable, or give another name")
     try:
         _delete_stale_parts(path.parent)
         # A folder of its own, so that what a kill leaves behind is nowhere found under the file's suffix.
@@ -81,7 +84,7 @@ def replace_on_success(path: str | Path) -> Iterator[Path]:
         yield temporary
         umask = os.umask(0)
         os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
+        temporary.chmod(0o666 & ~umask if mode is None else mode)
         try:
             temporary.replace(path)
         except OSError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Polygon
 from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.core.building import Building, Difficulty
+from topomerge.datasets.pairs.lookalike_radio import TRACK_GAP, WIFI
 from topomerge.datasets.pairs.pairs import ROOMS_A_MAP, Pair, PairSettings, draw_frames, make_pair, simulate_signs
+from topomerge.datasets.simulation.radio import build_radio_plans, place_access_points, simulate_readings
 from topomerge.datasets.simulation.scanner import scan_building
 from topomerge.datasets.simulation.sensors import get_sensor
 from topomerge.datasets.simulation.session import simulate_session
@@ -23,9 +26,10 @@ from topomerge.datasets.simulation.walk import sample_part
 
 from topomerge.errors import InputError
 from topomerge.io.landmarks import format_landmark_table
-from topomerge.types import Array, Landmarks, PointCloud, Sim3, TrueRoom
+from topomerge.types import Array, Landmarks, PointCloud, Sim3, TrueRoom, join_landmarks
 
 TRUTH_FORMAT = 1
+SIMULATED_LANDMARKS = {"signs": "text", "tags": "tag", "wifi": "radio"}  # and their kinds in a map
 Output = tuple[Path, Callable[[Path], None]]
 
 
@@ -71,24 +75,54 @@ def simulate_maps(
 
 
 def prepare_outputs(
-    building: Building, simulated: Pair | PointCloud, frame: Sim3, folder: Path, signs: str | None = None
+    building: Building, simulated: Pair | PointCloud, frame: Sim3, folder: Path, kinds: Sequence[str] = (), reader: str = "good"
 ) -> list[Output]:
     """Return the files of a simulation, and what writes each.
 
     Args:
-        signs: of `READERS`: door signs that were read lie beside each cloud, as `a.landmarks.csv`; None: none.
+        kinds: of `SIMULATED_LANDMARKS`, that lie beside each cloud, as `a.landmarks.csv`.
+        reader: of `READERS`, of signs and tags.
 
     Raises:
-        InputError: signs of another building, whose doors are not known.
+        InputError: landmarks of another building, whose doors are not known.
     """
     clouds = {"a": simulated} if isinstance(simulated, PointCloud) else {"a": simulated.a, "b": simulated.b}
     files: list[Output] = [(folder / f"{name}.ply", partial(save_cloud, cloud)) for name, cloud in clouds.items()]
     files.append((folder / "truth.json", partial(save_truth, building, simulated, frame)))
     files.append((folder / "plan.png", partial(save_figure, building, simulated, frame)))
-    if signs is not None:
-        read = simulate_signs(building, simulated, READERS[signs], frame)
+    if kinds:
+        seen = replace(READERS[reader], kinds=tuple(SIMULATED_LANDMARKS[kind] for kind in kinds if kind != "wifi"))
+        read = simulate_signs(building, simulated, seen, frame)
+        if "wifi" in kinds:
+            heard = simulate_wifi(building, simulated, frame)
+            read = [join_landmarks(both) for both in zip(read, heard, strict=True)]
         files += [(folder / f"{name}.landmarks.csv", partial(save_landmarks, of)) for name, of in zip(clouds, read, strict=True)]
     return files
+
+
+def simulate_wifi(building: Building, simulated: Pair | PointCloud, frame: Sim3) -> list[Landmarks]:
+    """Simulate what a phone hears that the surveyor of each cloud carries, in the frame of the cloud."""
+    sides = [(simulated, frame)]
+    if not isinstance(simulated, PointCloud):
+        assert simulated.frames is not None
+        sides = [(simulated.a, simulated.frames[0]), (simulated.b, simulated.frames[1])]
+    plans = build_radio_plans(building)
+    points = place_access_points(plans, WIFI, building.seed)
+    out = []
+    for session, (cloud, to_map) in enumerate(sides):
+        assert isinstance(cloud, PointCloud) and cloud.poses is not None
+        walk = to_map.inverse().apply(cloud.poses[:, :3, 3])
+        walk = walk[np.unique(np.floor(walk / TRACK_GAP), axis=0, return_index=True)[1]]
+        level = np.maximum(np.searchsorted(building.storeys["floor"], walk[:, 2], side="right") - 1, 0)
+        parts = []
+        for own in np.unique(level).tolist():
+            part = simulate_readings(plans, points, walk[level == own, :2], own, WIFI, session)
+            part.table["group"] += sum(int(other.table["group"].max(initial=-1)) + 1 for other in parts)
+            part.table["position"] = to_map.apply(part.table["position"])
+            part.table["sigma"] *= to_map.scale
+            parts.append(part)
+        out.append(join_landmarks(parts))
+    return out
 
 
 def save_landmarks(landmarks: Landmarks, path: Path) -> None:

@@ -15,6 +15,7 @@ from tests.io.scene_graphs import write_scene_graph
 from tests.scenes import two_rooms
 from tests.scenes_map import building, same
 from topomerge.cli.landmarks import match_values
+from topomerge.extraction.landmarks import add_landmarks
 from topomerge.fusion.atlas.store import add
 from topomerge.io.maps import load_map, save_map
 from topomerge.types import build_landmarks
@@ -102,6 +103,24 @@ def test_what_a_file_says_is_taken_and_replaced(marked: Run) -> None:
     assert table("b.tmap") == table()
     write_scene_graph(Path("empty.json"))
     assert "holds no landmarks and no names" in marked("mark", "a.tmap", "--from", "empty.json")[2]
+
+
+def test_what_comes_with_a_scan_is_taken(marked: Run) -> None:
+    np.save("b.npy", two_rooms().points())
+    Path("b.landmarks.csv").write_text("kind,value,room\nobject,sofa,1\n")
+    assert marked("mark", "a.tmap", "--from", "b.npy")[1] == "1 added, 1 landmark in all -> a.tmap\n"
+    assert table() == [("object", "sofa", 1, 0)]
+
+
+def test_a_place_far_outside_is_told(marked: Run) -> None:
+    assert "a.tmap: no room is at 100000,5,5" in marked("mark", "a.tmap", "--at", "100000,5,5", "--text", "1")[2]
+
+
+def test_the_strongest_reading_of_each_room_is_found(marked: Run) -> None:
+    readings = build_landmarks("radio", ["aa:bb"] * 3, "phone", room=[1, 1, 2], number=[-70.0, -60.0, -80.0])
+    save_map(add_landmarks(building(1, 2), readings), "a.tmap")
+    lines = marked("find", "--radio", "AA*", "a.tmap")[1].splitlines()[1:]
+    assert [line.split()[2:6] for line in lines] == [["aa:bb", "(-60", "dBm)", "0"], ["aa:bb", "(-80", "dBm)", "0"]]
 
 
 def test_patterns() -> None:

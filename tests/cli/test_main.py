@@ -19,7 +19,7 @@ from tests.cli.processes import Run, process
 from tests.scenes import two_rooms
 from tests.scenes_map import building, same
 from topomerge.cli.main import COMMANDS
-from topomerge.cli.options import check_cloud_options
+from topomerge.cli.options import check_cloud_options, collect_reading_options
 from topomerge.errors import InputError
 from topomerge.io.maps import load_map
 
@@ -234,6 +234,13 @@ def test_a_second_scan_is_for_merge(run: Run) -> None:
         ("embed a.tmap -o a.npz", "a.npz: -o writes .npy; end its name with .npy"),
         ("match a.tmap b.tmap --report m.pdf", "m.pdf: --report writes .html; end its name with .html or .htm"),
         ("atlas add new a.tmap --sensor tls", "--sensor: is for clouds"),
+        ("merge a.tmap b.tmap -o m --resolution 0.05", "--resolution: is for pictures, PDF and SVG; give such a file"),
+        ("merge a.tmap b.tmap -o m --topic /scan", "--topic: is for ROS bags; give such a bag"),
+        ("locate house a.tmap --scale 2", "--scale: is for clouds"),
+        ("locate a.tmap b.tmap", "a.tmap: is a file; give the folder of an atlas, and before other files"),
+        ("serve-locate nowhere", "nowhere: no such folder"),
+        ("export a.tmap --to indoorgml -o b.tmap", "b.tmap: --to indoorgml writes .gml; end its name with .gml"),
+        ("simulate --building house --landmarks tags,smells -o pair", "--landmarks smells: is none that is simulated"),
         ("view a.tmap -o a.pdf", "a.pdf: -o writes .html"),
         ("simulate --building house --storeys 9 -o pair", "storeys must be 1 to 8"),
     ],
@@ -251,6 +258,27 @@ def test_an_option_that_one_input_can_use_is_fine() -> None:
     check_cloud_options(["a.tmap", "b.ply"], args)
     with pytest.raises(InputError, match="^--up: is for clouds"):
         check_cloud_options(["a.tmap", "b.TMAP"], args)
+
+
+def test_options_of_reading_go_to_the_inputs_that_take_them(tmp_path: Path) -> None:
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag/0.mcap").touch()
+    args = argparse.Namespace(up="y", one_frame=True, resolution=0.05, page=1, topic="/scan")
+    names = ("a.png", "b.ply", "c.svg", "bag")
+    taken = {name: set(collect_reading_options(str(tmp_path / name), args)) - {"up"} for name in names}
+    assert taken == {"a.png": {"resolution", "page"}, "b.ply": set(), "c.svg": {"resolution"}, "bag": {"one_frame", "topic"}}
+
+
+def test_files_may_follow_options(run: Run, tmp_path: Path) -> None:
+    for k, name in enumerate("abc"):
+        topomerge.save_map(building(k + 1), tmp_path / f"{name}.tmap")
+    assert run("find", "a.tmap", "--text", "nothing", "b.tmap", "--name", "none", "c.tmap") == (
+        2,
+        "not found: text nothing, name none (in 3 maps)\n",
+        "",
+    )
+    status, _, err = run("merge", "a.tmap", "-o", "m", "b.tmap", "--nonsense")
+    assert status == 1 and "unrecognized arguments: b.tmap --nonsense" in err
 
 
 def test_no_words(run: Run) -> None:

@@ -102,7 +102,7 @@ def test_force_writes_all_and_keeps_the_status(run: Run, folder: Path) -> None:
         (("b.tmap", "broken.tmap"), "topomerge: broken.tmap: "),
         (("b.tmap", "text.ply"), "topomerge: text.ply: "),
         (("b.tmap", "mm.npy"), "topomerge: mm.npy: "),
-        (("b.tmap", "plan.png"), "(--resolution: of `topomerge extract`, whose .tmap can be given here)"),
+        (("b.tmap", "plan.png"), "plan.png: an image does not say how large a pixel is; give --resolution"),
         (("b.tmap", "c.tmap", "--threshold", "2"), "from 0 to 1"),
         (("b.tmap", "c.tmap", "--scale", "2"), "invalid choice"),
     ],

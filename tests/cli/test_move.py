@@ -82,6 +82,13 @@ def test_what_has_no_form_is_named(run: Run, tmp_path: Path) -> None:
     assert status == 0 and "c.bt: has no form" in err and (tmp_path / "merged/a_moved.db").exists()
 
 
+def test_a_map_is_told_how_its_file_is_moved(run: Run, tmp_path: Path) -> None:
+    write_session(tmp_path / "a.db")
+    save_map(building(1), tmp_path / "c.tmap")
+    status, _, err = run("a.db", "c.tmap", "-o", "merged", "--native", "--rigid")
+    assert status == 0 and "c.tmap: is a map; name the file that it was made of, by `topomerge move merged 1=FILE" in err
+
+
 def test_a_refused_merge_moves_nothing(run: Run, tmp_path: Path) -> None:
     for name in "ab":
         write_session(tmp_path / f"{name}.db")

@@ -114,8 +114,8 @@ def test_hard_negatives_share_nothing(tmp_path: Path, hard: str) -> None:
 @pytest.mark.longer
 def test_signs_lie_beside_the_clouds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["simulate", "--building", "office", "--rooms", "5", "--seed", "5", "--overlap", "0.8", "-q"]
-    for folder, signs in (("x", "good"), ("y", "good"), ("z", "poor")):
-        assert cli([*words, "--signs", signs, "-o", str(tmp_path / folder)]) == 0
+    for folder, signs in (("x", ["good"]), ("y", ["good"]), ("z", ["poor", "--landmarks", "signs,tags,wifi"])):
+        assert cli([*words, "--signs", *signs, "-o", str(tmp_path / folder)]) == 0
     assert (tmp_path / "x/b.landmarks.csv").read_bytes() == (tmp_path / "y/b.landmarks.csv").read_bytes()
     a, b = (read_landmark_file(tmp_path / f"x/{side}.landmarks.csv") for side in "ab")
     transform = np.array(json.loads((tmp_path / "x/truth.json").read_text())["T_ab"])
@@ -126,7 +126,9 @@ def test_signs_lie_beside_the_clouds(tmp_path: Path, capsys: pytest.CaptureFixtu
         p, q = (of.table["position"][of.get_values() == value][0] for of in (a, b))
         off.append(np.linalg.norm((transform @ [*q, 1.0])[:3] - p))
     assert np.median(off) < 1.0
-    assert len(read_landmark_file(tmp_path / "z/a.landmarks.csv")) < len(a)
+    kinds = [read_landmark_file(tmp_path / f"z/{side}.landmarks.csv") for side in "ab"]
+    assert 0 < kinds[0].is_kind("text").sum() < len(a) and all(of.is_kind("radio").sum() > 20 for of in kinds)
+    assert set(kinds[0].select(kinds[0].is_kind("radio")).get_values()) & set(kinds[1].get_values())
     hard = [*words, "--hard", "other-building", "--signs", "good", "-o", str(tmp_path / "w")]
     assert cli(hard) == 1 and "signs: the doors of the other building are not known" in capsys.readouterr().err
     assert not (tmp_path / "w").exists()

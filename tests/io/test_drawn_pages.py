@@ -17,6 +17,7 @@ from topomerge.io.drawing import (
     TracedDrawing,
     build_stairs_landmarks,
     find_treads,
+    is_plan,
     parse_drawing,
 )
 from topomerge.io.drawn_page import DrawnPage, compute_levels, find_homography, find_page, move_places
@@ -172,6 +173,22 @@ def test_a_blueprint_has_its_rooms(tmp_path):
     Image.fromarray((np.array([20, 60, 140]) * (1 - share) + 240 * share).astype(np.uint8)).save(path)
     map = extract(read_points(path, resolution=0.02, text=False))
     assert len(map.rooms) == 5 and any("dark lines on light paper" in warning for warning in map.warnings)
+
+
+def test_a_plan_of_two_levels_is_turned_and_a_grid_is_not(tmp_path):
+    page = find_page((255 - np.asarray(Image.open(draw_case(tmp_path / "plan.png")))) // 2)  # crisp, and pale
+    assert page.mended and page.doubtful and is_plan(page)
+    floor = np.zeros((300, 600), bool)  # corridors and rooms among solid black, with edges as a laser gives them
+    floor[40:54, 20:580] = floor[230:244, 20:580] = True
+    for column in range(40, 560, 110):
+        floor[40:240, column : column + 14] = floor[80:105, column - 16 : column + 26] = True
+    far = ndimage.distance_transform_edt(floor) - ndimage.distance_transform_edt(~floor)
+    rough = far + 8 * ndimage.gaussian_filter(np.random.default_rng(0).normal(0, 1, floor.shape), 1.5) > 1
+    grid = np.repeat(rough[..., None] * np.uint8(255), 3, axis=2)
+    assert find_page(grid).doubtful
+    Image.fromarray(grid).save(tmp_path / "grid.png")
+    with pytest.raises(InputError, match="give --resolution .*; if it shows light lines on dark paper, invert its colours$"):
+        read_points(tmp_path / "grid.png", text=False)
 
 
 @pytest.mark.parametrize("how", ["turned", "mirrored", "transparent", "16 bits", "JPEG", "half as large"])

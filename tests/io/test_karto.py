@@ -161,6 +161,10 @@ def test_what_belongs_together_is_asked_for(folder: Path) -> None:
     with pytest.raises(InputError, match=r"belongs to room\.posegraph; give that file"):
         read_points(folder / "room.data")
     assert find_format(folder / "room.data") is None
+    with pytest.raises(InputError, match=r"room: unknown suffix \(none\); give room\.posegraph$"):
+        read_points(folder / "room")
+    with pytest.raises(InputError, match=r"room\.data: give room\.posegraph, beside which it lies$"):
+        plan_outputs([Source(folder / "room.data")], folder)
     (folder / "room.data").rename(folder / "other.data")
     with pytest.raises(InputError, match=r"room\.data is not beside it"):
         read_points(folder / "room.posegraph")

@@ -214,6 +214,23 @@ def test_a_table_beside_a_scan_is_read_without_an_option(tmp_path: Path) -> None
     assert read_points(path).landmarks is None
 
 
+def test_the_only_file_of_a_folder_has_the_folders_table(tmp_path: Path) -> None:
+    path = scan_of_two_rooms(tmp_path, "")
+    beside, shared = tmp_path / "scan.landmarks.csv", tmp_path / "landmarks.csv"
+    beside.unlink()
+    shared.write_text("kind;value;x;y;z\ntext;101;1,5;1;1,5\ntext;102;;;\n")  # as a spreadsheet in German saves it
+    cloud = read_points(path)
+    assert cloud.landmarks is not None and cloud.landmarks.table["position"][0].tolist() == [1.5, 1, 1.5]
+    assert cloud.warnings[-1].startswith(f"{shared}: 1 landmark without a place, a room and a storey")
+    np.save(tmp_path / "other.npy", two_rooms().points())
+    cloud = read_points(path)
+    assert cloud.landmarks is None and cloud.warnings == (
+        f"{shared}: lies beside several files and was not read; name it scan.landmarks.csv if it is this one's",
+    )
+    shared.rename(tmp_path / "scan.npy.landmarks.csv")
+    assert len(read_points(path).landmarks or ()) == 2
+
+
 def test_a_folder_has_a_table_of_its_own(tmp_path: Path) -> None:
     points = two_rooms().points()
     for k, part in enumerate(np.array_split(points, 2)):

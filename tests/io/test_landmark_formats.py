@@ -110,11 +110,18 @@ def test_damaged_json_is_told_in_one_line(tmp_path: Path, text: str) -> None:
     assert "a.json" in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_indoorgml_names_its_cells(marked: TopometricMap, tmp_path: Path) -> None:
+def test_indoorgml_keeps_landmarks_and_names_of_cells(marked: TopometricMap, tmp_path: Path) -> None:
     save_export(marked, "indoorgml", tmp_path / "a.gml")
     check(xml.parse(tmp_path / "a.gml").getroot())
-    map = add_landmarks(two_floors(), load_landmark_source(tmp_path / "a.gml"))
-    assert rows(map.landmarks) == [(5, "2.113", 3), (5, "Lab", 0), (5, EVIL, 4)]
+    back, own = load_landmark_source(tmp_path / "a.gml"), marked.landmarks.select(~marked.landmarks.is_kind("radio"))
+    assert rows(back) == rows(own) and back.sources == ("by hand", "signs.csv", "robot")
+    for column in ("position", "confidence", "storey", "sigma"):
+        assert np.allclose(back.table[column], own.table[column], atol=1e-4, equal_nan=True)
+    names = two_floors()
+    save_export(names, "indoorgml", tmp_path / "names.gml")
+    text = (tmp_path / "names.gml").read_text(encoding="utf-8").replace(">room 0<", ">Lab<")  # as others write it
+    (tmp_path / "names.gml").write_text(text, encoding="utf-8")
+    assert rows(add_landmarks(names, load_landmark_source(tmp_path / "names.gml")).landmarks) == [(5, "Lab", 0)]
     (tmp_path / "b.gml").write_text("<!DOCTYPE x [<!ENTITY a 'aaaa'>]><x>&a;</x>")
     for name, text, said in (
         ("b", None, "declares entities"),

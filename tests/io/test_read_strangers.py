@@ -39,6 +39,11 @@ def test_pointers_of_git_lfs(tmp_path: Path, suffix: str) -> None:
     assert refusal_of(path) == f"{path}: is a Git LFS pointer, not the file; run `git lfs pull`"
 
 
+@pytest.mark.parametrize(("suffix", "advice"), [(".webp", "save it as PNG"), (".DWG", "save it as DXF"), (".doc", "rename or")])
+def test_what_to_make_of_other_suffixes(tmp_path: Path, suffix: str, advice: str) -> None:
+    assert f"unknown suffix {suffix}; {advice}" in refusal_of(tmp_path / f"a{suffix}")
+
+
 def test_pointers_of_git_lfs_that_another_file_names(tmp_path: Path) -> None:
     for name in ("map.pgm", "000.ply", "001.ply", "map.tmap", "poses.txt"):
         (tmp_path / name).write_bytes(POINTER)

@@ -30,6 +30,7 @@ from topomerge.cli.options import (
     ATLAS_OPTIONS,
     CLOUD_OPTIONS,
     NO_EDITS,
+    SELECTIVE,
     build_json_option,
     build_output_option,
     build_quiet_option,
@@ -301,7 +302,7 @@ def _build_reader(args: argparse.Namespace) -> Reader:
     def failure(error: Exception, path: Path) -> str | None:
         return None if find_signal(error) is not None else f"{format_failure(error, [str(path)])}; it is skipped until it changes"
 
-    names = ("voxel_size", "up", "unit", "one_frame", "sensor")
+    names = ("voxel_size", "up", "unit", "sensor", *SELECTIVE)
     return Reader(read, json.dumps(collect_given(args, *names), sort_keys=True), failure)
 
 

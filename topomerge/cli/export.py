@@ -11,6 +11,7 @@ from topomerge.cli.console import (
     build_option,
     check_inputs,
     check_outputs,
+    check_suffix,
     open_output_folder,
     print_line,
     warn,
@@ -23,7 +24,7 @@ from topomerge.errors import InputError
 
 def run_export(args: argparse.Namespace) -> int:
     """`topomerge export`: a map in the formats of other tools."""
-    from topomerge.io.exports import parse_formats, prepare_outputs
+    from topomerge.io.exports import FORMATS, parse_formats, prepare_outputs
     from topomerge.types import filter_confident
 
     names = parse_formats(args.to)
@@ -36,6 +37,8 @@ def run_export(args: argparse.Namespace) -> int:
     with open_output_folder(path.parent):
         files = [file for name in names for file in prepare_outputs(topomap, name, path, folder, **options)]
         check_outputs([file for file, _ in files], [source])
+        if not folder:
+            check_suffix(f"--to {args.to}", args.output, FORMATS[names[0]].suffixes)
         write_all(files)
     if not args.quiet:
         written = " ".join(str(file) for file, _ in files)

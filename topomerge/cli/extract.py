@@ -29,17 +29,14 @@ from topomerge.cli.options import (
     CONTEXT_STEPS,
     DESCRIPTOR,
     NO_EDITS,
-    ONE_FRAME,
-    TEXT,
-    UNIT,
-    UP,
+    READING_NAMES,
+    READING_OPTIONS,
     build_json_option,
     build_output_option,
     build_quiet_option,
     check_cloud_options,
     check_descriptor,
     collect_given,
-    parse_count,
     parse_positive,
 )
 from topomerge.errors import InputError
@@ -60,10 +57,7 @@ def run_extract(args: argparse.Namespace) -> int:
     with ProgressBars(enabled=not args.quiet) as bars:
         from topomerge.io.points import read_chunks
 
-        lengths = ("scale", "resolution", "extrude", "spacing", "tag_size")
-        others = ("up", "unit", "drawing", "ceiling", "doors", "poses", "topic", "one_frame", "text", "page")
-        reading = collect_given(args, *lengths, *others)
-        chunks = read_chunks(args.input, **reading, progress=bars.start_task("read"))
+        chunks = read_chunks(args.input, **collect_given(args, *READING_NAMES), progress=bars.start_task("read"))
         from topomerge.extraction.extract import extract  # after the file was opened: what is wrong with it is told at once
 
         choices = collect_given(args, "voxel_size", "preset")
@@ -115,43 +109,7 @@ EXTRACT = Command(
         build_option("--report", metavar="A.html", default=None, help="also write plans, tables and a 3D view as one web page"),
         build_option("--voxel-size", type=parse_positive, metavar="E", help="edge length of a cell, m (default 0.1)"),
         build_option("--preset", choices=("default", "thesis"), help="default, or the parameters of the thesis"),
-        UP,
-        UNIT,
-        ONE_FRAME,
-        *TEXT,
-        build_option("--scale", type=parse_positive, metavar="S", help="multiply coordinates by this (default 1)"),
-        build_option("--resolution", type=parse_positive, metavar="R", help="m per pixel of a plain image of a floor plan"),
-        build_option(
-            "--no-drawing",
-            dest="drawing",
-            action="store_const",
-            const=False,
-            help="dark pixels of a plain image are walls, also where it is a page with a drawn plan",
-        ),
-        build_option(
-            "--page",
-            type=parse_count,
-            metavar="N",
-            help="page of a PDF, from 1 (default: the only one with content), or plan of a picture",
-        ),
-        build_option("--extrude", type=parse_positive, metavar="H", help="m of wall height for 2D maps (default 2.5)"),
-        build_option("--ceiling", action="store_true", help="close 2D maps with a ceiling"),
-        build_option(
-            "--spacing",
-            type=parse_positive,
-            metavar="D",
-            help="m between points on surfaces of meshes, models and 2D maps, or at the finest level of an octree",
-        ),
-        build_option(
-            "--doors", action="store_true", help="keep the door leaves of building models, where doors are modelled shut"
-        ),
-        build_option(
-            "--poses",
-            metavar="TRAJECTORY",
-            help="where scans were taken: a KITTI or TUM file, or a topic of the bag (default: a trajectory beside the scans; "
-            "in a bag tf, then odometry)",
-        ),
-        build_option("--topic", metavar="NAME", help="topic to read, where a bag has points of several sensors, or maps as well"),
+        *READING_OPTIONS,
         NO_EDITS,
         build_quiet_option("no table, no progress; only warnings"),
     ),

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from topomerge.cli.console import ProgressBars, Report, exit_on_signals, format_failure, show_log, warn
-from topomerge.cli.options import collect_given, collect_reading_options, is_map
+from topomerge.cli.options import SELECTIVE, collect_given, collect_reading_options, is_map
 from topomerge.errors import InputError
 
 if TYPE_CHECKING:
@@ -36,11 +36,11 @@ if TYPE_CHECKING:
     from topomerge.types import TopometricMap
 
 # Advice of the readers that only `extract` can take: --scale and --poses of `merge` are others.
-EXTRACT_ADVICE = ("--resolution", "--poses", "--topic", "--scale", "--spacing")
+EXTRACT_ADVICE = ("--poses", "--scale", "--spacing")
 LEAST_SIZE = {"fork": 2_000_000, "spawn": 5_000_000}  # bytes of a cloud, from which a process is worth it (docs/benchmarks.md)
 COMPRESSION = {".laz": 6, ".e57": 2}  # of the bytes of a point, against PLY and LAS
 MEMORY_START, MEMORY_GROWTH = 600_000_000, 8  # bytes that extraction takes at most: to start with, and for each byte of the cloud
-WORKER_OPTIONS = ("voxel_size", "up", "unit", "one_frame", "sensor", "text", "tag_size", "verbose", "prepares")
+WORKER_OPTIONS = ("voxel_size", "up", "unit", "sensor", "text", "tag_size", *SELECTIVE, "verbose", "prepares")
 EXTRACTION_MODULES = ("topomerge.extraction.extract", "topomerge.io.points")
 PREPARATION_MODULE = "topomerge.registration.prepared"
 EXTRACTION_LOOPS = ("images", "rasters", "rays", "stencil", "voxels")  # of `topomerge.kernels`

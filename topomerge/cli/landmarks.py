@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from topomerge.cli.console import Command, build_option, check_inputs, print_line, print_text, write_all, write_out
+from topomerge.cli.console import Command, build_option, check_inputs, print_line, print_text, warn, write_all, write_out
 from topomerge.cli.options import build_json_option, build_quiet_option, collect_given, parse_whole_number
 from topomerge.errors import InputError
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 BY_HAND = "by hand"  # source of what `mark` adds
 MARKED_KINDS = ("text", "tag", "name", "object")  # options of both commands
-FOUND_BY = {"text": ("text", "name"), "tag": ("tag",), "name": ("name",), "object": ("object",)}  # kinds that an option finds
+FOUND_KINDS = (*MARKED_KINDS, "radio", "use", "area")  # options of `find`
 
 
 def run_mark(args: argparse.Namespace) -> int:
@@ -45,6 +45,8 @@ def run_mark(args: argparse.Namespace) -> int:
         added = _build_added(args)
         marked = add_landmarks(_drop_source(map, added.sources) if args.source else map, added)
         what = f"{len(added)} added"
+        if hasattr(args, "at") and (marked.landmarks.table["room"][-len(added) :] < 0).all():
+            warn([f"{args.input}: no room is at {','.join(f'{v:g}' for v in args.at)} (--at: m in the frame of the map)"])
     write_all([(args.input, partial(save_map, marked))])
     if not args.quiet:
         print_line(f"{what}, {len(marked.landmarks)} landmark{'s' * (len(marked.landmarks) != 1)} in all -> {args.input}")
@@ -147,9 +149,9 @@ def match_values(landmarks: Landmarks, kinds: Sequence[str], patterns: Sequence[
 
 def run_find(args: argparse.Namespace) -> int:
     """`topomerge find`: landmarks of maps and atlases. Status 2: there is none."""
-    given = {kind: getattr(args, kind) for kind in MARKED_KINDS if hasattr(args, kind)}
+    given = collect_given(args, *FOUND_KINDS)
     if not given:
-        raise InputError("--text, --tag, --name or --object: give one; say what to look for")
+        raise InputError(f"{', '.join(f'--{kind}' for kind in FOUND_KINDS)}: give one; say what to look for")
     check_inputs(args.inputs)
     maps = [path for item in args.inputs for path in list_map_files(Path(item))]
     found = [entry for path in maps for entry in _iter_found(path, given)]
@@ -189,8 +191,16 @@ def _iter_found(path: Path, given: dict[str, list[str]]) -> Iterator[dict[str, A
 
     landmarks = load_corrected_map(path).landmarks if find_journal(path).exists() else load_landmarks(path)[0]
     for kind, patterns in given.items():
-        for entry in serialise_landmarks(landmarks.select(match_values(landmarks, FOUND_BY[kind], patterns))):
+        kinds = ("text", "name") if kind == "text" else (kind,)
+        entries = serialise_landmarks(landmarks.select(match_values(landmarks, kinds, patterns)))
+        for entry in _keep_strongest(entries) if kind == "radio" else entries:
             yield {"map": str(path), **entry}
+
+
+def _keep_strongest(readings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Of each sender and room the strongest reading: a map may have thousands."""
+    ranked = sorted(readings, key=lambda entry: entry["number"] if entry["number"] is not None else -1e9)
+    return list({(entry["value"], entry["storey"], entry["room"]): entry for entry in ranked}.values())[::-1]
 
 
 def _format_found(found: Sequence[dict[str, Any]]) -> list[str]:
@@ -198,7 +208,8 @@ def _format_found(found: Sequence[dict[str, Any]]) -> list[str]:
     for entry in found:
         place = "–" if entry["position"] is None else " ".join(f"{v:.2f}" for v in entry["position"])
         numbers = ["–" if entry[name] is None else str(entry[name]) for name in ("storey", "room")]
-        rows.append((entry["map"], entry["kind"], entry["value"], *numbers, place))  # type: ignore[arg-type]
+        strength = f" ({entry['number']:g} dBm)" if entry["kind"] == "radio" and entry["number"] is not None else ""
+        rows.append((entry["map"], entry["kind"], entry["value"] + strength, *numbers, place))  # type: ignore[arg-type]
     widths = [max(len(row[c]) for row in rows) for c in range(5)]
     return ["  ".join((*(word.ljust(wide) for word, wide in zip(row, widths, strict=False)), row[5])) for row in rows]
 
@@ -213,14 +224,17 @@ def _parse_place(text: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _build_value_options(verb: str) -> tuple[Any, ...]:
+def _build_value_options(verb: str, kinds: Sequence[str]) -> tuple[Any, ...]:
     what = {
         "text": "a text, as of a door sign",
         "tag": "a tag, as tag36h11:7",
         "name": "the name of a room",
         "object": "an object",
+        "radio": "an access point by its address: its strongest reading in each room",
+        "use": "what rooms are for, as office",
+        "area": "an area that rooms are part of, as ward A",
     }
-    return tuple(build_option(f"--{k}", action="append", metavar="VALUE", help=f"{verb} {what[k]}") for k in MARKED_KINDS)
+    return tuple(build_option(f"--{k}", action="append", metavar="VALUE", help=f"{verb} {what[k]}") for k in kinds)
 
 
 MARK = Command(
@@ -230,7 +244,7 @@ MARK = Command(
     'topomerge mark a.tmap --room 7 --text "2.113"',
     (
         build_option("input", metavar="A.tmap", help="the map, which is changed"),
-        *_build_value_options("mark (with --remove, --list: only)"),
+        *_build_value_options("mark (with --remove, --list: only)", MARKED_KINDS),
         build_option(
             "--room", type=parse_whole_number, metavar="N", help="the room whose door it is at, in which it is, or its name"
         ),
@@ -241,7 +255,8 @@ MARK = Command(
             dest="source",
             default=None,
             metavar="FILE",
-            help="take landmarks and names of rooms from a table (.csv), JSON, GeoJSON, IndoorGML or a scene graph",
+            help="take landmarks and names of rooms from a table (.csv), JSON, GeoJSON, IndoorGML, a scene graph, or anything "
+            "else that extract reads",
         ),
         build_option("--remove", action="store_true", default=False, help="take out what the other options say"),
         build_option("--list", action="store_true", default=False, help="print them as a table that can lie beside a scan"),
@@ -254,11 +269,11 @@ MARK = Command(
 FIND = Command(
     "find",
     run_find,
-    "find a door sign, a tag, a name or an object in maps",
+    "find a door sign, a tag, a name, an object or an access point in maps",
     'topomerge find --text "2.113" atlas/',
     (
         build_option("inputs", nargs="+", metavar="MAP", help="maps (.tmap), folders of maps, atlases"),
-        *_build_value_options("find"),
+        *_build_value_options("find", FOUND_KINDS),
         build_json_option("print JSON instead of a table"),
     ),
     paths=("inputs",),

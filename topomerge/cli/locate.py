@@ -19,13 +19,14 @@ from topomerge.cli.console import (
     write_out,
 )
 from topomerge.cli.options import (
-    CLOUD_OPTIONS,
+    READING_NAMES,
+    READING_OPTIONS,
+    SELECTIVE,
     build_json_option,
     build_output_option,
     build_quiet_option,
     check_cloud_options,
     collect_given,
-    collect_reading_options,
     is_map,
     parse_positive,
     parse_share,
@@ -39,7 +40,7 @@ PORT = 7654
 def run_locate(args: argparse.Namespace) -> int:
     """`topomerge locate`: where in an atlas a scan was taken. Status 2: not here, or it can't be told."""
     check_inputs([args.input])
-    check_cloud_options([args.input], args)
+    check_cloud_options([args.input], args, [name for name in READING_NAMES if name not in ("drawing", "text", *SELECTIVE)])
     from dataclasses import replace
 
     from topomerge.fusion.atlas.locate import LOCATE, locate
@@ -50,8 +51,9 @@ def run_locate(args: argparse.Namespace) -> int:
     else:
         print_text(answer.reason)
         rest = answer.places if answer.status != "located" else answer.places[1:]
-        if rest and not args.quiet:
-            print_text("\n".join(f"  {place.describe()}" for place in rest if place.probability >= 0.005))
+        lines = [f"  {place.describe()}" for place in rest if place.probability >= 0.005]
+        if lines and not args.quiet:
+            print_text("\n".join(lines))
     return 0 if answer.status == "located" else 2
 
 
@@ -63,15 +65,19 @@ def _load_scan(args: argparse.Namespace) -> object:
         return load_map_with_landmarks(args.input)
     from topomerge.io.points import read_chunks
 
-    return read_chunks(args.input, **collect_reading_options(args.input, args))
+    return read_chunks(args.input, **collect_given(args, *READING_NAMES))
 
 
 def run_serve(args: argparse.Namespace) -> int:
     """`topomerge serve-locate`: answer until Ctrl-C or a termination."""
+    from dataclasses import replace
+
+    from topomerge.fusion.atlas.locate import LOCATE
     from topomerge.fusion.atlas.locate_server import LocateServer
 
-    with LocateServer(args.atlas, args.host, args.port) as server:
-        print_line(f"serving {args.atlas} on {server.address[0]}:{server.address[1]} (Ctrl-C ends it)")
+    with LocateServer(args.atlas, args.host, args.port, replace(LOCATE, **collect_given(args, "sure"))) as server:
+        if not args.quiet:
+            print_line(f"serving {args.atlas} on {server.address[0]}:{server.address[1]} (Ctrl-C ends it)")
         with guard_printing():
             sys.stdout.flush()
         try:
@@ -130,6 +136,7 @@ def parse_port(text: str) -> int:
     return number
 
 
+SURE = build_option("--sure", type=parse_share, metavar="P", help="probability from which on a place is told (default 0.9)")
 LOCATE = Command(
     "locate",
     run_locate,
@@ -138,12 +145,12 @@ LOCATE = Command(
     (
         build_option("atlas", metavar="ATLAS", help="an atlas (`topomerge atlas add`)"),
         build_option("input", metavar="SCAN", help="one scan, a slice, a frame with depth, a short walk, or a .tmap"),
-        build_option("--sure", type=parse_share, metavar="P", help="probability from which on a place is told (default 0.9)"),
-        *(option for option in CLOUD_OPTIONS if option[0][0] in ("--up", "--unit", "--one-frame")),
+        SURE,
+        *READING_OPTIONS,
         build_json_option("print the answer as JSON: places with pose, covariance and probability"),
         build_quiet_option("print one line only"),
     ),
-    paths=("input",),
+    paths=("input", "atlas"),
     description="Find building, storey, room and pose of a scan in an atlas. Status 2: it was not taken there, or several places "
     "look alike; these are named.",
 )
@@ -156,9 +163,11 @@ SERVE = Command(
         build_option("atlas", metavar="ATLAS", help="an atlas"),
         build_option("--port", type=parse_port, default=PORT, metavar="N", help=f"port (default {PORT}; 0: any free one)"),
         build_option("--host", default="127.0.0.1", metavar="ADDRESS", help="address (default 127.0.0.1: this machine only)"),
-        build_quiet_option("print nothing at the end"),
+        SURE,
+        build_quiet_option(),
     ),
-    description="Answer line JSON over a socket: each line asks with points or the name of a file in --host's machine, and gets "
+    paths=("atlas",),
+    description="Answer line JSON over a socket: each line asks with points or the ranges of a laser, and landmarks, and gets "
     "one line back.",
 )
 BRIDGE = Command(

@@ -43,7 +43,7 @@ from topomerge.cli.merge import MATCH, MERGE
 from topomerge.cli.move import MOVE
 from topomerge.cli.options import build_output_option, build_quiet_option, collect_given, parse_whole_number
 from topomerge.cli.view import STUDIO, VIEW
-from topomerge.errors import make_printable
+from topomerge.errors import InputError, make_printable
 
 KINDS_OF_BUILDINGS = ("office", "openplan", "apartment", "hotel", "hospital", "school", "lab", "house")  # of datasets/buildings
 
@@ -53,12 +53,15 @@ def run_simulate(args: argparse.Namespace) -> int:
     choices = collect_given(args, "seed", "storeys", "overlap", "rooms", "hard")
     if hasattr(args, "sensors"):
         choices["sensors"] = tuple(name.strip() for name in args.sensors.split(",") if name.strip())
+    kinds = [kind.strip() for kind in args.landmarks.split(",") if kind.strip()] or ["signs"] * bool(args.signs)
     with open_output_folder(args.output) as folder:
         check_outputs([folder / "truth.json"])
-        from topomerge.datasets.pairs.simulate import prepare_outputs, simulate_maps
+        from topomerge.datasets.pairs.simulate import SIMULATED_LANDMARKS, prepare_outputs, simulate_maps
 
+        if wrong := [kind for kind in kinds if kind not in SIMULATED_LANDMARKS]:
+            raise InputError(f"--landmarks {wrong[0]}: is none that is simulated; choose from {', '.join(SIMULATED_LANDMARKS)}")
         building, sessions, frame = simulate_maps(args.building, **choices, scale=args.scale == "free")
-        files = prepare_outputs(building, sessions, frame, folder, args.signs)
+        files = prepare_outputs(building, sessions, frame, folder, kinds, args.signs or "good")
         write_all(files)
     if not args.quiet:
         rooms = f"the building {building.name} has {len(building.rooms)} rooms"
@@ -100,7 +103,10 @@ SIMULATE = Command(
             "--signs",
             choices=("good", "poor"),
             default=None,
-            help="signs at doors, too: nearly all, or half of them, misread",
+            help="how well signs and tags are read: nearly all, or half of them, misread; alone: --landmarks signs",
+        ),
+        build_option(
+            "--landmarks", metavar="A,B", default="", help="signs tags wifi: also tables of them beside the clouds (default none)"
         ),
         build_output_option("DIR", "folder for a.ply, b.ply, truth.json, plan.png"),
         build_quiet_option(),
@@ -175,7 +181,7 @@ def build_parser() -> argparse.ArgumentParser:
         allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"topomerge {__version__}")
-    parser.set_defaults(run=None, paths=(), one_input="", commands=COMMANDS, prog=parser.prog)
+    parser.set_defaults(run=None, paths=(), one_input="", several="", commands=COMMANDS, prog=parser.prog)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     for command in COMMANDS:
         _add(commands, command)
@@ -194,7 +200,9 @@ def _add(commands: Any, command: Command) -> None:
     for flags, settings in command.arguments:
         parser.add_argument(*flags, **settings)
     parser.add_argument("-v", "--verbose", action="count", default=0, help="print more; twice: also tracebacks")
-    parser.set_defaults(run=command.run, paths=command.paths, one_input=command.one_input, prog=parser.prog)
+    several = next((flags[0] for flags, settings in command.arguments if settings.get("nargs") in ("*", "+")), "")
+    about = {"run": command.run, "paths": command.paths, "one_input": command.one_input, "several": several}
+    parser.set_defaults(**about, prog=parser.prog)
 
 
 def _collect_paths(args: argparse.Namespace) -> tuple[list[str], list[str]]:
@@ -284,7 +292,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = build_parser()
     try:
         args, unknown = parser.parse_known_args(_join_signed_values(sys.argv[1:] if argv is None else argv))
-        if unknown:
+        if unknown and args.several and not any(word.startswith("-") for word in unknown):
+            setattr(args, args.several, [*getattr(args, args.several), *unknown])  # files behind the options
+        elif unknown:
             one_input = "" if unknown[0].startswith("-") or not args.one_input else f": {args.one_input}"
             parser.prog = args.prog  # so that the help of the command is named
             parser.error(f"unrecognized arguments: {' '.join(unknown)}{one_input}")

@@ -67,22 +67,25 @@ def _parse_files(words: Sequence[str], frames: Mapping[int, object]) -> dict[int
     return named
 
 
-def _find_file(name: str) -> Path:
+def _find_file(name: str, how: str = "as NUMBER=FILE") -> Path:
     """The file to write again: of a folder of scans its trajectory.
+
+    Args:
+        how: another file is named, for messages.
 
     Raises:
         InputError: a map, or a folder without a trajectory.
     """
     path = Path(name)
     if path.suffix.lower() == ".tmap":
-        raise InputError(f"{path}: is a map; name the file that it was made of, as NUMBER=FILE")
+        raise InputError(f"{path}: is a map; name the file that it was made of, {how}")
     if not path.is_dir():
         return path
     from topomerge.io.scan_folder import find_scans, find_trajectory
 
     found = find_trajectory(path, find_scans(path)[0].parent)
     if found is None:
-        raise InputError(f"{path}: is a folder without a trajectory; name the file with its poses, as NUMBER=FILE")
+        raise InputError(f"{path}: is a folder without a trajectory; name the file with its poses, {how}")
     return found
 
 
@@ -96,7 +99,7 @@ def plan_merge(result: MergeResult, args: argparse.Namespace, folder: Path) -> t
     for k, placement in result.placements.items():
         name = args.inputs[k]
         try:
-            path = _find_file(name)
+            path = _find_file(name, f"by `topomerge move {folder} {k}=FILE -o moved`")
             if find_format(path) is None:
                 raise InputError(f"{name}: has no form in which it could be written again; take its points by --points")
             motion = build_file_motion(placement, result.maps[k].levelling, result.maps[0].levelling)

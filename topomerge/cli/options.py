@@ -81,23 +81,34 @@ def check_descriptor(args: argparse.Namespace) -> None:
             build_embedder(args.descriptor, steps)
 
 
-def check_cloud_options(paths: Sequence[str], args: argparse.Namespace) -> None:
-    """Refuse `CLOUD_OPTIONS` where no input is a cloud.
+def check_cloud_options(
+    paths: Sequence[str], args: argparse.Namespace, names: Sequence[str] = ("voxel_size", "up", "unit", "sensor")
+) -> None:
+    """Refuse `CLOUD_OPTIONS` where no input is a cloud, and those for folders, pictures or bags where none is one.
 
     Raises:
-        InputError: names the first of them; or the files of one frame, where no input is a folder.
+        InputError: names the first of them.
     """
-    useless = collect_given(args, "voxel_size", "up", "unit", "sensor")
+    useless = collect_given(args, *names)
     if useless and all(is_map(path) for path in paths):
         name = next(iter(useless)).replace("_", "-")
         raise InputError(f"--{name}: is for clouds, of no use to a .tmap; give the scan that it was made of, or leave it out")
-    if collect_given(args, "one_frame") and not any(Path(path).is_dir() for path in paths):
-        raise InputError("--one-frame: is for folders of files; give such a folder, or leave it out")
+    for name, (able, wanted, _) in SELECTIVE.items():
+        if hasattr(args, name) and not any(is_taker(path, name) for path in paths):
+            raise InputError(f"--{name.replace('_', '-')}: is for {able}; give such a {wanted}, or leave it out")
 
 
 def collect_reading_options(path: str, args: argparse.Namespace) -> dict[str, Any]:
-    """Collect the `CLOUD_OPTIONS` of reading one input, of which some are for folders only."""
-    return collect_given(args, "up", "unit", "text", "tag_size", *(["one_frame"] if Path(path).is_dir() else []))
+    """Collect the `CLOUD_OPTIONS` of reading one input, of which some are for folders, pictures or bags only."""
+    return collect_given(args, "up", "unit", "text", "tag_size", *(name for name in SELECTIVE if is_taker(path, name)))
+
+
+def is_taker(path: str, name: str) -> bool:
+    """Return whether an input takes an option of `SELECTIVE`."""
+    place, suffixes = Path(path), SELECTIVE[name][2]
+    if not place.is_dir():
+        return place.suffix.lower() in suffixes
+    return not suffixes or (name == "topic" and any(file.suffix.lower() in suffixes for file in place.iterdir()))
 
 
 def is_map(path: str) -> bool:
@@ -225,12 +236,66 @@ TEXT = (
         help="side of the black square of the tags on pictures, m: they are placed by it (default: by depth)",
     ),
 )
+RESOLUTION = build_option("--resolution", type=parse_positive, metavar="R", help="m per pixel of a plain image of a floor plan")
+PAGE = build_option(
+    "--page",
+    type=parse_count,
+    metavar="N",
+    help="page of a PDF, from 1 (default: the only one with content), or plan of a picture",
+)
+TOPIC = build_option("--topic", metavar="NAME", help="topic to read, where a bag has points of several sensors, or maps as well")
+READING_OPTIONS = (  # all that readers of a single input take
+    UP,
+    UNIT,
+    ONE_FRAME,
+    *TEXT,
+    build_option("--scale", type=parse_positive, metavar="S", help="multiply coordinates by this (default 1)"),
+    RESOLUTION,
+    build_option(
+        "--no-drawing",
+        dest="drawing",
+        action="store_const",
+        const=False,
+        help="dark pixels of a plain image are walls, also where it is a page with a drawn plan",
+    ),
+    PAGE,
+    build_option("--extrude", type=parse_positive, metavar="H", help="m of wall height for 2D maps (default 2.5)"),
+    build_option("--ceiling", action="store_true", help="close 2D maps with a ceiling"),
+    build_option(
+        "--spacing",
+        type=parse_positive,
+        metavar="D",
+        help="m between points on surfaces of meshes, models and 2D maps, or at the finest level of an octree",
+    ),
+    build_option("--doors", action="store_true", help="keep the door leaves of building models, where doors are modelled shut"),
+    build_option(
+        "--poses",
+        metavar="TRAJECTORY",
+        help="where scans were taken: a KITTI or TUM file, or a topic of the bag (default: a trajectory beside the scans; "
+        "in a bag tf, then odometry)",
+    ),
+    TOPIC,
+)
+READING_NAMES = (
+    *("scale", "resolution", "extrude", "spacing", "tag_size", "up", "unit", "drawing", "ceiling", "doors", "poses", "topic"),
+    *("one_frame", "text", "page"),
+)
+PICTURES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff", ".pdf")
+SELECTIVE = {  # of `CLOUD_OPTIONS`: inputs that take it, in words and as suffixes; none: folders
+    "one_frame": ("folders of files", "folder", ()),
+    "resolution": ("pictures, PDF and SVG", "file", (*PICTURES, ".svg")),
+    "page": ("pictures and PDF", "file", PICTURES),
+    "topic": ("ROS bags", "bag", (".bag", ".db3", ".mcap")),
+}
 CLOUD_OPTIONS = (
     build_option("--voxel-size", type=parse_positive, metavar="E", help="edge length of the cells of a cloud, m (default 0.1)"),
     UP,
     UNIT,
     ONE_FRAME,
     *TEXT,
+    RESOLUTION,
+    PAGE,
+    TOPIC,
     build_option(
         "--sensor",
         choices=SENSORS,

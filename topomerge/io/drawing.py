@@ -28,6 +28,7 @@ USUAL_SCALE = 25.0  # px/m, where none is known
 WALL_NEAR = 0.5  # m from a room: what lies farther off is no wall of the building
 GAP = 3  # px of walls that the network missed
 SQUARE, LEAST_STRAIGHT = 7, 0.3  # degrees; of the outline of walls, at least: of a ring .17, of plans .38 to .9
+INK_IN_WALLS, STRAIGHT_PLAN = 0.5, 0.6  # of a page that may be a turned grid: of 30 grids one has .59 and .55, the others less
 TREAD, FEWEST_TREADS = (0.2, 0.37), 6  # m between two
 TREAD_WIDTH, TREAD_STRONG = (0.4, 4.5), 15.0  # m; levels a pixel: tiles are paler
 WALLED = 0.4  # of a room's outline is wall or door, at least
@@ -161,6 +162,14 @@ def find_structure(probability: Array, zoom: float, scale: float | None) -> Pars
     near = ndimage.distance_transform_edt(~(rooms | door)) <= WALL_NEAR * known
     free = rooms | door
     return ParsedDrawing(occupied & near, free, door, window & near, np.where(free, probability[..., DOOR], 0), zoom)
+
+
+def is_plan(page: DrawnPage) -> bool:
+    """Return whether the ink of a page is straight walls, as in a plan; turned round, the floor of a robot's grid is not."""
+    drawing = parse_drawing(page.picture)
+    ink = resize_picture(page.picture, drawing.zoom)[..., 0] < 128
+    walls = (drawing.occupied | drawing.door)[ink]
+    return bool(walls.size and walls.mean() >= INK_IN_WALLS and measure_straight_share(drawing.occupied) >= STRAIGHT_PLAN)
 
 
 def find_treads(picture: Array, resolution: float) -> Array:

@@ -51,11 +51,13 @@ class DrawnPage:
         picture: (h, w, 3) uint8, dark lines on light paper.
         matrix: (3, 3), takes its pixels (column, row, 1) to those of the picture that it was found in.
         mended: what was done to it, in words.
+        doubtful: it was turned although it has few levels, as a robot's grid (`drawing.is_plan`).
     """
 
     picture: Array
     matrix: Array = field(default_factory=lambda: np.eye(3))
     mended: tuple[str, ...] = ()
+    doubtful: bool = False
 
 
 def find_page(picture: Array) -> DrawnPage | None:
@@ -73,7 +75,8 @@ def find_page(picture: Array) -> DrawnPage | None:
         picture, matrix = cut_sheet(picture, corners)
         mended.append("cut out of what is around its page")
         photograph = is_photograph(picture)
-    if not few and is_blueprint(picture):
+    turned = is_blueprint(picture) and not (few and is_robot_grid(255 - picture))
+    if turned:
         picture = invert_picture(picture)
         mended.append("turned into dark lines on light paper")
     if photograph and (lit := equalise_light(picture)) is not None:
@@ -85,7 +88,7 @@ def find_page(picture: Array) -> DrawnPage | None:
         picture, step = warp_picture(picture, step)
         matrix = matrix @ step
         mended.append("straightened by its lines")
-    return DrawnPage(picture, matrix, tuple(mended))
+    return DrawnPage(picture, matrix, tuple(mended), few and turned)
 
 
 def is_robot_grid(picture: Array) -> bool:

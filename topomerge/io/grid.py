@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError
-from topomerge.io.drawing import NAME_HEIGHT, TracedDrawing, build_name_landmarks, build_stairs_landmarks, trace_drawing
+from topomerge.io.drawing import NAME_HEIGHT, TracedDrawing, build_name_landmarks, build_stairs_landmarks, is_plan, trace_drawing
 from topomerge.io.drawn_page import find_page
 from topomerge.io.drawn_storeys import DrawnStorey, find_storeys
 from topomerge.io.grey_levels import GreyLevels, find_grey_levels, find_washed_walls, is_clear_cut, is_unknown_grey
@@ -37,6 +37,7 @@ PIXELS_LOOKED_AT = 4_000_000  # of a larger picture every second, third ... pixe
 BODY_RADIUS = 0.25  # m; floor where no body fits is no floor but the lines of walls
 LEAST_DOORWAY, DOOR_STEP = 0.05, 0.06  # probability of a door; m between places of it, at most
 SLAB = 0.3  # m between the walls of a drawn storey and the next floor
+INVERT = "; if it shows light lines on dark paper, invert its colours"
 NARROW, WIDE = 0.1, 0.3  # of the pixels of walls, at most, and of floor, at least, that lie deeper than that in what is like them
 
 
@@ -136,18 +137,20 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     if (pages := count_pages(path)) > 1:
         wanted = f"{path.name}: has {pages} pages, and the first was read; save the others as files of their own"
         yield Piece(np.empty((0, 3)), warnings=(wanted,), done=0.0)
-    if path.suffix.lower() in (".yaml", ".yml"):
+    is_yaml = path.suffix.lower() in (".yaml", ".yml")
+    page = find_page(read_picture(path)) if options.drawing and not is_yaml else None
+    if is_yaml:
         plan = read_yaml(path)
         if options.resolution is not None:
             raise InputError(f"{path}: states its own resolution of {plan.resolution:g} m; leave --resolution out")
         occupied, free, doubts = read_pixels(path, plan)
-    elif options.drawing and (page := find_page(read_picture(path))) is not None:
+    elif page is not None and (not page.doubtful or is_plan(page)):
         traced = trace_drawing(path, page, options.resolution, text=options.text)
         yield from build_drawn_pieces(path, traced, options, options.page)
         return
     elif options.resolution is None:
         companion = next((b for b in (path.with_suffix(".yaml"), path.with_suffix(".yml")) if b.is_file()), None)
-        hint = f", or read {companion.name} instead" if companion else ""
+        hint = f", or read {companion.name} instead" if companion else INVERT if page is not None else ""
         raise InputError(f"{path}: an image does not say how large a pixel is; give --resolution in metres a pixel{hint}")
     else:
         plan = Plan(path, options.resolution)

@@ -22,6 +22,7 @@ from topomerge.types import LANDMARK_DTYPE, LANDMARK_KINDS, MOST_LANDMARKS, Arra
 COLUMNS = ("kind", "value", "x", "y", "z", "sigma", "room", "storey", "confidence", "number", "group", "time")
 WHOLE = ("room", "storey", "group")  # columns of whole numbers, -1 where nothing is known
 REAL = ("x", "y", "z", "sigma", "number", "time")  # columns of numbers, nan where nothing is known
+NUMERIC = (*REAL, *WHOLE, "confidence")
 RADIO_TABLE = "radio.csv"  # `io.radio_csv`
 TABLE_NAME = "landmarks.csv"  # in a folder of scans; beside a file its stem and a dot stand before it
 LARGEST_TABLE = 1 << 28  # bytes: two million lines
@@ -36,32 +37,58 @@ def is_landmark_file(path: Path) -> bool:
 
 def find_landmark_file(path: Path) -> Path | None:
     """Find the table of landmarks beside a file, or in a folder of scans; None where there is none."""
-    place = path / TABLE_NAME if path.is_dir() else path.with_name(f"{path.stem}.{TABLE_NAME}")
-    return place if place.is_file() and place != path else None
+    return _find_table(path, TABLE_NAME)
 
 
-def find_radio_file(path: Path) -> Path | None:
-    """Find the table of readings of radio beside a file, or in a folder of scans; None where there is none."""
-    place = path / RADIO_TABLE if path.is_dir() else path.with_name(f"{path.stem}.{RADIO_TABLE}")
-    return place if place.is_file() and place != path else None
+def _find_table(path: Path, name: str) -> Path | None:
+    places = [path / name] if path.is_dir() else [path.with_name(f"{start}.{name}") for start in (path.stem, path.name)]
+    return next((place for place in places if place.is_file() and place != path), None)
 
 
-def read_tables_beside(path: Path, poses: str | None = None) -> list[Landmarks]:
-    """Read the tables beside a scan: of landmarks, and of readings of radio.
+def read_tables_beside(path: Path, poses: str | None, suffixes: Sequence[str]) -> tuple[list[Landmarks], list[str]]:
+    """Read the tables beside a scan: of landmarks, and of readings of radio. One that is named as in a folder of scans belongs to
+    the only file of its folder.
 
     Args:
         poses: the trajectory that the user names, for radio.
+        suffixes: of files that can be read.
+
+    Returns:
+        What the tables hold, and warnings of those that may belong to another file.
 
     Raises:
         InputError: as `read_landmark_file` and `radio_csv.read_radio_beside`.
     """
-    landmarks, radio = find_landmark_file(path), find_radio_file(path)
-    found = [] if landmarks is None else [read_landmark_file(landmarks)]
-    if radio is not None:
-        from topomerge.io.radio_csv import read_radio_beside
+    from topomerge.io.radio_csv import read_radio_beside
 
-        found.append(read_radio_beside(radio, path, poses))
-    return found
+    readers = {TABLE_NAME: read_landmark_file, RADIO_TABLE: lambda table: read_radio_beside(table, path, poses)}
+    found, told = [], []
+    for name, read in readers.items():
+        table, shared = _find_table(path, name), path.with_name(name)
+        if table is None and shared.is_file() and shared != path and not path.is_dir():
+            if _is_alone(path, suffixes):
+                table = shared
+            else:
+                told.append(
+                    f"{shared}: lies beside several files and was not read; name it {path.stem}.{name} if it is this one's"
+                )
+        if table is not None:
+            found.append(read(table))
+            if lost := count_lost(found[-1]):
+                told.append(f"{table}: {lost} landmark{'s' * (lost != 1)} without a place, a room and a storey; say where")
+    return found, told
+
+
+def count_lost(landmarks: Landmarks) -> int:
+    """Count the signs, tags, objects and names that have neither a place nor a room nor a storey."""
+    table = landmarks.table[landmarks.is_kind("text", "tag", "object", "name")]
+    return int((np.isnan(table["position"]).any(axis=1) & (table["room"] < 0) & (table["storey"] < 0)).sum())
+
+
+def _is_alone(path: Path, suffixes: Sequence[str]) -> bool:
+    """Is nothing else in its folder that can be read, but for its companions and texts?"""
+    others = [p for p in path.parent.iterdir() if p.suffix.lower() in suffixes and p.suffix.lower() != ".txt"]
+    return all(p.stem == path.stem or is_landmark_file(p) for p in others)
 
 
 def read_landmark_file(path: Path) -> Landmarks:
@@ -93,7 +120,9 @@ def read_landmark_file(path: Path) -> Landmarks:
         if len(row) != len(names):
             raise InputError(f"{path}, line {line}: has {len(row)} columns, not {len(names)} as the first line; correct it")
     lines, rows = [line for line, _ in numbered], [row for _, row in numbered]
-    columns = dict(zip(names, zip(*rows, strict=True), strict=True)) if rows else {}
+    columns: dict[str, Sequence[str]] = dict(zip(names, zip(*rows, strict=True), strict=True)) if rows else {}
+    if reader.dialect.delimiter != ",":  # decimal commas
+        columns |= {name: [text.replace(",", ".") for text in columns[name]] for name in NUMERIC if name in columns}
     return _build_table(path, lines, columns)
 
 
@@ -109,7 +138,7 @@ def _check_names(path: Path, names: Sequence[str]) -> None:
 def _build_table(path: Path, lines: Sequence[int], columns: Mapping[str, Sequence[str]]) -> Landmarks:
     count = len(lines)
     table = np.zeros(count, LANDMARK_DTYPE)
-    numbers = {name: _parse_reals(path, lines, name, columns.get(name, ())) for name in (*REAL, "confidence", *WHOLE)}
+    numbers = {name: _parse_reals(path, lines, name, columns.get(name, ())) for name in NUMERIC}
     kinds = [kind.strip().lower() for kind in columns.get("kind", ())]
     numbered = {kind: k for k, kind in enumerate(LANDMARK_KINDS)}
     _require(

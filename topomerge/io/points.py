@@ -239,6 +239,7 @@ FORMATS = (
     Format("an SVG drawing", "svg", (".svg",), fixed=True, extra="svg", takes=DRAWN),
     Format("a floor plan", "grid", (".yaml", ".yml", *PICTURES), fixed=True, takes=(*DRAWN, "page")),
 )
+ADVICE = {".dwg": "save it as DXF", **dict.fromkeys((".webp", ".gif", ".heic", ".heif", ".avif"), "save it as PNG")}
 SCAN_FOLDER = Format("a folder of scans", "scan_folder", (), takes=("poses",))
 TILES_FOLDER = Format("a folder of files of one frame", "tiles", (), takes=("one_frame",))
 RGBD_FOLDER = Format("a folder of RGB-D images", "rgbd", (), takes=("poses",))
@@ -304,9 +305,10 @@ def read_chunks(
         warnings.append(f"{file_format.name} states its own unit and up axis: --unit and --up are not applied")
         reading = replace(reading, unit=None, up=None)
     up = None if file_format.fixed else reading.up or file_format.up
-    gatherer = Gatherer(str(path), up, reading.factor, chunk, warnings)
+    tables, ignored = read_tables_beside(path, reading.poses, list_suffixes())
+    gatherer = Gatherer(str(path), up, reading.factor, chunk, warnings + ignored)
     pieces = _iter_pieces(path, file_format, reading)
-    companions = [Piece(np.empty((0, 3)), landmarks=found) for found in read_tables_beside(path, reading.poses)]
+    companions = [Piece(np.empty((0, 3)), landmarks=found) for found in tables]
     pieces = itertools.chain(companions, pieces)
     return _iter_chunks(path, pieces, gatherer, progress)
 
@@ -327,8 +329,10 @@ def detect_format(path: Path) -> Format:
             raise InputError(f"{path}: is a map already; give the scan that it was made of, or see it with `topomerge info`")
         if path.suffix.lower() == ".data" and path.with_suffix(".posegraph").is_file():
             raise InputError(f"{path}: belongs to {path.stem}.posegraph; give that file, this one is read with it")
-        readable = " ".join(s[1:] for s in list_suffixes())
-        raise InputError(f"{path}: unknown suffix {path.suffix or '(none)'}; rename or export it as one of {readable}")
+        readable = f"rename or export it as one of {' '.join(s[1:] for s in list_suffixes())}"
+        if path.with_name(f"{path.name}.posegraph").is_file():
+            readable = f"give {path.name}.posegraph"
+        raise InputError(f"{path}: unknown suffix {path.suffix or '(none)'}; {ADVICE.get(path.suffix.lower(), readable)}")
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: is no regular file (a pipe or a device); give the name of a file")
     try:

@@ -20,7 +20,7 @@ from topomerge.io import valetudo
 from topomerge.io.json_map import LARGEST_MAP_JSON, find_graph_landmarks, is_scene_graph, load_json_map
 from topomerge.io.landmarks import parse_landmarks, read_landmark_file
 from topomerge.io.piece import build_damage_error
-from topomerge.types import Landmarks
+from topomerge.types import LANDMARK_KINDS, Landmarks
 
 NAME_KEYS = ("name", "ref", "number", "long_name")  # of a polygon's properties, in this order
 STOREY_KEYS = ("storey", "level")
@@ -46,10 +46,21 @@ def load_landmark_source(path: Path) -> Landmarks:
     elif suffix in (".json", ".geojson"):
         found = _find_in_json(path, load_json_map(path))
     else:
-        raise InputError(f"{path}: no landmarks can be read of it; give a .csv, .json, .geojson or .gml (docs/landmarks.md)")
+        found = _read_scan(path)
     if not len(found):
         raise InputError(f"{path}: holds no landmarks and no names of rooms; give another file")
     return found
+
+
+def _read_scan(path: Path) -> Landmarks:
+    """What comes with the points of a scan or a model: spaces of IFC, labels of RTAB-Map, objects of USDZ ..."""
+    from topomerge.io.points import list_suffixes, read_chunks
+
+    if path.suffix.lower() not in list_suffixes():
+        known = "a .csv, .json, .geojson or .gml, or what `topomerge extract` reads"
+        raise InputError(f"{path}: no landmarks can be read of it; give {known} (docs/landmarks.md)")
+    found = [chunk.landmarks for chunk in read_chunks(path)][-1]  # they come with the last
+    return Landmarks() if found is None else found
 
 
 def _find_in_json(path: Path, about: Any) -> Landmarks:
@@ -107,7 +118,8 @@ def _check_metres(path: Path, about: Mapping[str, Any], bounds: Any) -> None:
 
 
 def _iter_cells(path: Path) -> Iterator[dict[str, Any]]:
-    """Rows of the names of cells of IndoorGML."""
+    """Rows of the landmarks of IndoorGML (states of the layer that topomerge writes), and of the names of cells that they do not
+    say."""
     if path.stat().st_size > LARGEST_MAP_JSON:
         raise InputError(f"{path}: has more than {LARGEST_MAP_JSON >> 20} MB, too many for IndoorGML; give a part of it")
     text = path.read_bytes()
@@ -115,12 +127,25 @@ def _iter_cells(path: Path) -> Iterator[dict[str, Any]]:
         raise InputError(f"{path}: declares entities, which IndoorGML has no use for; export it again")
     try:
         root = xml.fromstring(text)
-        points = {_get_id(state): _find_middle(state) for state in root.iter() if _get_name(state) == "State"}
+        states = [state for state in root.iter() if _get_name(state) == "State"]
+        points = {_get_id(state): _find_middle(state) for state in states}
+        own = [row for state in states if (row := _read_landmark(state))]
+        yield from own
+        given = {(f"C{row.get('room')}", row["value"]) for row in own}
         for cell in root.iter():
-            if _get_name(cell).endswith("Space") and (row := _read_cell(cell, points)):
+            row = _read_cell(cell, points) if _get_name(cell).endswith("Space") else None
+            if row and (_get_id(cell), row["value"]) not in given:
                 yield row
     except (xml.ParseError, ValueError, RecursionError, LookupError) as error:
         raise build_damage_error(path, "IndoorGML", error) from error
+
+
+def _read_landmark(state: Any) -> dict[str, Any] | None:
+    texts = {_get_name(part): part.text or "" for part in state}
+    facts = dict(re.findall(r'(\w+)="([^"]*)"', texts.get("description", "")))
+    if facts.get("kind") not in LANDMARK_KINDS:
+        return None
+    return {**facts, "value": texts.get("name", "").strip(), "position": _find_middle(state)}
 
 
 def _read_cell(cell: Any, points: Mapping[str, Any]) -> dict[str, Any] | None:

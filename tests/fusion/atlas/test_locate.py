@@ -21,7 +21,7 @@ from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.extraction.landmarks import add_landmarks
 from topomerge.fusion.atlas.folder import Entry, StoredAtlas, read_atlas
-from topomerge.fusion.atlas.locate import LOCATE, Location, Query, find_places, locate, prepare_query
+from topomerge.fusion.atlas.locate import LOCATE, Location, Place, Query, find_places, locate, prepare_query
 from topomerge.fusion.atlas.place_index import INDEX_FOLDER, PlaceIndex, open_index
 from topomerge.fusion.atlas.store import add, remove
 from topomerge.landmarks.map_search import build_landmark_index
@@ -223,6 +223,12 @@ def test_the_command_tells_and_exits(built: Path, tmp_path: Path, capsys: pytest
     assert cli(["locate", str(built), small, "-q"]) == 2
     assert cli(["locate", str(tmp_path / "none"), scan]) == 1
     assert "no such folder" in capsys.readouterr().err
+
+
+def test_a_place_without_a_room_and_an_angle_of_nought() -> None:
+    place = Place("a", 0, 0, -1, Sim3(-0.001), (0.0, 0.0, 0.0), ((0.0,) * 3,) * 3, 0.9)
+    assert "no room" in place.describe() and "facing 0 degrees" in place.describe()
+    assert Location("located", (place,), 1, 0.1, "").serialise()["places"][0]["room"] is None
 
 
 def test_all_probabilities_sum_to_one() -> None:

@@ -51,6 +51,15 @@ def test_a_laser_is_read_as_ros_writes_it() -> None:
     assert cloud.poses is not None and np.allclose(cloud.poses[0, :3, 3], [0, 0, 0.4])
 
 
+def test_landmarks_come_with_the_points() -> None:
+    sign = {"kind": "text", "value": "2.113", "position": [1, 2, 1.5]}
+    cloud = read_request({"points": [[0, 0, 0]], "landmarks": [sign, {"kind": "radio", "value": "aa:bb", "number": -60}]})
+    assert cloud.landmarks is not None and cloud.landmarks.get_values().tolist() == ["2.113", "aa:bb"]
+    assert cloud.landmarks.table["position"][0].tolist() == [1, 2, 1.5] and cloud.landmarks.table["number"][1] == -60
+    laser = {"ranges": [1.0], "angle_max": 3.0, "intensities": [], "header": {}}  # a LaserScan as it comes
+    assert read_request(laser).landmarks is None
+
+
 HOSTILE = [
     b"\xff\xfe\x00 no json\n",
     b"[1, 2]\n",
@@ -66,6 +75,11 @@ HOSTILE = [
     b'{"id": {"deep": 1}}\n',
     b"[" * 5000 + b"\n",
     b'{"points": [[1e300, 1e300, 1e300]]}\n',
+    b'{"points": [[1, 2, 3]], "unit": "mm"}\n',
+    b'{"points": [[1, 2, 3]], "id": 1.5}\n',
+    b'{"points": [[1, 2, 3]], "landmarks": {"kind": "text"}}\n',
+    b'{"points": [[1, 2, 3]], "landmarks": [{"kind": "smell", "value": "x"}]}\n',
+    b'{"points": [[1, 2, 3]], "landmarks": [{"kind": "text", "value": "x", "position": [1e300, 0, 0]}]}\n',
 ]
 
 

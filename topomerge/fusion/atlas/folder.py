@@ -258,6 +258,8 @@ def read_atlas(folder: str | Path) -> StoredAtlas:
         InputError: no such folder, no atlas, or damaged.
     """
     folder = Path(folder)
+    if folder.is_file():
+        raise InputError(f"{folder}: is a file; give the folder of an atlas, and before other files")
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; make an atlas with `topomerge atlas add {folder} MAP ...`")
     finish_change(folder)

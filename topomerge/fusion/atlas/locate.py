@@ -119,8 +119,9 @@ class Place:
         """Describe it in a line."""
         room = f"room {self.room}" + (f" ({self.room_name})" if self.room_name else "") if self.room >= 0 else "no room"
         x, y, _ = self.at
+        yaw = round(float(np.degrees(self.pose.yaw)))  # a whole number: there is no -0
         return (
-            f"{self.map}, storey {self.storey}, {room}, at ({x:.2f}, {y:.2f}) m, facing {np.degrees(self.pose.yaw):.0f} degrees, "
+            f"{self.map}, storey {self.storey}, {room}, at ({x:.2f}, {y:.2f}) m, facing {yaw} degrees, "
             f"probability {self.probability:.2f}"
         )
 
@@ -146,9 +147,15 @@ class Location:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def serialise(self) -> dict[str, Any]:
-        """As plain values, for JSON."""
+        """As plain values, for JSON; no room is None."""
         places = [
-            {**asdict(p), "pose": p.pose.matrix.round(6), "yaw_deg": round(float(np.degrees(p.pose.yaw)), 3)} for p in self.places
+            {
+                **asdict(p),
+                "room": p.room if p.room >= 0 else None,
+                "pose": p.pose.matrix.round(6),
+                "yaw_deg": round(float(np.degrees(p.pose.yaw)), 3),
+            }
+            for p in self.places
         ]
         listing = {**asdict(self), "places": places, "format": 1}
         plain: dict[str, Any] = convert_to_plain(listing)

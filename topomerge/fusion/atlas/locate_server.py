@@ -4,6 +4,7 @@
 |---|---|
 | `{"points": [[x, y, z], …], "place": [x, y, z], "id": …}` | `{"id": …, "status": "located", …}` (`Location.serialise`) |
 | `{"ranges": […], "angle_min": …, "angle_increment": …, "height": …}` | the same, of a slice of a laser |
+| either, and `"landmarks": [{"kind": "text", "value": "2.113", "position": [x, y, z]}, …]` | the same, by these, too |
 | anything else | `{"id": …, "error": "…"}`; the connection stays open unless a line is too long |
 """
 
@@ -21,9 +22,10 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.locate import locate
+from topomerge.fusion.atlas.locate import LOCATE, LocateSettings, locate
 from topomerge.fusion.atlas.place_index import PlaceIndex, open_index
-from topomerge.types import Array, PointCloud
+from topomerge.io.landmarks import parse_landmarks
+from topomerge.types import Array, Landmarks, PointCloud
 
 LONGEST_LINE = 16 << 20  # bytes
 MOST_CLIENTS = 32
@@ -41,13 +43,17 @@ class LocateServer:
     Args:
         atlas: a folder, or an index.
         host, port: where it listens; port 0: any free one.
+        settings: of `locate`.
 
     Raises:
         InputError: no atlas, or the address is taken.
     """
 
-    def __init__(self, atlas: str | Path | PlaceIndex, host: str = "127.0.0.1", port: int = 0) -> None:
+    def __init__(
+        self, atlas: str | Path | PlaceIndex, host: str = "127.0.0.1", port: int = 0, settings: LocateSettings = LOCATE
+    ) -> None:
         self.index = atlas if isinstance(atlas, PlaceIndex) else open_index(atlas)
+        self.settings = settings
         self.answered = 0
         self._stopped = threading.Event()
         self._clients: dict[socket.socket, tuple[bytearray, float]] = {}
@@ -134,7 +140,7 @@ class LocateServer:
             if not isinstance(asked, dict):
                 raise InputError("a line must be a JSON object with points or ranges")
             name = asked.get("id") if isinstance(asked.get("id"), str | int) else None
-            answer = locate(self.index, read_request(asked)).serialise()
+            answer = locate(self.index, read_request(asked), self.settings).serialise()
             self.answered += 1
         except InputError as error:
             answer = {"error": str(error)[:500]}
@@ -161,6 +167,11 @@ def read_request(asked: Mapping[str, Any]) -> PointCloud:
     Raises:
         InputError: names the key.
     """
+    wrong = [key for key in asked if key not in (*KEYS, *LASER, *UNUSED_OF_ROS)]
+    if wrong:
+        raise InputError(f"{wrong[0][:40]}: is no key; the keys are {', '.join((*KEYS, *LASER))}")
+    if not isinstance(asked.get("id"), str | int | None):
+        raise InputError("id: must be a whole number or a string")
     if "ranges" in asked:
         points, place = read_laser(asked), np.zeros(3)
         place[2] = points[0, 2] if len(points) else 0.0
@@ -176,7 +187,22 @@ def read_request(asked: Mapping[str, Any]) -> PointCloud:
     if poses is not None:
         poses[0, :3, 3] = place
     of = None if poses is None else np.zeros(len(points), np.int32)
-    return PointCloud(points.astype(np.float32), poses=poses, pose_of=of, upright=True)
+    return PointCloud(points.astype(np.float32), poses=poses, pose_of=of, upright=True, landmarks=read_landmarks(asked))
+
+
+def read_landmarks(asked: Mapping[str, Any]) -> Landmarks | None:
+    """Read the landmarks of a request; None of one that has none.
+
+    Raises:
+        InputError: names the key.
+    """
+    rows = asked.get("landmarks", [])
+    if not isinstance(rows, list):
+        raise InputError('landmarks: must be a list such as [{"kind": "text", "value": "2.113", "position": [x, y, z]}]')
+    found = parse_landmarks(rows, "landmarks")
+    if (np.abs(found.table["position"]) >= FARTHEST).any():
+        raise InputError(f"landmarks: a position lies {FARTHEST:g} m away or more; send m in the frame of the points")
+    return found if len(found) else None
 
 
 def read_laser(asked: Mapping[str, Any]) -> Array:
@@ -202,6 +228,8 @@ def read_laser(asked: Mapping[str, Any]) -> Array:
     return np.column_stack([x, y, np.full(int(seen.sum()), height)])
 
 
+KEYS = ("points", "place", "landmarks", "id", "ranges")
+UNUSED_OF_ROS = ("header", "angle_max", "time_increment", "scan_time", "intensities")  # of a LaserScan as it comes
 LASER = {"angle_min": 0.0, "angle_increment": np.pi / 180, "range_min": 0.05, "range_max": 60.0, "height": 0.3}
 
 

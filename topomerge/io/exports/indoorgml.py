@@ -5,7 +5,8 @@ them, under its lintel.
 
 Each room is a CellSpace, whose solid is its floor drawn up to its ceiling, and a State; each door or opening a CellSpaceBoundary
 and a Transition; each flight of stairs or ramp a Transition. A window is a CellSpaceBoundary without one, as nobody walks
-through; it leaves no gap in its wall. Source: OGC 19-011r4 and its schema indoorgmlcore.xsd.
+through; it leaves no gap in its wall. Landmarks are the States of a layer of their own, as the standard has it for sensors and
+tags: `gml:name` is the value, the description says the kind and the room. Source: OGC 19-011r4 and its schema indoorgmlcore.xsd.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 import shapely
 
 from topomerge.io.exports import replace_forbidden, write_xml
+from topomerge.io.landmarks import serialise_landmarks
 from topomerge.structure.floors import compute_jambs, find_inside_point, is_flight, measure_room_levels
 from topomerge.structure.plan_structure import PlanStructure, build_plan_structure
 from topomerge.structure.walls import build_wall_polygon
@@ -214,7 +216,8 @@ def _add_window(member: Any, k: int, window: Any, pane: Any) -> None:
 
 def _add_graph(root: Any, map: TopometricMap, points: list[Array]) -> None:
     graph = _add_element(_add_element(root, "multiLayeredGraph"), "MultiLayeredGraph", "MG")
-    layer = _add_element(_add_element(_add_element(graph, "spaceLayers", "SL"), "spaceLayerMember"), "SpaceLayer", "L0")
+    layers = _add_element(graph, "spaceLayers", "SL")
+    layer = _add_element(_add_element(layers, "spaceLayerMember"), "SpaceLayer", "L0")
     _add_description(layer, "rooms")
     nodes, names = _add_element(layer, "nodes", "N"), _list_room_names(map)
     for r, point in enumerate(points):
@@ -230,6 +233,25 @@ def _add_graph(root: Any, map: TopometricMap, points: list[Array]) -> None:
         edges = _add_element(layer, "edges", "E")
         for i, edge in enumerate(map.edges):
             _add_transition(_add_element(edges, "transitionMember"), i, edge, points)
+    _add_landmarks(layers, map)
+
+
+def _add_landmarks(layers: Any, map: TopometricMap) -> None:
+    """The layer of landmarks; a layer without states is none."""
+    rows = serialise_landmarks(map.landmarks.select(~map.landmarks.is_kind("radio", "pressure")))
+    if not rows:
+        return
+    layer = _add_element(_add_element(layers, "spaceLayerMember"), "SpaceLayer", "L1")
+    _add_description(layer, "landmarks")
+    nodes = _add_element(layer, "nodes", "N1")
+    for k, row in enumerate(rows):
+        state = _add_element(_add_element(nodes, "stateMember"), "State", f"M{k}")
+        name, position = row.pop("value"), row.pop("position")
+        row["source"] = str(row["source"]).replace('"', "'")
+        _add_description(state, name, **{key: replace_forbidden(str(fact)) for key, fact in row.items() if fact is not None})
+        if position is not None:
+            point = _add_element(_add_element(state, "geometry"), "Point", f"M{k}-point", GML)
+            _add_element(point, "pos", space=GML).text = _format_point(position)
 
 
 def _add_transition(member: Any, i: int, edge: Any, points: list[Array]) -> None:

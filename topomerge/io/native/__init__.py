@@ -154,6 +154,10 @@ def plan_outputs(sources: Sequence[Source], folder: Path) -> list[tuple[Path, Fo
         form = find_format(source.path)
         if form is None:
             able = f"only {list_native_suffixes()} are written again with new poses"
+            whole = next((f for f in NATIVE.values() if f.companion and source.path.suffix.lower() == f.companion), None)
+            if whole is not None:
+                name = source.path.with_suffix(whole.suffixes[0]).name
+                raise InputError(f"{source.path}: give {name}, beside which it lies")
             raise InputError(f"{source.path}: {able}; leave it out, or take its points by `merge --points`")
         key = form.module if form.joins else str(number)
         if form.grouped:
