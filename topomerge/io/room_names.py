@@ -53,7 +53,7 @@ def load_landmark_source(path: Path) -> Landmarks:
 
 
 def _read_scan(path: Path) -> Landmarks:
-    """What comes with the points of a scan or a model: spaces of IFC, labels of RTAB-Map, objects of USDZ ..."""
+    """Read what comes with the points of a scan or a model: spaces of IFC, labels of RTAB-Map, objects of USDZ ..."""
     from topomerge.io.points import list_suffixes, read_chunks
 
     if path.suffix.lower() not in list_suffixes():
