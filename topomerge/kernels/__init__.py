@@ -59,6 +59,7 @@ def run_in_slices(function: Callable[..., T], count: int, least: int, *args: Any
         function: lets go of the interpreter; what it writes for one index does not depend on other ones.
         least: of a slice, below which a thread costs more than it saves.
     """
+    # Not numba's parallel loops: they take three times as long to compile (docs/adr/0031).
     slices = min(count // least, SLICES_A_THREAD * count_threads())
     if slices < 2 or count_threads() == 1:
         return [function(0, count, *args)]

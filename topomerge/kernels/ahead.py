@@ -84,6 +84,7 @@ def _read(path: Path) -> str:
 
 def _run_workers(count: int) -> bool:
     """Compile in so many processes; return whether all succeeded."""
+    # Else each worker, which imports this package, would start workers of its own.
     environment = {**os.environ, SWITCH: "0"}
     environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
     with tempfile.TemporaryDirectory(prefix="topomerge-") as folder:

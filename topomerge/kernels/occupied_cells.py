@@ -305,6 +305,7 @@ def _count_in_bricks(
         return np.zeros((0, 3), np.int64), none.astype(np.uint64), none, none, np.zeros((0, columns), np.int64)
     run_in_slices(mark, len(points), LEAST_POINTS, points, shift, edge, base, table)
     bricks = np.argwhere(table)
+    # About the lattice's origin: so cells come in the order of their codes, without a sort of their own (docs/adr/0044).
     codes = encode(bricks + first)
     order = np.argsort(codes, kind="stable")
     bricks, codes = bricks[order], codes[order]

@@ -95,6 +95,8 @@ def decode(codes: NDArray[Any]) -> NDArray[np.int32]:
     return out
 
 
+# Bricks of 8 x 8 x 8: a dense array would take 5 GB for an airport, a hash table answers 0.9 M rays a second for 12 M
+# (docs/adr/0002).
 MAX_BRICKS = 1 << 27  # 512 MB of table
 
 
@@ -116,6 +118,7 @@ def _fill_bricks(cells, table, bricks):  # type: ignore[no-untyped-def]  # pragm
         bricks[table[x >> 3, y >> 3, z >> 3], ((x & 7) << 6) | ((y & 7) << 3) | (z & 7)] = i
 
 
+# Called, not copied into each caller: less to compile (docs/adr/0031).
 @compile_ahead("i4[:,:,::1], i4[:,::1], i8, i8, i8")
 def find_row(table, bricks, x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Row of cell (x, y, z), -1 where it is empty or outside."""
