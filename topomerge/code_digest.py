@@ -123,8 +123,8 @@ def _find_module_file(module: str, package: Path) -> Path | None:
     top, *parts = module.split(".")
     if top != TOP:
         return None
-    beside = parts and parts[0] in DATA_BESIDE and not (package / parts[0]).is_dir()
-    path = (package.parent if beside else package).joinpath(*parts)
+    is_beside = parts and parts[0] in DATA_BESIDE and not (package / parts[0]).is_dir()
+    path = (package.parent if is_beside else package).joinpath(*parts)
     candidates = (path.with_name(f"{path.name}.py"), path / "__init__.py") if parts else (path / "__init__.py",)
     return next((p for p in candidates if p.is_file()), None)
 
@@ -152,7 +152,7 @@ def _parse_source(text: str) -> _Source:
     """Of a file's text: the same file of another copy of the package is not read a second time."""
     reading = _SourceReader()
     reading.read(ast.parse(text))
-    description = hashlib.sha256("\n".join(reading.words).encode())
+    description = hashlib.sha256("\n".join(reading.tokens).encode())
     return _Source(description.hexdigest(), frozenset(reading.names), frozenset(reading.texts))
 
 
@@ -160,7 +160,7 @@ class _SourceReader:
     """One pass over a syntax tree, which is all that the walk costs."""
 
     def __init__(self) -> None:
-        self.words: list[str] = []  # the code, without comments, docstrings and layout
+        self.tokens: list[str] = []  # the code, without comments, docstrings and layout
         self.names: set[str] = set()
         self.texts: set[str] = set()
 
@@ -173,20 +173,20 @@ class _SourceReader:
         counts = counts and not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test))
         if counts:
             self.names.update(_iter_imported_names(node))
-        self.words.append(node.__class__.__name__)
+        self.tokens.append(node.__class__.__name__)
         for field in node._fields:
             value = getattr(node, field, None)
             if value is None or value == [] or isinstance(value, ast.expr_context):
                 continue  # newer versions of Python have more fields that are empty
-            self.words.append(field)
+            self.tokens.append(field)
             for item in value if isinstance(value, list) else [value]:
                 if not isinstance(item, ast.AST):
-                    self.words.append(repr(item))
+                    self.tokens.append(repr(item))
                     if isinstance(item, str):
                         self.texts.add(item)
                 elif not (isinstance(item, ast.Expr) and isinstance(item.value, ast.Constant)):  # a docstring
                     self.read(item, counts)
-        self.words.append("end")
+        self.tokens.append("end")
 
 
 def _iter_imported_names(node: ast.AST) -> Iterator[str]:
@@ -234,9 +234,9 @@ def _read_homes(package: Path) -> dict[str, str]:
 def read_commit(package: Path = HERE) -> tuple[str, bool]:
     """Return the commit of the checkout that a package runs from, and do its sources differ from it? Empty outside a checkout."""
 
-    def git(*words: str) -> str:
+    def git(*arguments: str) -> str:
         try:
-            done = subprocess.run(["git", "-C", str(package.parent), *words], capture_output=True, text=True, check=False)
+            done = subprocess.run(["git", "-C", str(package.parent), *arguments], capture_output=True, text=True, check=False)
         except OSError:  # no git here
             return ""
         return done.stdout.strip() if done.returncode == 0 else ""

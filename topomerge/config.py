@@ -15,7 +15,7 @@ SEARCH_PATH = "hydra.searchpath="
 SEARCH = "search"  # key of what is no setting of a run (`training.search`)
 
 
-def compose(name: str, schema: type[Schema], words: Sequence[str] = ()) -> Schema:
+def compose(name: str, schema: type[Schema], overrides: Sequence[str] = ()) -> Schema:
     """Return the settings of `configs/<name>.yaml`, overridden by words like ``data=train_small jobs=2 data.pairs=10``.
 
     Every key must be a field of the dataclass `schema` and every value of its type; a field with a default may be absent.
@@ -24,10 +24,10 @@ def compose(name: str, schema: type[Schema], words: Sequence[str] = ()) -> Schem
         InputError: one line with the key's name.
     """
     register(name, schema)
-    return convert_to_dataclass(compose_config(name, words), schema)
+    return convert_to_dataclass(compose_config(name, overrides), schema)
 
 
-def compose_config(name: str, words: Sequence[str] = ()) -> Any:
+def compose_config(name: str, overrides: Sequence[str] = ()) -> Any:
     """Return what Hydra composes of `configs/<name>.yaml` and words, whose schemas are registered.
 
     Raises:
@@ -42,12 +42,12 @@ def compose_config(name: str, words: Sequence[str] = ()) -> Any:
         raise InputError("settings need Hydra: pip install topomerge[learn]") from error
     try:
         with initialize_config_module("topomerge.configs", version_base="1.3"):
-            return hydra_compose(name, overrides=find_plugins(words))
+            return hydra_compose(name, overrides=find_plugins(overrides))
     except (HydraException, OmegaConfBaseException) as error:
         raise InputError(_shorten_error(error)) from error
 
 
-def find_plugins(words: Sequence[str]) -> list[str]:
+def find_plugins(overrides: Sequence[str]) -> list[str]:
     """Import the modules that words like ``plugins=[my_package.my_module]`` name.
 
     Returns:
@@ -56,10 +56,10 @@ def find_plugins(words: Sequence[str]) -> list[str]:
     Raises:
         InputError: one of them cannot be imported.
     """
-    named = next((word.partition("=")[2] for word in reversed(words) if word.lstrip("+").startswith("plugins=")), "")
+    named = next((word.partition("=")[2] for word in reversed(overrides) if word.lstrip("+").startswith("plugins=")), "")
     folders = load_plugins([name.strip(" '\"") for name in named.strip("[]").split(",") if name])
     paths = ",".join(f"'file://{folder}'" for folder in folders)
-    return [*(w for w in words if not w.startswith(SEARCH_PATH)), f"{SEARCH_PATH}[{paths}]"] if folders else list(words)
+    return [*(w for w in overrides if not w.startswith(SEARCH_PATH)), f"{SEARCH_PATH}[{paths}]"] if folders else list(overrides)
 
 
 def register(name: str, schema: type[Any], group: str | None = None, package: str = "_global_") -> None:
@@ -118,19 +118,19 @@ def _shorten_error(error: Exception) -> str:
     return "; ".join(line for line in lines if line and not line.startswith("object_type="))
 
 
-def name_by_sweep(words: Sequence[str]) -> list[str]:
+def name_by_sweep(arguments: Sequence[str]) -> list[str]:
     """Words of `train.py`; of a sweep with one more, by which names of runs hold what differs between them only."""
-    if not {"-m", "--multirun"} & set(words):
-        return list(words)
+    if not {"-m", "--multirun"} & set(arguments):
+        return list(arguments)
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
     try:
-        overrides = OverridesParser.create().parse_overrides([word for word in words if not word.startswith("-")])
+        overrides = OverridesParser.create().parse_overrides([word for word in arguments if not word.startswith("-")])
     except HydraException as error:
         raise InputError(_shorten_error(error)) from error
     fixed = [one.key_or_group for one in overrides if not one.is_sweep_override() and not one.key_or_group.startswith("hydra")]
-    return [*words, f"hydra.job.config.override_dirname.exclude_keys=[{','.join(fixed)}]"]
+    return [*arguments, f"hydra.job.config.override_dirname.exclude_keys=[{','.join(fixed)}]"]
 
 
 def read_command() -> str:

@@ -115,10 +115,10 @@ MAPPED_ROOMS = 14  # of a map, at most
 STRANGER = 5_000  # seeds further on: buildings without a map
 
 
-def draw_building(split: str, number: int, stranger: bool = False) -> tuple[Building, Array, np.random.Generator]:
+def draw_building(split: str, number: int, negative: bool = False) -> tuple[Building, Array, np.random.Generator]:
     """Draw a building, the rooms that its map visits, and what draws the rest."""
     first, _ = get_seed_range(split)
-    seed = first + 40_000 + number + STRANGER * stranger
+    seed = first + 40_000 + number + STRANGER * negative
     rng = np.random.default_rng([seed, 54])
     building = make_building(MAPPED_KINDS[number % len(MAPPED_KINDS)], seed, 2 if number % 6 == 5 else 1)
     return building, sample_part(building, MAPPED_ROOMS, rng), rng
@@ -146,11 +146,11 @@ def make_located_map(split: str, number: int, folder: Path) -> Path:
     return path
 
 
-def make_located_scan(split: str, number: int, kind: str, stranger: bool) -> SingleScan:
+def make_located_scan(split: str, number: int, kind: str, negative: bool) -> SingleScan:
     """Make a scan of the building of a map, or of one without a map."""
-    building, rooms, _ = draw_building(split, number, stranger)
+    building, rooms, _ = draw_building(split, number, negative)
     for attempt in range(10):
-        rng = np.random.default_rng([number, (*SCANS, *MORE_SCANS).index(kind), int(stranger), attempt, 541])
+        rng = np.random.default_rng([number, (*SCANS, *MORE_SCANS).index(kind), int(negative), attempt, 541])
         try:
             return simulate_single_scan(
                 simulate_session(building, None, rng), kind, rooms.tolist(), rng, *draw_frames(1, False, rng)

@@ -220,7 +220,7 @@ def draw_frames(count: int, scale: bool, rng: np.random.Generator) -> list[Sim3]
     return frames
 
 
-def simulate_signs(building: Building, made: Pair | PointCloud, reader: Reader, frame: Sim3 | None = None) -> list[Landmarks]:
+def simulate_signs(building: Building, source: Pair | PointCloud, reader: Reader, frame: Sim3 | None = None) -> list[Landmarks]:
     """Read the signs at the doors of the rooms that each map visited, in the frame of its cloud.
 
     Args:
@@ -229,14 +229,14 @@ def simulate_signs(building: Building, made: Pair | PointCloud, reader: Reader, 
     Raises:
         InputError: b is of another building, whose doors are not known.
     """
-    if isinstance(made, PointCloud):
-        visited = [[] if made.labels is None else np.unique(made.labels[made.labels >= 0]).tolist()]
+    if isinstance(source, PointCloud):
+        visited = [[] if source.labels is None else np.unique(source.labels[source.labels >= 0]).tolist()]
         frames = [frame or Sim3()]
-    elif made.kind == "other-building":
+    elif source.kind == "other-building":
         raise InputError("signs: the doors of the other building are not known; leave --signs or --hard out")
     else:
-        assert made.frames is not None
-        visited, frames = [list(rooms) for rooms in made.visited], list(made.frames)
+        assert source.frames is not None
+        visited, frames = [list(rooms) for rooms in source.visited], list(source.frames)
     rng = np.random.default_rng([building.seed, 51])
     signs = place_signs(building, draw_numbering(rng), rng)
     return [read_signs(signs, rooms, to_map, reader, rng) for rooms, to_map in zip(visited, frames, strict=True)]

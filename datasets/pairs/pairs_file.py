@@ -64,7 +64,7 @@ class Capture:
 
 @dataclass(frozen=True, eq=False)
 class PairTruth:
-    """What is true of two captures.
+    """The truth about two captures.
 
     Args:
         a, b: their names.
@@ -93,7 +93,7 @@ class Split:
 
 @dataclass(frozen=True)
 class PairsFile:
-    """What a `pairs.yaml` says.
+    """The content of a `pairs.yaml`.
 
     Args:
         path: of the file; where: what messages call it: a data set of one's own has no such file.

@@ -168,7 +168,7 @@ def _list(args: argparse.Namespace) -> int:
 
 
 def _format_listing(listing: Mapping[str, Any]) -> str:
-    """What atlas.json lists, as text."""
+    """Format the listing of atlas.json as text."""
     rows = [("map", "rooms", "storeys", "where", "source")]
     joined_in = {k: n for n, c in enumerate(listing["components"]) for k in c["maps"] if len(c["maps"]) > 1}
     for k, m in enumerate(listing["maps"]):
@@ -243,7 +243,7 @@ def run_watch(args: argparse.Namespace) -> int:
 
 
 def _build_monitor(args: argparse.Namespace) -> FolderWatcher:
-    """What looks into the folder, and tells what it does."""
+    """Build the watcher of the folder, which reports what it does."""
     from topomerge.fusion.atlas.watch import FolderWatcher
     from topomerge.viz.atlas_report import render_atlas_html
 

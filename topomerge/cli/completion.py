@@ -81,7 +81,7 @@ def _format_bash_value(word: CompletionWord) -> str:
 
 
 def _iter_bash_cases(command: str, words: Sequence[CompletionWord]) -> Iterable[str]:
-    """What bash offers after each option that takes a value, and for each argument without a flag."""
+    """Yield the cases of bash: its offers after each option that takes a value, and for each argument without a flag."""
     for word in words:
         if word.flags and word.value != "none":
             pattern = "|".join(f'"{command} {flag}"' for flag in word.flags)

@@ -95,7 +95,7 @@ class ProgressBars:
 
 
 class PrintError(Exception):
-    """What is printed can't be written: no file's fault."""
+    """Standard output can't be written to: no file's fault."""
 
 
 @contextmanager

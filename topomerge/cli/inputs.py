@@ -239,7 +239,7 @@ def _load_corrected_map(path: str, lines: int | None) -> TopometricMap:
 
 
 def _prepare_map(topomap: TopometricMap) -> Mapping[str, Any] | None:
-    """What registration needs of a map; None of one that has nothing to register, which registration says."""
+    """Prepare a map for registration; None of one that has nothing to register, which registration says."""
     from topomerge.registration.prepared import prepare
 
     return prepare(topomap).pack() if len(topomap.grid) else None

@@ -58,7 +58,7 @@ def run_locate(args: argparse.Namespace) -> int:
 
 
 def _load_scan(args: argparse.Namespace) -> object:
-    """What `locate` is asked with."""
+    """Load the scan that `locate` is asked with."""
     if is_map(args.input):
         from topomerge.extraction.landmarks import load_map_with_landmarks
 

@@ -200,7 +200,7 @@ def _take_prepared(loaded: Sequence[LoadedMap], maps: Sequence[TopometricMap]) -
 def _read_decisions(
     maps: Sequence[TopometricMap], folder: Path, args: argparse.Namespace
 ) -> Mapping[tuple[int, int], Sim3 | None]:
-    """What somebody decided of an earlier merge into the folder; lines that do not apply are told."""
+    """Read the decisions about an earlier merge into the folder; lines that do not apply are reported."""
     from topomerge.edits.journal import find_journal, read_journal
 
     journal = read_journal(find_journal(folder))

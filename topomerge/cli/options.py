@@ -1,4 +1,4 @@
-"""What several commands share: options and the types of their values."""
+"""Options that several commands share: options and the types of their values."""
 
 from __future__ import annotations
 

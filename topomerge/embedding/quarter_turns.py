@@ -109,7 +109,7 @@ class Turn:
         return out
 
     @property
-    def ways(self) -> Array:
+    def displacements(self) -> Array:
         """(R_a, R_b) x + i y, m, from each room of b, as it is turned, to each of a."""
         out: Array = _convert_to_complex(self.a.places)[:, None] - _convert_to_complex(self.b.places)[None] * 1j**self.quarters
         return out
@@ -117,7 +117,7 @@ class Turn:
     @property
     def coincidence(self) -> Array:
         """(R_a, R_b) from 0 to 1: is a room of b, turned and moved, where a room of a is?"""
-        out: Array = np.exp(-(np.abs(self.ways - self.shift) ** 2) / (2 * ONE_PLACE**2))
+        out: Array = np.exp(-(np.abs(self.displacements - self.shift) ** 2) / (2 * ONE_PLACE**2))
         return out
 
 
@@ -153,7 +153,7 @@ def compute_shares(log_evidence: Array) -> Array:
 
 def _score_turn(turn: Turn) -> tuple[float, complex]:
     """Logarithm of the evidence of a turn, and the shift that explains most of it."""
-    cosine, shifts = turn.cosine, turn.ways
+    cosine, shifts = turn.cosine, turn.displacements
     most = min(PARTNERS * sum(cosine.shape), MOST_PAIRS, cosine.size)
     rooms = np.unravel_index(np.argpartition(-cosine, most - 1, axis=None)[:most], cosine.shape)
     way, odds = shifts[rooms], np.exp(LIKENESS * (cosine[rooms] - EVEN))

@@ -180,7 +180,7 @@ def extract(
     """
     p = resolve_parameters(preset, overrides)
     watch = Stopwatch(progress)
-    doubts: list[str] = []
+    warnings: list[str] = []
     scan, navigable = read_navigable(source, voxel_size, p, watch)
     if isinstance(p, ThesisParameters):
         watch.begin("rooms", 0.4)
@@ -192,7 +192,7 @@ def extract(
         watch.begin("topology", 0.85)
         map = build_topometric_map(scan.grid, floor, p.standing_height)  # 2.7
         watch.begin("odds of rooms, doors on walls", 0.87)
-        map, doubts = estimate_attributes(map, scan, floor, walls, p.walls)
+        map, warnings = estimate_attributes(map, scan, floor, walls, p.walls)
 
     watch.begin("free space", 0.9)
     free = find_free_space(scan, navigable, p.range) if p.carve else scan.free
@@ -206,7 +206,7 @@ def extract(
         source=scan.source if name is None else name,
         parameters={**chosen, "preset": preset if isinstance(preset, str) else "custom"},
         seconds=watch.end(),
-        warnings=(*scan.warnings, *doubts, *list_warnings(map)),
+        warnings=(*scan.warnings, *warnings, *list_warnings(map)),
     )
     return add_landmarks(map, scan.landmarks)
 
@@ -287,9 +287,9 @@ def cut_rooms(
 
 def list_warnings(map: TopometricMap) -> list[str]:
     """List warnings about the map as a whole, for the user."""
-    doubts = []
+    warnings = []
     if map.grid.edge > COARSE_CELL:
-        doubts.append(f"cells of {map.grid.edge:g} m are coarse: doors may be lost, {COARSE_CELL} m or less finds them")
+        warnings.append(f"cells of {map.grid.edge:g} m are coarse: doors may be lost, {COARSE_CELL} m or less finds them")
     if not len(map.rooms):
-        doubts.append("no room was found: take larger voxels if the points are sparse, smaller ones if they are dense")
-    return doubts
+        warnings.append("no room was found: take larger voxels if the points are sparse, smaller ones if they are dense")
+    return warnings

@@ -45,7 +45,7 @@ LIVE_NAME = Path("live")  # of what has no file
 
 @dataclass(frozen=True)
 class RobotTopics:
-    """What a robot sends.
+    """The topics that a robot sends.
 
     Args:
         scans: topic of scans, clouds or grids.

@@ -67,7 +67,7 @@ LIVE = LiveSettings()
 
 @dataclass(eq=False)
 class GrowingMap:
-    """What a robot saw, one point a cell.
+    """The map that grows while a robot drives: one point a cell.
 
     Args:
         frame: of its poses, as its messages name it.

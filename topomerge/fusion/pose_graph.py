@@ -237,9 +237,9 @@ class Assembler:
         assembly = Assembly([{k: Sim3()} for k in self.maps])
         candidates = self._list_candidates(banned)
         refused: dict[int, tuple[Poses, Poses]] = {}  # by the components that stood there then, and mostly still do
-        again = True
-        while again:
-            again = False
+        changed = True
+        while changed:
+            changed = False
             for n, (pair, h) in enumerate(candidates):
                 a, b = assembly.find_component(pair[0]), assembly.find_component(pair[1])
                 if a is b or (n in refused and refused[n][0] is a and refused[n][1] is b):
@@ -247,7 +247,7 @@ class Assembler:
                 link = self.evidence.score_link(a, b, pair, h, least=self.limit)
                 if link.log_odds >= self.limit:
                     self._join(assembly, a, b, link)
-                    again = True
+                    changed = True
                     break
                 refused[n] = a, b
         return assembly

@@ -62,8 +62,8 @@ def fit_room_moves(map: TopometricMap, bend: Deformation) -> RoomMoves:
         return np.column_stack([np.bincount(room, v, count) for v in values.T]) / number
 
     before, after = places[:, :2], bend.apply(places)[:, :2]
-    centre, there = mean(before), mean(after)
-    p, q = before - centre[room], after - there[room]
+    centre, moved_centre = mean(before), mean(after)
+    p, q = before - centre[room], after - moved_centre[room]
     dot, cross = mean(np.column_stack([(p * q).sum(axis=1), p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]])).T
     covariance = np.full((count, 3, 3), np.nan)
     for i in np.unique(bend.room[bend.room >= 0]):
@@ -71,7 +71,7 @@ def fit_room_moves(map: TopometricMap, bend: Deformation) -> RoomMoves:
         of_room = of_room[np.isfinite(of_room).all(axis=(1, 2))]
         if i < count and len(of_room):
             covariance[i] = of_room.mean(axis=0)
-    return RoomMoves(centre, there - centre, np.arctan2(cross, dot), covariance)
+    return RoomMoves(centre, moved_centre - centre, np.arctan2(cross, dot), covariance)
 
 
 def serialise_bend(map: TopometricMap, placement: Placement) -> dict[str, Any]:

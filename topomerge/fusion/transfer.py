@@ -135,9 +135,9 @@ class _PlacedFloor:
         room, tree = find_rooms_at(joined, part.rooms.places), cKDTree(part.rooms.places)
         pairs = np.full((len(doors), 2), -1, np.int64)
         for k, near in enumerate(tree.query_ball_point(doors["centre"], DOOR_SIDE)):
-            there, own = room[near], part_room[near]
+            joined_room, own = room[near], part_room[near]
             for side, number in enumerate(doors["rooms"][k]):
-                votes = there[(own == number) & (there >= 0)]
+                votes = joined_room[(own == number) & (joined_room >= 0)]
                 pairs[k, side] = np.bincount(votes).argmax() if len(votes) else -1
         between = (pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])
         doors["rooms"] = np.sort(pairs, axis=1)
@@ -289,6 +289,6 @@ def _assign_joined_rooms(joined: TopometricMap, part: PlacedLandmarks) -> Landma
     lost = known & (assigned.table["room"] < 0) & (room >= 0)
     if not lost.any():
         return assigned
-    again = assigned.table.copy()
-    again["room"][lost] = room[lost]
-    return assign_landmarks(joined, replace(assigned, table=again))
+    restored = assigned.table.copy()
+    restored["room"][lost] = room[lost]
+    return assign_landmarks(joined, replace(assigned, table=restored))

@@ -264,7 +264,7 @@ class LandmarkReader:
             cloud: what the bag's scans show.
         """
         decoders = self._find_decoders()
-        for topic in find_picture_topics(self.bag) if self.pictures.wanted else ():
+        for topic in find_picture_topics(self.bag) if self.pictures.reads_text else ():
             try:
                 self.cameras[topic.name] = (topic, self.camera_of(self.bag, topic))
                 decoders[topic.name] = (topic, self._read_picture)

@@ -135,15 +135,15 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Read floor points, then walls layer by layer, in metres."""
     names: Landmarks | None = None
     if (pages := count_pages(path)) > 1:
-        wanted = f"{path.name}: has {pages} pages, and the first was read; save the others as files of their own"
-        yield Piece(np.empty((0, 3)), warnings=(wanted,), done=0.0)
+        warning = f"{path.name}: has {pages} pages, and the first was read; save the others as files of their own"
+        yield Piece(np.empty((0, 3)), warnings=(warning,), done=0.0)
     is_yaml = path.suffix.lower() in (".yaml", ".yml")
     page = find_page(read_picture(path)) if options.drawing and not is_yaml else None
     if is_yaml:
         plan = read_yaml(path)
         if options.resolution is not None:
             raise InputError(f"{path}: states its own resolution of {plan.resolution:g} m; leave --resolution out")
-        occupied, free, doubts = read_pixels(path, plan)
+        occupied, free, warnings = read_pixels(path, plan)
     elif page is not None and (not page.doubtful or is_plan(page)):
         traced = trace_drawing(path, page, options.resolution, text=options.text)
         yield from build_drawn_pieces(path, traced, options, options.page)
@@ -154,10 +154,10 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         raise InputError(f"{path}: an image does not say how large a pixel is; give --resolution in metres a pixel{hint}")
     else:
         plan = Plan(path, options.resolution)
-        occupied, free, doubts = read_pixels(path, plan)
+        occupied, free, warnings = read_pixels(path, plan)
     if options.page is not None:
         raise InputError(f"{path}: is no page with drawn plans; leave --page out")
-    yield Piece(np.empty((0, 3)), warnings=(*plan.warnings, *doubts), landmarks=names, done=0.1)
+    yield Piece(np.empty((0, 3)), warnings=(*plan.warnings, *warnings), landmarks=names, done=0.1)
     # The grid is metric already; only a --scale is left to undo in the lengths that are given in metres.
     yield from extrude(path, occupied, free, plan, options)
 
@@ -377,20 +377,20 @@ def read_pixels(path: Path, plan: Plan) -> tuple[Array, Array, tuple[str, ...]]:
     if not occupied.any() and not free.any():
         wrong = f"shows neither floor nor walls (free_thresh {plan.free:g}, occupied_thresh {plan.occupied:g})"
         raise InputError(f"{path}: {wrong}; is free space white and are walls black? mend thresholds, negate or mode")
-    doubts: list[str] = []
+    warnings: list[str] = []
     if plan.mode == "trinary":
         occupied, free, notes = _read_greys(path, image, plan, occupied, free)
-        doubts += [notes] if notes else []
+        warnings += [notes] if notes else []
     if is_inverted(occupied, free, plan.resolution):
         advice = (
             f"set negate: {1 - plan.negate}" if path != plan.image else "invert it, or give a yaml of map_server with negate: 1"
         )
         wall = f"{occupied.mean():.0%} of the picture counts as wall"
-        doubts.append(f"{plan.image.name}: {wall}; are its colours inverted? {advice}")
+        warnings.append(f"{plan.image.name}: {wall}; are its colours inverted? {advice}")
     for doubt in check_outside_floor(occupied, free, plan.resolution):
         advice = "if nobody saw it, lower free_thresh below its grey, or paint it in the grey of unknown (205)"
-        doubts.append(f"{plan.image.name}: {doubt}; {advice}")
-    return occupied, free, tuple(doubts)
+        warnings.append(f"{plan.image.name}: {doubt}; {advice}")
+    return occupied, free, tuple(warnings)
 
 
 def _read_greys(path: Path, image: tuple[Array, Array], plan: Plan, occupied: Array, free: Array) -> tuple[Array, Array, str]:

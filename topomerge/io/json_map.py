@@ -95,11 +95,11 @@ def _parse_places(graph: Mapping[str, Any]) -> tuple[Array, Array]:
     return np.array(list(rows.values())).reshape(-1, 4), np.array(joined, np.int64).reshape(-1, 2)
 
 
-def _draw_places(path: Path, places: Array, rows: Array, ways: Array) -> tuple[Array, list[float]]:
+def _draw_places(path: Path, places: Array, rows: Array, links: Array) -> tuple[Array, list[float]]:
     """Return (h, w) bool of what is free around places and along ways, the lowest row first; and the lower left corner, m."""
     clear = places[:, 3].clip(LEAST_CLEAR, 10.0)
     discs = [(places[k, :2], clear[k]) for k in rows.tolist()]
-    for a, b in ways.tolist():
+    for a, b in links.tolist():
         start, end = places[a, :2], places[b, :2]
         wide = min(clear[a], clear[b], WAY)
         steps = min(int(np.ceil(np.linalg.norm(end - start) / wide)) + 1, 1000)

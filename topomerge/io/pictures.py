@@ -79,7 +79,7 @@ class PictureReader:
     """
 
     def __init__(self, text: bool | None = None, tag_size: float | None = None) -> None:
-        self.wanted, self.tag_size = text is not False, tag_size
+        self.reads_text, self.tag_size = text is not False, tag_size
         if text and load_text_reader() is None:
             raise InputError("--text: reading signs on pictures needs rapidocr_onnxruntime: pip install topomerge[text]")
         self.warnings: list[str] = []
@@ -91,7 +91,7 @@ class PictureReader:
 
     def is_due(self, pose: Array | None, done: float) -> bool:
         """Return whether a picture at a pose is to be read: the camera moved, and the share `done` of all allows for it."""
-        if not self.wanted or pose is None or len(self.sightings) >= MOST_SIGHTINGS or not np.isfinite(pose).all():
+        if not self.reads_text or pose is None or len(self.sightings) >= MOST_SIGHTINGS or not np.isfinite(pose).all():
             return False
         return self.read < FIRST_PICTURES + MOST_PICTURES * done and self._measure_way(pose) >= 1
 

@@ -120,8 +120,8 @@ def _parse_rows(path: Path, lines) -> list[tuple[float, str, float]]:  # type: i
     return rows
 
 
-def _find_columns(words: Sequence[str]) -> list[int]:
+def _find_columns(header: Sequence[str]) -> list[int]:
     """Columns of time, address and dBm by their names; empty where one of them is not named."""
-    names = [word.lower() for word in words]
+    names = [word.lower() for word in header]
     found = [next((names.index(n) for n in possible if n in names), -1) for possible in COLUMNS.values()]
     return found if min(found) >= 0 else []

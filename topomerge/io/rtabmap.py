@@ -256,7 +256,7 @@ def _iter_pieces(path: Path, base: sqlite3.Connection, options: ReadOptions) -> 
 def _read_pictures(path: Path, base: sqlite3.Connection, version: tuple[int, ...], poses: Poses, options: ReadOptions) -> Piece:
     """Signs and tags on the pictures of a recording whose points are those of a laser."""
     reader = PictureReader(options.text, options.tag_size)
-    if reader.wanted:
+    if reader.reads_text:
         for frame in _iter_frames(path, base, version, poses, reader.is_due):
             if frame is not None and isinstance(frame.depth, np.ndarray) and not isinstance(frame.color, Path):
                 reader.read_frame(frame, frame.depth, frame.color)

@@ -51,7 +51,7 @@ Received = Iterator[Message | None]  # None: nothing came for a while
 
 @dataclass
 class StreamCounts:
-    """What a stream brought: messages that were read, and those that could not be."""
+    """Counts of a stream's messages: those that were read, and those that could not be."""
 
     read: int = 0
     broken: int = 0

@@ -1,4 +1,4 @@
-"""What landmarks of two maps say of a pose: one factor a kind over the named alternatives, and which landmarks testify.
+"""Evidence of landmarks of two maps for a pose: one factor a kind over the named alternatives, and which landmarks testify.
 
 Where both maps read something at one place, `likelihood` weighs it. Besides:
 
@@ -143,7 +143,7 @@ class Witness:
 
 @dataclass(frozen=True)
 class LandmarkEvidence:
-    """What landmarks say of a pose.
+    """The evidence of landmarks for a pose.
 
     Args:
         factors: kind -> alternative -> log of how many times as likely as by chance what was read is.
@@ -183,7 +183,7 @@ class LandmarkEvidence:
         return replace(self, witnesses=tuple(w.inverse() for w in self.witnesses))
 
     def list_sentences(self) -> list[str]:
-        """What agrees and what contradicts, a sentence a kind."""
+        """List what agrees and what contradicts, a sentence a kind."""
         return [s for kind in self.factors if (s := describe_witnesses(kind, [w for w in self.witnesses if w.kind == kind]))]
 
     def serialise(self) -> dict[str, Any]:

@@ -32,7 +32,7 @@ MOST_LISTED = 100  # contradictions that are kept in words
 
 @dataclass(frozen=True)
 class LandmarkSummary:
-    """What became of the landmarks of joined maps.
+    """The outcome of fusing the landmarks of joined maps.
 
     Args:
         maps: how many each map had, in their order.

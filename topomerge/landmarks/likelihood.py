@@ -62,7 +62,7 @@ DOUBTED = 0.5  # of what a reader is unsure of, that is nothing like what stands
 
 @dataclass(frozen=True)
 class Kind:
-    """What is assumed of landmarks of a kind.
+    """Assumptions about landmarks of a kind.
 
     Args:
         kinds: of both maps that are compared.

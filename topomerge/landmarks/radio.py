@@ -1,4 +1,4 @@
-"""What access points in reach say of a pose: readings as scans, how alike two scans are, and how that falls off with distance.
+"""Evidence of access points in reach: readings as scans, how alike two scans are, and how that falls off with distance.
 
 A scan is what was heard at one place: addresses and their strengths, dBm. Two scans are compared by the cosine of powers of their
 readings, which a receiver's gain does not change; addresses that are heard everywhere, or at places far from each other, count

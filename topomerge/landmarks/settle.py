@@ -1,4 +1,4 @@
-"""What would settle whether two maps belong together: the observations that change the posterior most, for their cost.
+"""Observations that would settle whether two maps belong together: those that change the posterior most, for their cost.
 
 An observation has two outcomes, as if this is the place or as if not. Its worth is the expected change of the posterior over the
 named alternatives (mean of the total variation over both outcomes), divided by what it costs; as in active loop closing

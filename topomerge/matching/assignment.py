@@ -146,15 +146,20 @@ def grow(a: TopometricMap, b: TopometricMap, cost: Array, c_max: float | None = 
 
 
 def _grow_from_seed(
-    seed: tuple[int, int], cost: Array, beside: list[list[set[int]]], centroids: tuple[Array, Array], c_max: float, de_max: float
+    seed: tuple[int, int],
+    cost: Array,
+    neighbours: list[list[set[int]]],
+    centroids: tuple[Array, Array],
+    c_max: float,
+    de_max: float,
 ) -> Pairs:
     """One hypothesis from its seed."""
     partner = {seed[0]: seed[1]}
     error, queue = 0.0, deque([seed])
     while queue:
         i, j = queue.popleft()
-        free_a = np.array(sorted(beside[0][i] - set(partner)), np.int64)
-        free_b = np.array(sorted(beside[1][j] - set(partner.values())), np.int64)
+        free_a = np.array(sorted(neighbours[0][i] - set(partner)), np.int64)
+        free_b = np.array(sorted(neighbours[1][j] - set(partner.values())), np.int64)
         costs = cost[np.ix_(free_a, free_b)]
         pairs = assign(costs)
         for k, l in pairs[np.argsort(costs[tuple(pairs.T)], kind="stable")].tolist():

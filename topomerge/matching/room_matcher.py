@@ -288,11 +288,11 @@ def find_best_scale(of_a: Rows, of_b: Rows, rows_at: RowsAt) -> tuple[float, tup
         return 1.0, ()
     rows: dict[float, Rows] = {}
 
-    def sureness(scale: float) -> float:
+    def compute_confidence(scale: float) -> float:
         """At the turn that is likeliest by rows alone: all of them take longer."""
         rows[scale] = rows[scale] if scale in rows else rows_at(scale)
         return compute_room_odds(of_a, rows[scale], likeliest=True)[0].confidence
 
-    best = max(COARSE_SCALES, key=sureness)
-    best = max([best, best / FINE_STEP**0.5, best * FINE_STEP**0.5], key=sureness)
+    best = max(COARSE_SCALES, key=compute_confidence)
+    best = max([best, best / FINE_STEP**0.5, best * FINE_STEP**0.5], key=compute_confidence)
     return best, compute_room_odds(of_a, rows[best])

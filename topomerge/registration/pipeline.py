@@ -317,9 +317,9 @@ class _Pair:
         tell_step(0.8, "refine the pose")
         bent, rmse = _refine_candidate(self.a, self.b, self.looked[0], self.scaled, rigid)
         self.clock.lap("refine")
-        believed = _build_registration(self.ranked, self.looked, verdict)
-        features = {**believed.features, "rmse": rmse}
-        return replace(believed, transform=bent.transform, features=features, bend=None if rigid else bent)
+        registration = _build_registration(self.ranked, self.looked, verdict)
+        features = {**registration.features, "rmse": rmse}
+        return replace(registration, transform=bent.transform, features=features, bend=None if rigid else bent)
 
 
 def _invert_poses(poses: Sequence[Sim3]) -> list[Sim3]:

@@ -309,5 +309,5 @@ class EtaClock:
 
     def format_time_left(self, done: int) -> str:
         """Return hh:mm:ss that remain when `done` of the total are done."""
-        pace = (time.monotonic() - self.began) / max(done - self.first, 1)
-        return time.strftime("%H:%M:%S", time.gmtime(pace * (self.total - done)))
+        seconds_each = (time.monotonic() - self.began) / max(done - self.first, 1)
+        return time.strftime("%H:%M:%S", time.gmtime(seconds_each * (self.total - done)))

@@ -72,25 +72,25 @@ class Task:
 RANKINGS = tuple(f"recall@{k}{of}" for k in (1, 5) for of in ("", "_single", "_twin"))
 
 
-def get_word(words: Sequence[str], key: str, default: str = "") -> str:
+def get_word(overrides: Sequence[str], key: str, default: str = "") -> str:
     """Return the value of the last word ``key=value``."""
-    return next((word[len(key) + 1 :] for word in reversed(words) if word.startswith(f"{key}=")), default)
+    return next((word[len(key) + 1 :] for word in reversed(overrides) if word.startswith(f"{key}=")), default)
 
 
 LISTS = ("logger", "plugins")  # keys that take several values, or one without brackets
 
 
-def bracket_lists(words: Sequence[str]) -> list[str]:
+def bracket_lists(overrides: Sequence[str]) -> list[str]:
     """Return words of a command line in which ``logger=csv`` is ``logger=[csv]``, as Hydra has it."""
     out = []
-    for word in words:
+    for word in overrides:
         key, _, value = word.partition("=")
         single = key.lstrip("+") in LISTS and value and not value.startswith(("[", "'", '"'))
         out.append(f"{key}=[{value}]" if single else word)
     return out
 
 
-def prepare_words(words: Sequence[str]) -> list[str]:
+def prepare_words(overrides: Sequence[str]) -> list[str]:
     """Import the plugins that words of a command line name, let Hydra know the keys of the tasks, and find YAML of plugins.
 
     Raises:
@@ -100,14 +100,14 @@ def prepare_words(words: Sequence[str]) -> list[str]:
     from topomerge.training.settings import Search
 
     register("optuna", Search, group=SEARCH, package=SEARCH)
-    ready = bracket_lists(find_plugins(words))
-    for task in get_word(words, "task", DEFAULT_TASK).split(","):
+    ready = bracket_lists(find_plugins(overrides))
+    for task in get_word(overrides, "task", DEFAULT_TASK).split(","):
         schema = make_dataclass("Composed", [(SEARCH, Any, None)], bases=(TASKS[task].get_schema(),))
         register(task, schema, group="task")
     return ready
 
 
-def compose_settings(words: Sequence[str] = ()) -> Any:
+def compose_settings(overrides: Sequence[str] = ()) -> Any:
     """Return settings of a task from `configs/train.yaml` and words like ``task=plan_segmentation data.scans=20``, by Hydra.
 
     Raises:
@@ -115,8 +115,8 @@ def compose_settings(words: Sequence[str] = ()) -> Any:
     """
     from topomerge.config import compose
 
-    ready = prepare_words(words)
-    task = TASKS[get_word(words, "task", DEFAULT_TASK)]
+    ready = prepare_words(overrides)
+    task = TASKS[get_word(overrides, "task", DEFAULT_TASK)]
     return task.convert(compose("train", task.get_schema(), ready))
 
 
@@ -229,17 +229,17 @@ class EvaluationResult:
     folder: Path
 
 
-def evaluate_task(task: str, words: Sequence[str], log_line: LogFn) -> EvaluationResult:
+def evaluate_task(task: str, overrides: Sequence[str], log_line: LogFn) -> EvaluationResult:
     """Judge the weights that ship, or those of a run (``run=runs/x``), on the task's `heldout` data.
 
     Args:
-        words: overrides like those of `train.py`; besides ``run=`` and ``folder=`` (runs/eval).
+        overrides: as those of `train.py`; besides ``run=`` and ``folder=`` (runs/eval).
 
     Raises:
         InputError: a wrong word, no such weights, or no data.
     """
-    named = {key: word[len(key) + 1 :] for key in ("run", "folder") for word in words if word.startswith(f"{key}=")}
-    rest = [word for word in words if not word.startswith(("run=", "folder="))]
+    named = {key: word[len(key) + 1 :] for key in ("run", "folder") for word in overrides if word.startswith(f"{key}=")}
+    rest = [word for word in overrides if not word.startswith(("run=", "folder="))]
     settings = compose_settings(rest)  # which imports plugins
     file = find_weights(task, named.get("run", ""))
     scores = dict(TASKS[task].judge(settings, file, log_line))

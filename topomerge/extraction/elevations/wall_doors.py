@@ -158,13 +158,13 @@ def build_door_candidates(
 def _is_only_way(candidates: DoorCandidates, probability: Array, rooms: int) -> Array:
     """Return (n,) bool: passages of a map without walls by which alone one walks from some rooms to others, the likeliest: what
     parts a room wrongly must not part the graph."""
-    ways, group = np.zeros(len(probability), bool), np.arange(rooms)
+    needed, group = np.zeros(len(probability), bool), np.arange(rooms)
     for k in np.argsort(-probability, kind="stable").tolist():
         a, b = group[candidates.edges["rooms"][k]].tolist()
         if a != b and candidates.source[k] == SOURCES.index("flat"):
-            ways[k] = True
+            needed[k] = True
             group[group == b] = a
-    return ways
+    return needed
 
 
 def _build_flat_candidates(complete: Array, storeys: Sequence[ClassifiedStorey], edges: Array) -> DoorCandidates:

@@ -61,8 +61,8 @@ def compute_wall_profile(strip: Array, start: int, stop: int) -> Array:
     """Return (32,) how much lies in each element across the strip beside a stretch and above it: its wall. A cupboard has a face,
     too, and its strip shows the wall, or a window, behind it."""
     left, right = strip[max(start - BESIDE, 0) * PLACES : start * PLACES], strip[stop * PLACES : (stop + BESIDE) * PLACES]
-    beside = np.concatenate([left, right])[:, :, BESIDE_BANDS].sum(axis=(0, 2))
-    profile: Array = beside + strip[start * PLACES : stop * PLACES, :, ABOVE_BANDS].sum(axis=(0, 2))
+    around = np.concatenate([left, right])[:, :, BESIDE_BANDS].sum(axis=(0, 2))
+    profile: Array = around + strip[start * PLACES : stop * PLACES, :, ABOVE_BANDS].sum(axis=(0, 2))
     return profile
 
 

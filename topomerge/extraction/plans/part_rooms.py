@@ -96,12 +96,12 @@ def _score_separation(room: Array, certainty: Array, sides: tuple[Array, Array])
     """
     shares, sure = [], 1.0
     for side in sides:
-        there = room[side]
-        there = there[there >= 0]
-        if len(there) < LEAST_COLUMNS:
+        rooms = room[side]
+        rooms = rooms[rooms >= 0]
+        if len(rooms) < LEAST_COLUMNS:
             return 0.0
-        share = np.bincount(there, minlength=len(certainty)) / len(there)
-        sure = min(sure, float(share @ certainty)) * len(there) / float(side.sum())
+        share = np.bincount(rooms, minlength=len(certainty)) / len(rooms)
+        sure = min(sure, float(share @ certainty)) * len(rooms) / float(side.sum())
         shares.append(share)
     return sure * (1 - 2 * float(shares[0] @ shares[1]))
 

@@ -143,7 +143,7 @@ def select_shortlist(scores: Array, number: int) -> list[int]:
 def rank_sightings(names: Sequence[str], rows: Sequence[Rows], new: Rows, number: int) -> tuple[Sighting, ...]:
     """`find` with rows of length 1 of each map and of the new one."""
     both = [_compute_similarity(new, of) for of in rows]
-    alike, weight = [cosine for cosine, _ in both], [np.exp(VOTE_SHARPNESS * (cosine - 1)) * there for cosine, there in both]
+    alike, weight = [cosine for cosine, _ in both], [np.exp(VOTE_SHARPNESS * (cosine - 1)) * counted for cosine, counted in both]
     total = np.maximum(np.sum([w.sum(axis=1) for w in weight], axis=0), 1e-300)
     sightings = []
     for name, w, cosine in zip(names, weight, alike, strict=True):
@@ -166,8 +166,8 @@ def _compute_similarity(new: Rows, rows: Rows) -> tuple[Array, Array]:
         cosine = _normalise_rows(np.asarray(new)) @ _normalise_rows(np.asarray(rows)).T
         return cosine, np.ones_like(cosine)
     turns = estimate_turns(new, rows)
-    there = ELSEWHERE + (1 - ELSEWHERE) * average_turns(turns, lambda turn: turn.coincidence)
-    return average_turns(turns, lambda turn: turn.cosine), there
+    counted = ELSEWHERE + (1 - ELSEWHERE) * average_turns(turns, lambda turn: turn.coincidence)
+    return average_turns(turns, lambda turn: turn.cosine), counted
 
 
 def _normalise_rows(rows: Array) -> Array:

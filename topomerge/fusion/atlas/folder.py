@@ -174,7 +174,7 @@ class Entry:
 
 @dataclass(frozen=True, eq=False)
 class StoredAtlas:
-    """What atlas.json says.
+    """The content of atlas.json.
 
     Args:
         listing: all of it; None of an atlas that is not there yet.

@@ -110,7 +110,7 @@ class LinkEvidence:
 
     def __init__(self, maps: Sequence[int], hypotheses: Hypotheses, checks: Checks) -> None:
         self.maps, self.hypotheses, self.checks = maps, hypotheses, checks
-        self._ways: dict[tuple[int, int, int], tuple[tuple[object, object], Source | None]] = {}
+        self._composed: dict[tuple[int, int, int], tuple[tuple[object, object], Source | None]] = {}
 
     def score_link(
         self,
@@ -152,9 +152,9 @@ class LinkEvidence:
     def get_composed_source(self, i: int, j: int, k: int) -> Source | None:
         """Placements of maps i < j by the registrations of both with map k: each pose of the one with each of the other."""
         of = tuple(self.hypotheses.get((min(m, k), max(m, k))) for m in (i, j))
-        if (i, j, k) not in self._ways or any(p is not q for p, q in zip(self._ways[i, j, k][0], of, strict=True)):
-            self._ways[i, j, k] = (of[0], of[1]), self._compose_source(i, j, k)
-        return self._ways[i, j, k][1]
+        if (i, j, k) not in self._composed or any(p is not q for p, q in zip(self._composed[i, j, k][0], of, strict=True)):
+            self._composed[i, j, k] = (of[0], of[1]), self._compose_source(i, j, k)
+        return self._composed[i, j, k][1]
 
     def _compose_source(self, i: int, j: int, k: int) -> Source | None:
         first, second = self._list_poses(i, k), self._list_poses(k, j)
@@ -187,8 +187,8 @@ class _LinkScorer:
         self._shares: dict[Source, float | None] = {}  # of the placement of the link
         self.sources = [evidence.get_source(min(i, j), max(i, j)) for i in a for j in b]
         i, j = min(pair), max(pair)
-        ways = (evidence.get_composed_source(i, j, k) for k in evidence.maps if k not in a and k not in b)
-        self.ways = [way for way in ways if way is not None]
+        composed = (evidence.get_composed_source(i, j, k) for k in evidence.maps if k not in a and k not in b)
+        self.composed = [way for way in composed if way is not None]
 
     def score(self, least: float) -> Link:
         """Return the link with its log odds, or some below the least ones, and the pair that spoke most against it."""
@@ -242,7 +242,7 @@ class _LinkScorer:
     def _compute_any_log_odds(self) -> float:
         """Log odds of the placement against none at all: of the surest registration that names it, and what others add."""
         odds, supports = [], []
-        for source in (*self.sources, *self.ways):
+        for source in (*self.sources, *self.composed):
             share = self._compute_share(source)
             support = 0.0 if share is None else compute_support(float(np.log(share / max(1 - share, LEAST_SHARE))))
             if source.direct and source.pair != self.pair:
@@ -276,7 +276,7 @@ class _LinkScorer:
         """Other placements that sources name, those with the largest shares."""
         named = [
             (share, source, pose)
-            for source in (*self.sources, *self.ways)
+            for source in (*self.sources, *self.composed)
             for pose, share in source.named
             if share >= (self._compute_share(source) or source.none) * LEAST_RIVAL
         ]
@@ -297,7 +297,7 @@ class _LinkScorer:
         doubtful = any(
             source.pair == self.pair and self._compute_rival_share(source, rival) is not None for source in self.sources
         )
-        for source in (*self.sources, *self.ways):
+        for source in (*self.sources, *self.composed):
             shares = self._compute_share(source), self._compute_rival_share(source, rival)
             if doubtful and not source.direct and shares[1] is None:
                 continue  # a rival that the pair itself names may be among what is composed, too far off to be known again

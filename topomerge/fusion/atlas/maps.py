@@ -54,7 +54,7 @@ class Memory:
 
     def __init__(self, coarse: MutableMapping[tuple[str, str], float] | None = None) -> None:
         self.coarse = {} if coarse is None else coarse
-        self._facts: dict[Path, tuple[tuple[int, ...], MapSummary]] = {}  # of files, with what tells whether they changed
+        self._summaries: dict[Path, tuple[tuple[int, ...], MapSummary]] = {}  # of files, with what tells whether they changed
         self._sources: dict[str, TopometricMap | str | Path] = {}
         self._loaded: OrderedDict[str, TopometricMap] = OrderedDict()
         self._prepared: OrderedDict[str, Any] = OrderedDict()
@@ -87,9 +87,9 @@ class Memory:
         journal = find_journal(path)
         edited = journal.stat().st_size if journal.exists() else 0  # a journal only grows
         stamp = (stat.st_ino, stat.st_size, stat.st_mtime_ns, edited)
-        if path not in self._facts or self._facts[path][0] != stamp:
-            self._facts[path] = (stamp, _summarise_map(load_corrected_map(path)))
-        return self._facts[path][1]
+        if path not in self._summaries or self._summaries[path][0] != stamp:
+            self._summaries[path] = (stamp, _summarise_map(load_corrected_map(path)))
+        return self._summaries[path][1]
 
     def load(self, key: str) -> TopometricMap:
         """Return a map; files are loaded when they are needed."""

@@ -222,11 +222,11 @@ class Checks:
     def locate_place(self, i: int, j: int, pose: Sim3) -> Array:
         """`place` of maps i and j (i < j) under T_ij."""
 
-        def made() -> Array:
+        def compute() -> Array:
             return locate_place(self.maps.get_prepared(i).storeys, self.maps.get_prepared(j).storeys, pose)
 
         def make() -> Array:
-            return self.maps.answer(("place", pose), (i, j), made)
+            return self.maps.answer(("place", pose), (i, j), compute)
 
         return _get_or_compute(self._places, (i, j), pose, self.maps.get_middle(j), make)
 
@@ -235,11 +235,11 @@ class Checks:
         if self.maps.is_sliced(i) or self.maps.is_sliced(j):
             return pose
 
-        def made() -> Sim3:
+        def compute() -> Sim3:
             return refine_by_surfaces(self.maps.get_prepared(i), self.maps.get_prepared(j), pose, self.scaled)[0]
 
         def make() -> Sim3:
-            return self.maps.answer(("fine", pose, self.scaled), (i, j), made)
+            return self.maps.answer(("fine", pose, self.scaled), (i, j), compute)
 
         return _get_or_compute(self._fine, (i, j), pose, self.maps.get_middle(j), make)
 
@@ -263,11 +263,11 @@ class Checks:
         judge = Judge(a, b)
         moved, features = pose, judge(pose)
         for candidate in refine(a, b, [PoseHypothesis(pose, from_rooms=True)], self.scaled):
-            again = judge(candidate.transform)
-            if is_same_pose(candidate.transform, pose, locate_place(a, b, pose).mean(axis=0)) and score_pose(again) > score_pose(
-                features
-            ):
-                moved, features = candidate.transform, again
+            moved_features = judge(candidate.transform)
+            if is_same_pose(candidate.transform, pose, locate_place(a, b, pose).mean(axis=0)) and score_pose(
+                moved_features
+            ) > score_pose(features):
+                moved, features = candidate.transform, moved_features
         if features["free"] < OVERLAP_FLOOR and features["walls"] < OVERLAP_WALLS:
             return Check(moved, 0.0, False, features)
         conflicts = find_conflicts(a, b, moved) if compute_excess_conflict(features) else ()

@@ -49,7 +49,7 @@ class _TurnedQuery:
         self.walls, self.clear = query.walls, query.plan.compute_points(query.core)
         both = np.concatenate([self.walls, self.clear])
         self.reach = min(float(np.hypot(*np.ptp(both, axis=0))), FARTHEST)
-        self.made: dict[tuple[int, tuple[int, int]], tuple[Array, Array, Array, float]] = {}
+        self.cache: dict[tuple[int, tuple[int, int]], tuple[Array, Array, Array, float]] = {}
 
     def correlate(self, storey: IndexedStorey) -> list[tuple[float, Sim3]]:
         """Score, and pose without height, at the best peaks of each likely yaw."""
@@ -71,14 +71,14 @@ class _TurnedQuery:
         return found
 
     def _draw(self, step: int, size: tuple[int, int]) -> tuple[Array, Array, Array, float]:
-        if (step, size) not in self.made:
+        if (step, size) not in self.cache:
             walls, clear = (turn_points(points, np.radians(step)) for points in (self.walls, self.clear))
             low = np.concatenate([walls, clear]).min(axis=0)
             cells = (COARSE_CELL / self.query.plan.edge) ** 2
             drawn = draw_points(walls - low, size, 3.0), draw_points(clear - low, size, cells)
             spectra = [np.conj(fft.rfft2(image)) for image in drawn]
-            self.made[step, size] = (*spectra, low, max(float(drawn[0].sum()), 1.0))  # type: ignore[assignment]
-        return self.made[step, size]
+            self.cache[step, size] = (*spectra, low, max(float(drawn[0].sum()), 1.0))  # type: ignore[assignment]
+        return self.cache[step, size]
 
 
 def _find_size(cells: int, reach: float) -> int:

@@ -84,12 +84,12 @@ def check_graph(graph: bytes, count: int, size: int, links: int) -> None:
         _check_links(whole, at, upper, levels >= level)
 
 
-def _check_links(whole: Array, places: Array, most: int, there: Array) -> None:
-    """Lists at these bytes, each the number of links and then so many rooms, which must be `there` at this level."""
+def _check_links(whole: Array, places: Array, most: int, present: Array) -> None:
+    """Lists at these bytes, each the number of links and then so many rooms, which must be `present` at this level."""
     for k in range(0, len(places), LISTS_AT_ONCE):
         lists = _read_integers(whole, places[k : k + LISTS_AT_ONCE], 1 + most)
         to = lists[:, 1:][np.arange(most) < lists[:, :1]]
-        if lists[:, 0].max() > most or to.max(initial=0) >= len(there) or not there[to].all():
+        if lists[:, 0].max() > most or to.max(initial=0) >= len(present) or not present[to].all():
             raise ValueError("links lead nowhere")
 
 

@@ -113,7 +113,7 @@ def solve(
     keys: Sequence[str] | None = None,
     proposed: Proposed | None = None,
     memory: Memory | None = None,
-    pace: SolvingSchedule | None = None,
+    schedule: SolvingSchedule | None = None,
 ) -> AtlasResult:
     """As `atlas`, of any number of maps, one or none, too.
 
@@ -122,7 +122,7 @@ def solve(
         keys: what `hash_map` should give for each map.
         proposed: poses of pairs, tried beside those that are looked for; these may be registered however alike the maps look.
         memory: of maps that were put together before; it changes how long it takes, not what comes out.
-        pace: of who waits for an answer.
+        schedule: of who waits for an answer.
 
     Raises:
         InputError: as `atlas`; and a map has another key.
@@ -136,10 +136,10 @@ def solve(
     order = sorted(range(len(maps)), key=lambda k: map_keys[k])
     ordered = Maps([maps[k] for k in order], settings.embedder, memory, [map_keys[k] for k in order])
     explorer = _Explorer(ordered, settings, threshold, {} if registrations is None else registrations, proposed or {})
-    pace = pace or SolvingSchedule()
-    assembly = explorer.explore(began + pace.seconds, pace.workers)
-    if pace.answered is not None:
-        pace.answered(_build_result(assembly, explorer, names, order, rigid=True, fine=False))
+    schedule = schedule or SolvingSchedule()
+    assembly = explorer.explore(began + schedule.seconds, schedule.workers)
+    if schedule.answered is not None:
+        schedule.answered(_build_result(assembly, explorer, names, order, rigid=True, fine=False))
     result = _build_result(assembly, explorer, names, order, settings.rigid)
     return replace(result, maps=Maps(maps), seconds=time.perf_counter() - began, warnings=(*warnings, *result.warnings))
 

@@ -56,7 +56,7 @@ class Alignment:
 
     def compute_shares(self, i: int, j: int, chosen: Array) -> tuple[Array, Array]:
         """Return (m, NEIGHBOURS) pieces of map j around the chosen ones of map i, and their shares."""
-        here, there = self.compute_anchors(i)[chosen], self.compute_anchors(j)
+        here, targets = self.compute_anchors(i)[chosen], self.compute_anchors(j)
         out, shares = np.zeros((len(chosen), NEIGHBOURS), np.int64), np.zeros((len(chosen), NEIGHBOURS))
         for mine, theirs in self.match_storeys(i, j):
             rows = np.flatnonzero(self.maps[i].pieces.storey[chosen] == mine)
@@ -64,7 +64,7 @@ class Alignment:
             if not len(rows) or not len(near):
                 continue
             many = min(NEIGHBOURS, len(near))
-            distance, nearest = (x.reshape(len(rows), many) for x in cKDTree(there[near]).query(here[rows], many))
+            distance, nearest = (x.reshape(len(rows), many) for x in cKDTree(targets[near]).query(here[rows], many))
             weight = np.exp(-(distance**2 - distance[:, :1] ** 2) / (2 * REACH**2))
             out[rows, :many], shares[rows, :many] = near[nearest], weight / weight.sum(axis=1, keepdims=True)
         return out, shares
@@ -72,10 +72,10 @@ class Alignment:
     def compute_relative_moves(self, i: int, j: int) -> Array:
         """Return (n, 3) moves of the pieces of map i against map j."""
         others, shares = self.compute_shares(i, j, np.arange(len(self.maps[i].pieces)))
-        here, there = self.compute_anchors(i), self.compute_anchors(j)
+        here, targets = self.compute_anchors(i), self.compute_anchors(j)
         out = self.moves[i][:, :3].copy()
-        for k in range(NEIGHBOURS if len(there) else 0):
-            move, gap = self.moves[j][others[:, k]], here - there[others[:, k]]
+        for k in range(NEIGHBOURS if len(targets) else 0):
+            move, gap = self.moves[j][others[:, k]], here - targets[others[:, k]]
             x = move[:, 0] - move[:, 2] * gap[:, 1] + move[:, 3] * gap[:, 0]
             y = move[:, 1] + move[:, 2] * gap[:, 0] + move[:, 3] * gap[:, 1]
             out -= shares[:, k : k + 1] * np.column_stack([x, y, move[:, 2]])

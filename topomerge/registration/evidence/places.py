@@ -190,8 +190,8 @@ def compute_planes(parts: Array, ceiling: Array, observed: Array) -> Array:
     out += _compare_layers(bit["clutter"] & ~near["wall"], empty, standing)
     for n, name in enumerate(HEIGHT_PARTS):
         seen = explored & (observed[:, :, 1 + n, None, None] > 0)
-        there = bit[name] & seen & ~near["wall"]
-        out += _compare_layers(there, seen & ~near[name] & bit["free"], near[name])
+        shown = bit[name] & seen & ~near["wall"]
+        out += _compare_layers(shown, seen & ~near[name] & bit["free"], near[name])
     roof = bit["ceiling"] & bit["free"]
     out += _compare_layers(bit["hanging"], roof & ~near["hanging"], near["hanging"])
     height = CEILINGS[0] + (ceiling.astype(np.float32) - 1) * CEILINGS[1]
@@ -217,11 +217,11 @@ def _pool_mean(layer: Array) -> Array:
     return out
 
 
-def _compare_layers(there: Array, missing: Array, near: Array) -> list[Array]:
+def _compare_layers(shown: Array, missing: Array, near: Array) -> list[Array]:
     """Return (k, side, side) each: where both maps show something, and where one shows it and the other one misses it. All (k, 2,
-    side, side): `there` in a map, `missing` from it, there or `near` by."""
-    both = (there[:, 0] & near[:, 1]) | (there[:, 1] & near[:, 0])
-    one = (there[:, 0] & missing[:, 1]) | (there[:, 1] & missing[:, 0])
+    side, side): `shown` in a map, `missing` from it, there or `near` by."""
+    both = (shown[:, 0] & near[:, 1]) | (shown[:, 1] & near[:, 0])
+    one = (shown[:, 0] & missing[:, 1]) | (shown[:, 1] & missing[:, 0])
     return [both, one]
 
 
