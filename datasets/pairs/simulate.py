@@ -114,10 +114,12 @@ def simulate_wifi(building: Building, simulated: Pair | PointCloud, frame: Sim3)
         walk = to_map.inverse().apply(cloud.poses[:, :3, 3])
         walk = walk[np.unique(np.floor(walk / TRACK_GAP), axis=0, return_index=True)[1]]
         level = np.maximum(np.searchsorted(building.storeys["floor"], walk[:, 2], side="right") - 1, 0)
-        parts = []
+        parts: list[Landmarks] = []
+        scans = 0
         for own in np.unique(level).tolist():
             part = simulate_readings(plans, points, walk[level == own, :2], own, WIFI, session)
-            part.table["group"] += sum(int(other.table["group"].max(initial=-1)) + 1 for other in parts)
+            part.table["group"] += scans
+            scans += int((level == own).sum())
             part.table["position"] = to_map.apply(part.table["position"])
             part.table["sigma"] *= to_map.scale
             parts.append(part)

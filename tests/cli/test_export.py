@@ -102,7 +102,7 @@ BAD = [
     ((".", "--to", "ply", "-o", "x"), "holds no joined map"),
     (("a.tmap", "--to", "ply,ros", "-o", "cloud.npy"), "is a file"),
     (("a.tmap", "--to", "ros", "-o", "cloud.npy/x"), "can't be made"),
-    (("a.tmap", "--to", "ply", "-o", "a.tmap"), "is the input"),
+    (("a.tmap", "--to", "ply", "-o", "a.tmap"), "--to ply writes .ply"),
     (("a.tmap", "--to", "geojson", "-o", "x/y.geojson", "--storey", "9"), "no such storey (0 to 1)"),
     (("a.tmap", "--to", "ros", "-o", "x/y", "--storey", "2"), "no such storey"),
     (("a.tmap", "--to", "geojson", "-o", "x", "--origin", "north"), "latitude,longitude"),

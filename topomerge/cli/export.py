@@ -31,14 +31,14 @@ def run_export(args: argparse.Namespace) -> int:
     options = _collect_export_options(args, names)
     source = _find_map_file(args.input)
     path, folder = _choose_output_path(args, names, source)
+    if not folder:
+        check_suffix(f"--to {args.to}", args.output, FORMATS[names[0]].suffixes)
     topomap = load_stored_map(source, args)
     warn(topomap.warnings)
     topomap = filter_confident(topomap, getattr(args, "min_confidence", 0.0))
     with open_output_folder(path.parent):
         files = [file for name in names for file in prepare_outputs(topomap, name, path, folder, **options)]
         check_outputs([file for file, _ in files], [source])
-        if not folder:
-            check_suffix(f"--to {args.to}", args.output, FORMATS[names[0]].suffixes)
         write_all(files)
     if not args.quiet:
         written = " ".join(str(file) for file, _ in files)
