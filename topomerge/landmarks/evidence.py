@@ -183,8 +183,13 @@ class LandmarkEvidence:
         return replace(self, witnesses=tuple(w.inverse() for w in self.witnesses))
 
     def list_sentences(self) -> list[str]:
-        """List what agrees and what contradicts, a sentence a kind."""
-        return [s for kind in self.factors if (s := describe_witnesses(kind, [w for w in self.witnesses if w.kind == kind]))]
+        """List what agrees and what contradicts, a sentence a kind; the last one tells where nothing contradicts at all."""
+        by_kind = {kind: [w for w in self.witnesses if w.kind == kind] for kind in self.factors}
+        sentences = [text for kind, of in by_kind.items() if (text := describe_witnesses(kind, of))]
+        verdicts = {w.verdict for of in by_kind.values() for w in of}
+        if "agrees" in verdicts and "contradicts" not in verdicts:
+            sentences[-1] += "; nothing contradicts"
+        return sentences
 
     def serialise(self) -> dict[str, Any]:
         """As plain values, for merge.json."""
@@ -200,7 +205,7 @@ class LandmarkEvidence:
 
 
 def describe_witnesses(kind: str, witnesses: Sequence[Witness], shown: int = 3) -> str:
-    """Describe the landmarks of a kind: "signs 2.113 and 2.114 agree; nothing contradicts"; nothing where none testifies."""
+    """Describe the landmarks of a kind: "signs 2.113 and 2.114 agree"; nothing where none testifies."""
     label = KINDS[kind].words if kind in KINDS else kind
     agree, against, away = ([w for w in witnesses if w.verdict == v] for v in ("agrees", "contradicts", "elsewhere"))
     if not (agree or against or away):
@@ -219,8 +224,6 @@ def describe_witnesses(kind: str, witnesses: Sequence[Witness], shown: int = 3) 
         pairs = ", ".join(f"{quote_text(w.values[0])} against {quote_text(w.values[1])}" for w in against[:shown])
         more = f" and {len(against) - shown} more" if len(against) > shown else ""
         parts.append(f"{label}s contradict: {pairs}{more}")
-    elif agree:
-        parts.append("nothing contradicts")
     if away:
         parts.append(f"{label}{'s' * (len(away) > 1)} {name(away)} stand{'s' * (len(away) == 1)} elsewhere in the other map")
     return "; ".join(parts)
