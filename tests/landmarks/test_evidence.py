@@ -277,7 +277,7 @@ def test_joined_kinds_are_one_factor_each():
     assert list(evidence.factors) == ["text", "tag"]
     assert evidence.support == pytest.approx(sum(f["here"] - f["outside"] for f in evidence.factors.values()))
     listed = evidence.serialise()
-    assert listed["sentences"] == ["signs 2.113, 2.114, 2.115 and 3 more agree", "tag 1 agrees; nothing contradicts"]
+    assert listed["sentences"] == ["signs 2.113, 2.114, 2.115 and 3 more agree", "tag tag:1 agrees; nothing contradicts"]
     against = replace(evidence.witnesses[0], verdict="contradicts")
     doubted = replace(evidence, witnesses=(*evidence.witnesses, against)).list_sentences()
     assert doubted[0].endswith("signs contradict: 2.113 against 2.113") and "nothing contradicts" not in " ".join(doubted)
