@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -38,7 +39,9 @@ class PoseBook:
             return False
         if not known and len(self._edges) + len(self._static) >= self.FRAMES:
             return False
-        matrix = _build_matrix(values)
+        from topomerge.io.trajectory import build_pose_matrices
+
+        (matrix,) = build_pose_matrices(values[None, :3], values[None, 3:])
         if static:
             self._static[child] = parent, matrix
             return True
@@ -59,7 +62,9 @@ class PoseBook:
         if child not in self._edges:
             return None
         parent, samples = self._edges[child]
-        track = Trajectory(np.array([m for _, m in samples]), np.array([t for t, _ in samples]))
+        after = bisect_right(samples, time, key=lambda sample: sample[0])
+        around = samples[max(after - 1, 0) : after + 1]  # two of hundreds: this is asked for with every scan
+        track = Trajectory(np.array([m for _, m in around]), np.array([t for t, _ in around]))
         if time > samples[-1][0] or track.measure_gap(np.array([time]))[0] > self.GAP:
             return parent, None, True  # a newer one is on its way: the robot has moved since the last one
         return parent, track.interpolate(np.array([time]))[0], True
@@ -100,15 +105,6 @@ def find_pose(books: Sequence[PoseBook], frame: str, time: float, top: str = "")
             moved.setdefault(book, name)
         name, pose = parent, matrix @ pose
     return FramePose(name, pose, moved) if moved else None
-
-
-def _build_matrix(values: Any) -> Any:
-    from scipy.spatial.transform import Rotation
-
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat(values[3:]).as_matrix()
-    matrix[:3, 3] = values[:3]
-    return matrix
 
 
 def take_poses(book: PoseBook, message: Message, fallback: str) -> str:
