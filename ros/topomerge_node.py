@@ -9,6 +9,7 @@ import queue
 import sys
 import threading
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from tf2_msgs.msg import TFMessage
 
 from topomerge.errors import InputError
 from topomerge.fusion.bridge import EVENTS_TOPIC, TRANSFORMS_TOPIC, Bridge, parse_robots
-from topomerge.fusion.live import LiveMerger, describe_event
+from topomerge.fusion.live import LiveMerger, describe_event, hold_state
 from topomerge.io.bag_file import LASER_SCAN, OCCUPANCY_GRID, POINT_CLOUD, TRANSFORMS, Message
 from topomerge.io.streams import ODOMETRY, POSE, UNSURE_POSE
 
@@ -49,6 +50,8 @@ class TopomergeNode(Node):
         robots = parse_robots(self.declare_parameter("robots", ["a=/a/scan,/a/odom"]).value)
         folder = self.declare_parameter("folder", "topomerge_live").value
         self.inbox: queue.Queue[Message] = queue.Queue(maxsize=500)
+        self.held = ExitStack()
+        self.held.enter_context(hold_state(Path(folder)))
         self.bridge = Bridge(LiveMerger(Path(folder)), robots, lambda event: self.get_logger().info(describe_event(event)))
         self.failure: BaseException | None = None
         self.senders = {
@@ -157,6 +160,7 @@ def main() -> int:
     finally:
         rclpy.try_shutdown()
         node.worker.join()
+        node.held.close()
         node.destroy_node()
     counts = ", ".join(f"{n} {what}" for what, n in sorted(node.bridge.counts.items())) or "nothing came"
     print(f"topomerge: {node.failure or counts}", file=sys.stderr)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+import subprocess
+import sys
 import threading
 from collections.abc import Mapping
 from dataclasses import replace
@@ -230,6 +232,34 @@ def test_the_folder_is_checked_before_anything_is_read(tmp_path: Path, capsys: p
         told = capsys.readouterr().err
         assert reason in told and told.count("\n") == 1
     assert [p.name for p in house.iterdir()] == ["atlas.json"] and not (tmp_path / "new").exists()
+
+
+HOLD = """
+import sys
+from pathlib import Path
+from topomerge.fusion.live import hold_state
+with hold_state(Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_second_bridge_on_a_folder_is_refused_until_the_first_one_is_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The lock goes with its process, also where that is killed."""
+    live, words = tmp_path / "live", ["--robot", "a=/scan", "--mcap"]
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(buffer=io.BytesIO()))
+    first = subprocess.Popen([sys.executable, "-c", HOLD, str(live)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert first.stdout is not None and first.stdout.readline() == "held\n"
+    assert cli(["bridge", "-o", str(live), *words]) == 1
+    told = capsys.readouterr().err
+    assert "live: is kept by another bridge or ROS node that runs; end that, or give another folder" in told
+    assert told.count("\n") == 1 and live.exists()
+    first.kill()
+    first.communicate(timeout=60)
+    assert cli(["bridge", "-o", str(live), *words]) == 1 and "is no MCAP" in capsys.readouterr().err
+    assert list(live.iterdir()) == []
 
 
 def test_a_stream_of_nothing_writes_nothing(

@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from topomerge.cli.console import (
@@ -92,21 +93,26 @@ def run_serve(args: argparse.Namespace) -> int:
 
 def run_bridge(args: argparse.Namespace) -> int:
     """`topomerge bridge`: robots whose maps are joined while they drive."""
-    from pathlib import Path
-
-    from topomerge.fusion.bridge import Bridge, parse_robots
-    from topomerge.fusion.live import STATE_FILE, LiveMerger, describe_event
-    from topomerge.io.streams import FOXGLOVE, Connection, StreamCounts, read_foxglove, read_mcap, read_rosbridge
+    from topomerge.fusion.live import hold_state
 
     if sum(bool(way) for way in (args.rosbridge, args.foxglove, args.mcap)) != 1:
         raise InputError("bridge: give one of --rosbridge, --foxglove and --mcap")
+    with hold_state(Path(args.output)):
+        return _join_robots(args, Path(args.output))
+
+
+def _join_robots(args: argparse.Namespace, folder: Path) -> int:
+    """Go through the stream, and say what came of it."""
+    from topomerge.fusion.bridge import Bridge, parse_robots
+    from topomerge.fusion.live import STATE_FILE, LiveMerger, describe_event
+    from topomerge.io.streams import FOXGLOVE, Connection, StreamCounts, read_foxglove, read_mcap, read_rosbridge
 
     def tell(event: Mapping[str, Any]) -> None:
         print_line(json.dumps(event, ensure_ascii=False) if args.json else describe_event(event))
         with guard_printing():
             sys.stdout.flush()
 
-    bridge = Bridge(LiveMerger(Path(args.output)), parse_robots(args.robots), tell, **collect_given(args, "every"))
+    bridge = Bridge(LiveMerger(folder), parse_robots(args.robots), tell, **collect_given(args, "every"))
     topics, counts = bridge.list_topics(), StreamCounts()
     try:
         if args.rosbridge:
@@ -123,7 +129,7 @@ def run_bridge(args: argparse.Namespace) -> int:
         message = ", ".join(f"{n} {what}" for what, n in sorted(bridge.counts.items())) or "nothing came"
         left_out = sum(robot.left_out for robot in bridge.merger.robots.values())
         full = f", {left_out:,} points left out, as a map was full" if left_out else ""
-        kept = f"-> {args.output}" if (Path(args.output) / STATE_FILE).exists() else "(nothing is written)"
+        kept = f"-> {args.output}" if (folder / STATE_FILE).exists() else "(nothing is written)"
         print_line(f"{counts.read} messages: {message}{full}; {counts.broken} unreadable {kept}", sys.stderr)
     return 0 if bridge.merger.links else 2
 

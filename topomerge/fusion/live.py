@@ -10,7 +10,8 @@ import json
 import logging
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
@@ -22,6 +23,7 @@ from topomerge import archive
 from topomerge.archive import convert_to_plain, replace_on_success
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
+from topomerge.fusion.atlas.folder import hold_folder
 from topomerge.io.maps import save_map
 from topomerge.landmarks.settle import find_observations
 from topomerge.matching.poses import wrap_yaw
@@ -140,6 +142,33 @@ class LiveLink:
     probability: float
 
 
+def check_folder(folder: Path) -> None:
+    """Check that a folder holds a state, or may hold one.
+
+    Raises:
+        InputError: it can't.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file; give the name of a folder")
+    if not os.access(next(place for place in (folder, *folder.absolute().parents) if place.exists()), os.W_OK):
+        raise InputError(f"{folder}: can't be written; give a folder that is yours")
+    empty = not folder.exists() or all(path.name.startswith(".") for path in folder.iterdir())
+    if not empty and not (folder / STATE_FILE).exists():
+        raise InputError(f"{folder}: holds something else, and no {STATE_FILE}; give a new folder")
+
+
+@contextmanager
+def hold_state(folder: Path) -> Iterator[None]:
+    """Keep the state in a folder for this process: two that go on with one state would each overwrite what the other one saw.
+
+    Raises:
+        InputError: another process keeps it, or the folder can't hold a state.
+    """
+    check_folder(folder)
+    with hold_folder(folder, "is kept by another bridge or ROS node that runs; end that, or give another folder"):
+        yield
+
+
 @dataclass(eq=False)
 class LiveMerger:
     """The robots and what is believed of their maps.
@@ -162,14 +191,9 @@ class LiveMerger:
     def __post_init__(self) -> None:
         self._kept: dict[str, tuple[Any, ...]] = {}
         self._warned = False
-        if self.folder.exists() and not self.folder.is_dir():
-            raise InputError(f"{self.folder}: is a file; give the name of a folder")
-        if not os.access(next(place for place in (self.folder, *self.folder.absolute().parents) if place.exists()), os.W_OK):
-            raise InputError(f"{self.folder}: can't be written; give a folder that is yours")
+        check_folder(self.folder)
         if (self.folder / STATE_FILE).exists():
             self._load()
-        elif self.folder.exists() and any(not path.name.startswith(".") for path in self.folder.iterdir()):
-            raise InputError(f"{self.folder}: holds something else, and no {STATE_FILE}; give a new folder")
 
     def get_robot(self, name: str, frame: str = "") -> GrowingMap:
         """Return the map of a robot, a new one of a new robot or in another frame.

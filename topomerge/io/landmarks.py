@@ -64,8 +64,8 @@ def read_tables_beside(path: Path, poses: str | None, suffixes: Sequence[str]) -
     readers = {TABLE_NAME: read_landmark_file, RADIO_TABLE: lambda table: read_radio_beside(table, path, poses)}
     found, told = [], []
     for name, read in readers.items():
-        table, shared = _find_table(path, name), path.with_name(name)
-        if table is None and shared.is_file() and shared != path and not path.is_dir():
+        table, shared = _find_table(path, name), _find_shared_table(path, name)
+        if table is None and shared is not None:
             if _is_alone(path, suffixes):
                 table = shared
             else:
@@ -77,6 +77,31 @@ def read_tables_beside(path: Path, poses: str | None, suffixes: Sequence[str]) -
             if lost := count_lost(found[-1]):
                 told.append(f"{table}: {lost} landmark{'s' * (lost != 1)} without a place, a room and a storey; say where")
     return found, told
+
+
+def _find_shared_table(path: Path, name: str) -> Path | None:
+    """The table beside a file that is named as in a folder of scans."""
+    shared = path.with_name(name)
+    return shared if shared.is_file() and shared != path and not path.is_dir() else None
+
+
+def list_companions(path: Path, suffixes: Sequence[str]) -> list[Path]:
+    """List what is read with a file: the tables beside it, as of `read_tables_beside`, and the trajectory of the radio's.
+
+    Args:
+        suffixes: of files that can be read.
+    """
+    from topomerge.io.radio_csv import find_trajectory
+
+    found: list[Path] = []
+    for name in (TABLE_NAME, RADIO_TABLE):
+        table, shared = _find_table(path, name), _find_shared_table(path, name)
+        if table is None and shared is not None and _is_alone(path, suffixes):
+            table = shared
+        if table is not None:
+            trajectory = find_trajectory(table, path) if name == RADIO_TABLE else None
+            found += [table] if trajectory is None else [table, trajectory]
+    return found
 
 
 def count_lost(landmarks: Landmarks) -> int:

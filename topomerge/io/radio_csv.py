@@ -40,12 +40,21 @@ def read_radio_beside(table: Path, path: Path, poses: str | None = None) -> Land
     Raises:
         InputError: there is no trajectory, or as `read_radio_csv`.
     """
-    stems = TRAJECTORIES if path.is_dir() else tuple(f"{path.stem}.{name}" for name in TRAJECTORIES) + TRAJECTORIES
-    places = [Path(poses)] if poses else [table.parent / name for name in stems]
-    trajectory = next((place for place in places if place.is_file()), None)
+    trajectory = find_trajectory(table, path, poses)
     if trajectory is None:
-        raise InputError(f"{table}: has no trajectory; put {stems[0]} (time tx ty tz qx qy qz qw) beside it, or take it away")
+        first = _list_trajectories(path)[0]
+        raise InputError(f"{table}: has no trajectory; put {first} (time tx ty tz qx qy qz qw) beside it, or take it away")
     return read_radio_csv(table, read_trajectory(trajectory))
+
+
+def find_trajectory(table: Path, path: Path, poses: str | None = None) -> Path | None:
+    """Find the trajectory of a table of readings beside a scan, as of `read_radio_beside`; None where there is none."""
+    places = [Path(poses)] if poses else [table.parent / name for name in _list_trajectories(path)]
+    return next((place for place in places if place.is_file()), None)
+
+
+def _list_trajectories(path: Path) -> tuple[str, ...]:
+    return TRAJECTORIES if path.is_dir() else tuple(f"{path.stem}.{name}" for name in TRAJECTORIES) + TRAJECTORIES
 
 
 def read_radio_csv(path: Path, trajectory: Trajectory) -> Landmarks:

@@ -293,6 +293,29 @@ def test_words_of_what_is_taken_apart_and_joined():
     assert list(iter_changes({"a": 0, "b": 0, "c": 1, "d": 0}, before)) == []
 
 
+def test_a_change_of_a_lone_table_or_a_trajectory_has_its_scan_read_again(apart, tmp_path):
+    """Tables that are named as in a folder of scans belong to the only file of theirs."""
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for name in ("a.ply", "landmarks.csv", "radio.csv", "poses.txt"):
+        (folder / name).write_text("1")
+
+    def look() -> list[str]:
+        lines = Lines()
+        lines.map = lambda path: (lines.read.append(path.name), room(len((folder / "landmarks.csv").read_text())))[1]
+        watch(folder, tmp_path / "site", lines, replacing=False).update()
+        return lines.read
+
+    assert look() == ["a.ply"] and look() == []
+    for name in ("landmarks.csv", "radio.csv", "poses.txt"):
+        (folder / name).write_text("22")
+        assert look() == ["a.ply"] and look() == []
+    (folder / "b.ply").write_text("1")
+    assert look() == ["a.ply", "b.ply", "poses.txt"] and look() == []  # the tables are nobody's now
+    (folder / "landmarks.csv").write_text("333")
+    assert look() == []
+
+
 def test_a_table_of_landmarks_is_no_map_but_its_map_is_read_again(scans, apart, tmp_path):
     seen(scans, tmp_path / "site")
     (scans / "1.landmarks.csv").write_text("kind,value,room\nname,Lab,0\n")

@@ -12,7 +12,7 @@ import logging
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from topomerge.fusion.atlas.solve import AtlasSettings
 from topomerge.types import EDITED, Array, Sim3, convert_pose_to_maps, read_levelling
 
 NEW, NEXT, LOCK, GONE = ".new", ".next", ".lock", "gone.json"
+BUSY = "is being changed by another process; wait for it"
 LOCK_POLL = 0.1  # s between two looks at a lock that another process holds
 log = logging.getLogger(__name__)
 ATLAS_FORMAT = 1
@@ -48,7 +49,7 @@ def change_folder(folder: Path, gone: list[str], patience: float | None = None) 
     created = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with _lock_folder(folder, patience):
+        with lock_folder(folder, patience):
             try:
                 _finish(folder)
                 shutil.rmtree(folder / NEW, ignore_errors=True)
@@ -84,7 +85,7 @@ def finish_change(folder: Path) -> None:
     """
     if (folder / NEXT).is_dir():
         try:
-            with _lock_folder(folder, None):
+            with lock_folder(folder, None):
                 _finish(folder)
         except OSError as error:
             raise InputError(f"{folder}: can't be locked ({error.strerror or error}); is it writable?") from error
@@ -118,8 +119,33 @@ def _finish(folder: Path) -> None:
 
 
 @contextmanager
-def _lock_folder(folder: Path, patience: float | None) -> Iterator[None]:
-    """One change at a time; the others wait."""
+def hold_folder(folder: Path, refusal: str) -> Iterator[None]:
+    """Keep a folder for this process while it writes into it now and then; nothing is left of a folder that stays empty.
+
+    Args:
+        refusal: what to do where another process keeps it, in words.
+
+    Raises:
+        InputError: another process keeps it, or it can't be written.
+    """
+    created = not folder.exists()
+    with ExitStack() as held:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            held.enter_context(lock_folder(folder, 0, refusal))
+        except OSError as error:
+            raise InputError(f"{folder}: can't be written ({error.strerror or error}); give another folder") from error
+        held.callback(_restore_folder, folder, created)
+        yield
+
+
+@contextmanager
+def lock_folder(folder: Path, patience: float | None, refusal: str = BUSY) -> Iterator[None]:
+    """Lock a folder: one process at a time, the others wait. The lock of a process that is killed goes with it.
+
+    Raises:
+        InputError: it takes longer than `patience`, s, which is told by `refusal`.
+    """
     lock, waits = FileLock(folder / LOCK, poll_interval=LOCK_POLL), False
     while not lock.is_locked:
         try:
@@ -128,7 +154,7 @@ def _lock_folder(folder: Path, patience: float | None) -> Iterator[None]:
             folder.mkdir(parents=True, exist_ok=True)
         except Timeout:
             if waits or patience == 0:
-                raise InputError(f"{folder}: is being changed by another process; wait for it") from None
+                raise InputError(f"{folder}: {refusal}") from None
             log.warning("%s: is being changed by another process; waiting for it", folder)
             waits = True
     try:

@@ -25,7 +25,7 @@ from topomerge.fusion.atlas.solve import Proposed
 from topomerge.fusion.atlas.store import Change, Report, build_entry, change
 from topomerge.fusion.fuse import match_common_rooms
 from topomerge.fusion.inputs import check_cells, check_units, resolve_link_threshold
-from topomerge.io.landmarks import find_landmark_file, is_landmark_file
+from topomerge.io.landmarks import find_landmark_file, is_landmark_file, list_companions
 from topomerge.io.listing import format_json
 from topomerge.io.maps import load_map
 from topomerge.io.points import PICTURES, list_suffixes
@@ -122,10 +122,12 @@ def _name_file(file: Path, path: Path) -> str:
 
 
 def files_of(path: Path) -> list[Path]:
-    """Return the file itself and the landmarks beside it, or all files in a folder, in their order; without hidden ones."""
+    """Return the file itself and the tables that are read with it, or all files in a folder, in their order; without hidden
+    ones."""
     if not path.is_dir():
         companion = find_landmark_file(path)
-        return [path] if companion is None else [path, companion]
+        own = [companion] if companion is not None else []
+        return [path, *(own if path.suffix.lower() == ".tmap" else list_companions(path, list_suffixes()))]
     inside = (p for p in path.rglob("*") if not any(part.startswith(".") for part in p.relative_to(path).parts))
     return sorted(p for p in inside if p.is_file())
 
@@ -283,7 +285,9 @@ class FolderWatcher:
         for p in sorted({p for p in own if p.is_symlink() and not p.exists()} - self._broken):
             self.tell(f"{p}: is a link to what is not there; it is skipped until it is", True)
             self._broken.add(p)
-        return [p for p in own if (p.is_dir() and p != self.atlas.resolve()) or (p.is_file() and p.suffix.lower() in kinds)]
+        own = [p for p in own if (p.is_dir() and p != self.atlas.resolve()) or (p.is_file() and p.suffix.lower() in kinds)]
+        beside = {file for p in own if p.is_file() for file in files_of(p)[1:]}  # a trajectory is no cloud of its own
+        return [p for p in own if p not in beside]
 
     def _iter_batches(self, paths: list[str]) -> Iterator[list[_ReadFile]]:
         """Read files, as many as are written at once."""
