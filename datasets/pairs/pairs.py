@@ -233,7 +233,7 @@ def simulate_signs(building: Building, source: Pair | PointCloud, reader: Reader
         visited = [[] if source.labels is None else np.unique(source.labels[source.labels >= 0]).tolist()]
         frames = [frame or Sim3()]
     elif source.kind == "other-building":
-        raise InputError("signs: the doors of the other building are not known; leave --signs or --hard out")
+        raise InputError("landmarks: the doors of the other building are not known; leave --hard out, or --landmarks and --signs")
     else:
         assert source.frames is not None
         visited, frames = [list(rooms) for rooms in source.visited], list(source.frames)

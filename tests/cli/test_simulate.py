@@ -129,8 +129,10 @@ def test_signs_lie_beside_the_clouds(tmp_path: Path, capsys: pytest.CaptureFixtu
     kinds = [read_landmark_file(tmp_path / f"z/{side}.landmarks.csv") for side in "ab"]
     assert 0 < kinds[0].is_kind("text").sum() < len(a) and all(of.is_kind("radio").sum() > 20 for of in kinds)
     assert set(kinds[0].select(kinds[0].is_kind("radio")).get_values()) & set(kinds[1].get_values())
-    hard = [*words, "--hard", "other-building", "--signs", "good", "-o", str(tmp_path / "w")]
-    assert cli(hard) == 1 and "signs: the doors of the other building are not known" in capsys.readouterr().err
+    for which in (["--signs", "good"], ["--landmarks", "wifi"]):
+        assert cli([*words, "--hard", "other-building", *which, "-o", str(tmp_path / "w")]) == 1
+        told = capsys.readouterr().err
+        assert "landmarks: the doors of the other building are not known; leave --hard out, or --landmarks and --signs" in told
     assert not (tmp_path / "w").exists()
 
 

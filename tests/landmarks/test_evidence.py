@@ -70,6 +70,23 @@ def test_another_number_at_the_place_contradicts_by_hand():
     assert evidence.list_sentences() == ["signs contradict: 2.113 against 4.850"]
 
 
+@pytest.mark.parametrize(
+    ("one", "other", "sentences"),
+    [
+        ("Salida", "Salid", ["sign cut off: Salid may be Salida"]),
+        ("Ausgang", "Notausgang", ["sign cut off: Ausgang may be Notausgang"]),
+        ("2.113", "2.1", ["sign cut off: 2.1 may be 2.113"]),
+        ("2.113", "2.11", []),
+        ("Bahnhofstr", "Bahnhof", ["sign Bahnhofstr agrees; nothing contradicts"]),
+        ("Salida", "Sali", ["sign cut off: Sali may be Salida"]),
+        ("Salida", "Sa", ["signs contradict: Salida against Sa"]),
+        ("Salida", "Salud", ["signs contradict: Salida against Salud"]),
+    ],
+)
+def test_a_text_that_lost_an_end_contradicts_nothing(one, other, sentences):
+    assert score([one], [other]).list_sentences() == sentences
+
+
 def test_an_exit_sign_says_little_and_one_on_every_door_nothing():
     common, rare = lead(score(["EXIT"], ["EXIT"])), lead(score(["2.113"], ["2.113"]))
     assert max(common.values()) < 1.0 and min(rare.values()) > 3.0

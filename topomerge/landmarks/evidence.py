@@ -35,7 +35,7 @@ from topomerge.landmarks.likelihood import (
 )
 from topomerge.landmarks.radio import MOST_RATIO, SAME_STOREY, STOREY_HEIGHT, WRONG, score_radio
 from topomerge.landmarks.sightings import Sightings, build_sightings, transform_places
-from topomerge.landmarks.text import quote_text
+from topomerge.landmarks.text import is_cut_off, quote_text
 from topomerge.types import Array, Deformation, Landmarks, Sim3, TopometricMap
 
 FALL = 0.12  # hPa a metre
@@ -127,7 +127,8 @@ class Witness:
         values: what stands in map a and in map b.
         rows: of the tables of both.
         at: place in the frame of each map, m.
-        verdict: "agrees", "contradicts", or "elsewhere": the same string, far away.
+        verdict: "agrees", "contradicts", "cut off": the one may be the other, of which an end is missing, which says little; or
+            "elsewhere": the same string, far away.
     """
 
     kind: str
@@ -207,8 +208,9 @@ class LandmarkEvidence:
 def describe_witnesses(kind: str, witnesses: Sequence[Witness], shown: int = 3) -> str:
     """Describe the landmarks of a kind: "signs 2.113 and 2.114 agree"; nothing where none testifies."""
     label = KINDS[kind].words if kind in KINDS else kind
-    agree, against, away = ([w for w in witnesses if w.verdict == v] for v in ("agrees", "contradicts", "elsewhere"))
-    if not (agree or against or away):
+    verdicts = ("agrees", "contradicts", "cut off", "elsewhere")
+    agree, against, lost, away = ([w for w in witnesses if w.verdict == v] for v in verdicts)
+    if not (agree or against or lost or away):
         return ""
 
     def name(listed: Sequence[Witness]) -> str:
@@ -224,6 +226,10 @@ def describe_witnesses(kind: str, witnesses: Sequence[Witness], shown: int = 3) 
         pairs = ", ".join(f"{quote_text(w.values[0])} against {quote_text(w.values[1])}" for w in against[:shown])
         more = f" and {len(against) - shown} more" if len(against) > shown else ""
         parts.append(f"{label}s contradict: {pairs}{more}")
+    if lost:
+        pairs = ", ".join("{} may be {}".format(*map(quote_text, sorted(w.values, key=len))) for w in lost[:shown])
+        more = f" and {len(lost) - shown} more" if len(lost) > shown else ""
+        parts.append(f"{label}{'s' * (len(lost) > 1)} cut off: {pairs}{more}")
     if away:
         parts.append(f"{label}{'s' * (len(away) > 1)} {name(away)} stand{'s' * (len(away) == 1)} elsewhere in the other map")
     return "; ".join(parts)
@@ -408,7 +414,8 @@ def _list_witnesses(
         times = sum(weight * score_pair(*keys[k], error, kind) / share[k] for error, weight in READERS)
         sure = max(a.sigma[i], b.sigma[j]) <= rules.surest
         if met.turned[k] or (sure and times < probability[k] / 2):
-            out.append(_build_witness(a, b, i, j, kind, "contradicts"))
+            lost = kind == "text" and not met.turned[k] and is_cut_off(*keys[k])
+            out.append(_build_witness(a, b, i, j, kind, "cut off" if lost else "contradicts"))
         elif times > 2 * (1.0 if keys[k][0] == keys[k][1] else probability[k]):
             out.append(_build_witness(a, b, i, j, kind, "agrees"))
     return out + [_build_witness(a, b, i, j, kind, "elsewhere") for i, j in far]

@@ -116,10 +116,15 @@ def score_reading(one: str, other: str, error: float) -> float:
     same = max(max(len(one), len(other), 1) - alike - changed - shifted, 0)
     read = (1 - wrong) ** same * (wrong * SUBSTITUTED * ALIKE_SHARE / ALIKE_CHARACTERS) ** alike
     read *= (wrong * SUBSTITUTED * (1 - ALIKE_SHARE) / ALPHABET) ** changed * (wrong * SHIFTED / ALPHABET**0.5) ** shifted
-    short, long = sorted((one, other), key=len)
-    if len(short) < len(long) <= 2 * len(short) and (long.startswith(short) or long.endswith(short)):
-        read = max(read, CUT_OFF * (1 - wrong) ** len(short))
+    if is_cut_off(one, other):
+        read = max(read, CUT_OFF * (1 - wrong) ** min(len(one), len(other)))
     return float(read)
+
+
+def is_cut_off(one: str, other: str) -> bool:
+    """May one of two folded strings be the other one, of which an end of half its length at most is missing?"""
+    short, long = sorted((one, other), key=len)
+    return len(short) < len(long) <= 2 * len(short) and (long.startswith(short) or long.endswith(short))
 
 
 def score_neighbour(one: str, other: str) -> float:
