@@ -32,7 +32,7 @@ from topomerge.io.maps import save_map
 from topomerge.types import Array, PointCloud, Sim3
 
 SCANS = ("station", "sweep", "slice", "frame", "walk")
-MORE_SCANS = ("turn", "drive")  # what helps where a frame or a slice tells nothing; the odds are not fitted to them
+MORE_SCANS = ("turn", "drive")  # what helps where a frame or a slice tells nothing
 SENSOR_OF = {"station": "tls", "sweep": "lidar", "slice": "laser2d", "frame": "depth", "walk": "depth"}
 SENSOR_OF |= {"turn": "depth", "drive": "laser2d"}
 RAYS_OF = {"station": 60_000, "sweep": 32_000, "slice": 1080, "frame": 30_000, "walk": 12_000}  # a pose

@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 from topomerge import archive
 from topomerge.code_digest import compute_code_digest
 from topomerge.datasets.core.builder import limit_threads
-from topomerge.datasets.pairs.localisation import SCANS, load_located_map, make_located_map, make_located_scan
+from topomerge.datasets.pairs.localisation import MORE_SCANS, SCANS, load_located_map, make_located_map, make_located_scan
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.locate import LOCATE, find_places, measure_chance, prepare_query
 from topomerge.fusion.atlas.place_index import PlaceIndex
@@ -30,6 +30,7 @@ from topomerge.training.task_settings import LocateOdds
 from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
 
+KINDS = (*SCANS, *MORE_SCANS)
 RIGHT = (0.5, np.radians(6.0))  # m and rad: a pose that is learned as right
 FOLDS = 6
 MAKERS = ("topomerge.fusion.atlas.place_search", "topomerge.datasets.pairs.localisation")  # of features and scans
@@ -57,7 +58,7 @@ class LocateWeights(NamedTuple):
 def build_rows(split: str, count: int, folder: Path, log_line: LogFn) -> list[LocateRows]:
     """Make an atlas of so many maps, and judge poses of scans of each building and of as many without a map; rows are cached."""
     folder.mkdir(parents=True, exist_ok=True)
-    key = f"{compute_code_digest(*MAKERS)}_{count}"
+    key = f"{compute_code_digest(*MAKERS)}_{count}x{len(KINDS)}"
     with limit_threads():
         maps = [load_located_map(make_located_map(split, k, folder)) for k in range(count)]
         index, rows = None, []
@@ -75,8 +76,8 @@ def build_rows(split: str, count: int, folder: Path, log_line: LogFn) -> list[Lo
 
 
 def list_scans(building: int) -> list[tuple[str, bool]]:
-    """List the kinds of scans of a building, and whether each is of one without a map: two in five kinds are."""
-    return [(kind, no) for n, kind in enumerate(SCANS) for no in ((False, True) if (building + n) % 3 == 0 else (False,))]
+    """List the kinds of scans of a building, and whether each is of one without a map: every third kind also is."""
+    return [(kind, no) for n, kind in enumerate(KINDS) for no in ((False, True) if (building + n) % 3 == 0 else (False,))]
 
 
 def build_row(index: PlaceIndex, own: Any, split: str, number: int, kind: str, negative: bool) -> LocateRows | None:
