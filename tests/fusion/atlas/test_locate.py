@@ -82,8 +82,12 @@ def test_a_turned_scan_gives_the_pose_that_turns_it_back(frame: Sim3) -> None:
 
 
 def test_a_scan_of_another_building_is_not_here() -> None:
-    answer = locate(PlaceIndex.from_maps({"stranger": stranger()}), scan_part())
+    """As sure as it may be: by the usual .99 it is told only that no place fits."""
+    atlas = PlaceIndex.from_maps({"stranger": stranger()})
+    answer = locate(atlas, scan_part(), replace(LOCATE, absent=0.9))
     assert answer.status == "not here" and not answer.told and answer.nowhere >= 0.5 and "not here" in answer.reason
+    usual = locate(atlas, scan_part())
+    assert usual.status == "ambiguous" and not usual.told and "no place fits well" in usual.reason
 
 
 def test_two_copies_of_one_map_cannot_be_told_apart() -> None:
