@@ -23,7 +23,7 @@ from topomerge.landmarks.radio import (
     load_radio_law,
     score_radio,
 )
-from topomerge.landmarks.radio_search import build_radio_index, propose_radio_poses, rank_maps
+from topomerge.landmarks.radio_search import build_radio_index, compute_pose_features, propose_radio_poses, rank_maps
 from topomerge.registration.posterior import POSTERIOR
 from topomerge.registration.posterior import WRONG as ALTERNATIVES
 from topomerge.types import Landmarks, Sim3, build_landmarks, join_landmarks
@@ -147,6 +147,20 @@ def test_poses_are_found_though_access_points_moved():
     assert again.pose == best.pose and np.array_equal(again.covariance, best.covariance)
 
 
+def test_a_pose_of_few_places_is_told_less_sure_than_its_law_has_it():
+    """The odds that ship: surer with more places, a smaller standard deviation, a larger lead; and never surer than the law."""
+    few, many = (propose_radio_poses(build(hear(2, last)), build(hear(2, last, session=1), FRAME)) for last in (12, 45))
+    assert few[0].places < many[0].places and few[0].probability < many[0].probability
+    assert np.allclose(compute_pose_features(few), [1.0, *np.log([few[0].sigma, few[0].score - few[1].score, few[0].places])])
+    weights = load_radio_law().pose_odds
+    assert weights[1] < 0 < weights[2] and weights[3] > 0
+    bare = propose_radio_poses(
+        build(hear(2, 12)), build(hear(2, 12, session=1), FRAME), law=replace(load_radio_law(), pose_odds=())
+    )
+    assert bare[0].pose == few[0].pose and few[0].probability <= bare[0].probability
+    assert sum(pose.probability for pose in few) <= 1.0
+
+
 def test_maps_that_share_nothing_are_told_as_unsure():
     strangers = propose_radio_poses(build(hear(2, 40)), build(hear(2, 40, session=1, seed=4)))
     assert not any(p.is_sure for p in strangers)
@@ -227,6 +241,8 @@ def test_a_damaged_law_is_refused():
         {},
         {**data, "discount": -1},
         {**data, "blur": "x"},
+        {**data, "pose_odds": [1.0]},
+        {**data, "pose_odds": [float("nan")] * 4},
         {**data, "log_density": [[1.0]]},
         {**data, "log_density": nan},
     ):

@@ -9,7 +9,7 @@ loss of `datasets.simulation.radio`, and scores right and wrong storeys.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -39,16 +39,25 @@ from topomerge.landmarks.radio import (
     load_radio_law,
     score_radio,
 )
-from topomerge.landmarks.radio_search import build_radio_index, propose_radio_poses, rank_maps
+from topomerge.landmarks.radio_search import RIGHT, build_radio_index, propose_radio_poses, rank_maps
 from topomerge.statistics import compute_exact_interval
-from topomerge.training.radio_law import count_pairs, draw_cases, fit_left_out, measure_log_loss, read_storeys, score_cases
+from topomerge.training.radio_law import (
+    build_trials,
+    count_pairs,
+    draw_cases,
+    fit_left_out,
+    fit_left_out_odds,
+    measure_log_loss,
+    read_storeys,
+    score_cases,
+)
 from topomerge.types import Landmarks, LogFn, Sim3
 
 MAKERS = ("topomerge.landmarks.radio_search", "topomerge.training.radio_law", "topomerge.datasets.simulation.radio")
 WALKS = (0, 15, 5)  # of each map; 0: half of all
 SEED, VERDICT_SEED = 1000, 2000  # first of the splits; of those of small maps
 TRIALS = 20  # of a storey
-FAR, ALIKE = 5.0, 0.5  # m of error that must be told as unsure; likeness of pairs that are
+FAR, ALIKE = RIGHT, 0.5  # m of error that must be told as unsure; likeness of pairs that are
 QUERIES = ("all scans", "one walk", "one scan")
 LEVELS = {"1f": 0, "2f": 1, "3f": 2, "6f": 5, "7f": 6, "8f": 7, "b1f": -1}
 DENSITY = 1.5  # access points for 100 m2
@@ -77,20 +86,28 @@ def measure(settings: Settings, log_line: LogFn) -> list[Row]:
     if settings.data.set == "storeys":
         items = {f"{building} {part}": (data, building, part) for building in STOREYS for part in range(PARTS)}
         return measure_missing(path, items, measure_building, log_line, settings)
-    walks = {f"{name} {walks or 'all'}": (name, walks, trials) for name in WIFI_STOREYS for walks in WALKS}
+    kept = str(Path(settings.cache) / "radio")
+    walks = {f"{name} {walks or 'all'}": (name, walks, trials, kept) for name in WIFI_STOREYS for walks in WALKS}
     return measure_missing(path, walks, measure_walks, log_line, settings)
 
 
 @cache
-def load_left_out() -> tuple[dict[str, WifiStorey], dict[str, RadioLaw]]:
-    """Load the storeys, and for each the law that was fitted on the others."""
+def load_left_out(folder: str) -> tuple[dict[str, WifiStorey], dict[str, RadioLaw]]:
+    """Load the storeys, and for each the law, and the odds of poses, that were fitted on the others."""
     storeys = read_storeys()
-    return storeys, fit_left_out(count_pairs(storeys), load_radio_law().discount)
+    counts = count_pairs(storeys)
+    odds = fit_left_out_odds(build_trials(storeys, counts, Path(folder), lambda line: None))
+    laws = fit_left_out(counts, load_radio_law().discount)
+    return storeys, {name: replace(law, pose_odds=odds[name]) for name, law in laws.items()}
 
 
-def measure_walks(name: str, walks: int, trials: int) -> Row:
-    """Measure poses of two sets of walks on a storey; of all walks, also the rank of the storey and verdicts of small maps."""
-    storeys, laws = load_left_out()
+def measure_walks(name: str, walks: int, trials: int, folder: str) -> Row:
+    """Measure poses of two sets of walks on a storey; of all walks, also the rank of the storey and verdicts of small maps.
+
+    Args:
+        folder: of the trials that the odds of poses are fitted to.
+    """
+    storeys, laws = load_left_out(folder)
     law, rows = laws[name], []
     for trial in range(trials):
         a, b, truth = split_walks(storeys[name], SEED + trial, walks)

@@ -41,6 +41,7 @@ STRETCHES = (0.6, 1.0, 1.7)  # metres of the mall that a metre of another buildi
 LEAKY, LEAKY_DISTANCE = 0.1, 10.0  # probability that a floor of another building is as light as so many m of one storey
 REPLACED = 0.02  # probability that all access points were replaced between two maps
 FOREIGN = 0.02  # probability that two scans of two buildings are alike at all
+N_POSE_FEATURES = 4
 MOST_RATIO = 8.0  # of a log likelihood ratio: radio never says more
 SUSPECTS = 3  # addresses that say the most: what is left without any one of them is believed
 
@@ -212,12 +213,14 @@ class RadioLaw:
         log_density: (APART, D, K) log probability of each class of likeness, by storeys apart and class of distance.
         discount: factor of log likelihoods, as pairs of scans are not independent; `pose_discount` that of positions.
         blur: m, standard deviation of a pose beside what its likelihood says: positions of scans are not exact.
+        pose_odds: weights of the log odds that a pose is right, of `radio_search.compute_pose_features`; empty: not fitted.
     """
 
     log_density: Array
     discount: float = 1.0
     pose_discount: float = 1.0
     blur: float = 0.5
+    pose_odds: tuple[float, ...] = ()
 
     @cached_property
     def fine(self) -> Array:
@@ -264,11 +267,13 @@ def convert_law(data: Mapping[str, Any]) -> RadioLaw:
     """
     try:
         density = np.array(data["log_density"], float)
-        law = RadioLaw(density, float(data["discount"]), float(data["pose_discount"]), float(data["blur"]))
+        odds = tuple(float(weight) for weight in data["pose_odds"])
+        law = RadioLaw(density, float(data["discount"]), float(data["pose_discount"]), float(data["blur"]), odds)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{RADIO_LAW_FILE}: not the law of this version ({error}); install the package again") from error
     numbers = np.array([law.discount, law.pose_discount, law.blur])
     right = density.shape == (APART, len(DISTANCE_EDGES), len(LIKENESS_EDGES) + 1) and bool(np.isfinite(density).all())
+    right &= len(odds) == N_POSE_FEATURES and bool(np.isfinite(odds).all())
     if not right or not (np.isfinite(numbers) & (numbers > 0)).all():
         raise InputError(f"{RADIO_LAW_FILE}: not the law of this version; install the package again")
     return law

@@ -8,7 +8,7 @@ place to place, and would bend the pose.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage, sparse
@@ -33,7 +33,9 @@ TURNS_APART, CELLS_APART = np.radians(15.0), 10.0  # poses that differ by less a
 COARSE, EXACT = 25.0, 13.0  # m, up to which pairs of scans tell a pose
 REFINED = 400  # scans of a map, by which candidates are refined
 LEAST_PLACES = 3  # of each map: fewer have no turn
-SURE, EXACT_ENOUGH = 0.9, 2.5  # probability and m of the standard deviation, from which on a pose is told as sure
+RIGHT = 5.0  # m that b's scans may be off in the mean
+# Probability from which on a pose is told as sure: of 186 trials on storeys that were left out none of those was wrong.
+SURE = 0.95
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,27 +45,38 @@ class RadioPose:
     Args:
         pose: T_ab.
         score: log likelihood ratio against scans that have nothing to do with each other.
-        probability: that it is the right one.
+        probability: that b's scans lie within `RIGHT` of where they are.
         covariance: (3, 3) of x, y (m, of the middle of b's scans) and yaw (rad).
+        sigma: standard deviation of where b's scans lie, m.
+        places: that the map with fewer has: how much testifies.
     """
 
     pose: Sim3
     score: float
     probability: float
     covariance: Array
+    sigma: float
+    places: float
 
     def __iter__(self) -> Iterator[Sim3 | float]:
         return iter((self.pose, self.score))
 
     @property
-    def sigma(self) -> float:
-        """Standard deviation of the position of b's middle, m."""
-        return float(np.sqrt(max(np.trace(self.covariance[:2, :2]), 0.0)))
-
-    @property
     def is_sure(self) -> bool:
         """Is it told as sure?"""
-        return self.probability >= SURE and self.sigma <= EXACT_ENOUGH
+        return self.probability >= SURE
+
+
+def compute_pose_features(poses: Sequence[RadioPose]) -> Array:
+    """Compute (4,) features of the odds that the likeliest of some poses is right: 1, and the logarithms of its standard
+    deviation, of its score above the next one's, and of how many places testify.
+
+    The law alone is too sure where few do: what is alike at a distance differs from place to place, and a walk's readings share
+    one phone and one way of laying them out.
+    """
+    best, rivals = poses[0], [pose.score for pose in poses[1:2]]
+    margin = best.score - max([0.0, *rivals])
+    return np.array([1.0, *np.log([best.sigma, max(margin, 0.1), max(best.places, 1.0)])])
 
 
 def propose_radio_poses(a: TopometricMap, b: TopometricMap, n: int = 5, law: RadioLaw | None = None) -> list[RadioPose]:
@@ -92,10 +105,16 @@ def propose_scan_poses(a: RadioScans, b: RadioScans, n: int, law: RadioLaw) -> l
     kept = _keep_best([search.refine(at) for at, _ in coarse[: max(n, 2)]])
     chances = np.exp(law.pose_discount * np.array([score for _, score in kept] + [0.0]) - law.pose_discount * max(kept[0][1], 0))
     chances /= chances.sum()
-    return [
-        RadioPose(_build_pose(at, middle, height), score, float(p), search.measure_covariance(at))
-        for (at, score), p in zip(kept[:n], chances, strict=False)
-    ]
+    poses, places = [], min(float(scans.share.sum()) for scans in (a, b))
+    for (at, score), p in zip(kept, chances, strict=False):
+        covariance = search.measure_covariance(at)
+        sigma = float(np.sqrt(max(np.trace(covariance[:2, :2]) + covariance[2, 2] * search.reach**2, 0.0)))
+        poses.append(RadioPose(_build_pose(at, middle, height), score, float(p), covariance, sigma, places))
+    if law.pose_odds:
+        right = 1 / (1 + np.exp(-float(compute_pose_features(poses) @ law.pose_odds)))
+        share = min(right / max(poses[0].probability, 1e-9), 1.0)
+        poses = [replace(pose, probability=pose.probability * share) for pose in poses]
+    return poses[:n]
 
 
 def _keep_best(found: Sequence[tuple[Array, float]]) -> list[tuple[Array, float]]:

@@ -1,11 +1,13 @@
 """Task `radio_law`: how alike readings of radio are at a distance and through floors (`landmarks.radio`).
 
 Counts of pairs of scans of two sets of walks of one storey, and of storeys that lie above each other in one frame, of one mall.
-Each storey is scored by the law of the others.
+Each storey is scored by the law of the others. So are poses that are found from radio alone: of them the odds are fitted that a
+pose is right, by how many places testify (logistic regression).
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -16,7 +18,9 @@ from typing import Any
 
 import numpy as np
 from scipy import ndimage
+from scipy.optimize import minimize
 
+from topomerge import archive
 from topomerge.datasets.real.wifi_malls import ALIGNED, WIFI_STOREYS, WifiStorey, read_wifi_storey, split_walks
 from topomerge.errors import InputError
 from topomerge.landmarks.radio import (
@@ -33,6 +37,7 @@ from topomerge.landmarks.radio import (
     measure_apart,
     score_scans,
 )
+from topomerge.landmarks.radio_search import RIGHT, compute_pose_features, propose_scan_poses
 from topomerge.training.closed_form import FitResult, run_fit
 from topomerge.training.task_settings import RadioLawFit
 from topomerge.training.tasks import Task
@@ -153,6 +158,66 @@ def fit_left_out(counts: Counts, discount: float = 1.0) -> dict[str, RadioLaw]:
     return {name: build_law(sum_counts(counts, [n for n in WIFI_STOREYS if n != name]), discount) for name in WIFI_STOREYS}
 
 
+ODDS_WALKS, ODDS_DRAWN, ODDS_SEED = (5, 8, 12, 15, 25, 40), 8, 3000  # walks of a map, trials of each storey, first seed
+ROWS_VERSION = 1  # of the trials that are kept: raise it where poses are searched otherwise
+SHRINK = 1e-3  # of squared weights of standardised features
+
+
+def build_trials(storeys: Mapping[str, WifiStorey], counts: Counts, folder: Path, log_line: LogFn) -> dict[str, Array]:
+    """Search poses of small maps of each storey by the law of the others: storey -> (n, 5) features of the likeliest one, and how
+    far off it is, m; kept in a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    found = {}
+    for name, law in fit_left_out(counts).items():
+        key = hashlib.sha256(law.log_density.round(6).tobytes()).hexdigest()[:12]
+        path = folder / f"poses_{ROWS_VERSION}_{ODDS_DRAWN}_{name}_{key}.npz"
+        if not path.exists():
+            seeds = range(ODDS_SEED, ODDS_SEED + ODDS_DRAWN)
+            rows = [search_trial(storeys[name], law, walks, seed) for walks, seed in product(ODDS_WALKS, seeds)]
+            archive.write({"trials": np.array([row for row in rows if row is not None])}, path)
+            log_line(f"{name}: poses of {len(rows)} pairs of maps")
+        found[name] = archive.read(path)["trials"]
+    return found
+
+
+def search_trial(storey: WifiStorey, law: RadioLaw, walks: int, seed: int) -> Array | None:
+    """Search the pose of two small maps: (5,) its features and its error, m; None where nothing is proposed."""
+    a, b, truth = split_walks(storey, seed, walks)
+    first, second = collect_radio_scans(a.landmarks), collect_radio_scans(b.landmarks)
+    poses = propose_scan_poses(first, second, 5, law)
+    if not poses:
+        return None
+    off = poses[0].pose.apply(second.position) - truth.apply(second.position)
+    return np.append(compute_pose_features(poses), np.hypot(off[:, 0], off[:, 1]).mean())
+
+
+def fit_pose_odds(trials: Array) -> tuple[float, ...]:
+    """Fit the weights of the log odds that a pose is right to (n, 5) trials."""
+    right = trials[:, -1] <= RIGHT
+    size = np.append(1.0, trials[:, 1:-1].std(axis=0) + 1e-9)
+    x = trials[:, :-1] / size
+
+    def loss(w: Array) -> tuple[float, Array]:
+        z, kept = x @ w, np.append(0.0, w[1:])
+        slope = x.T @ (1 / (1 + np.exp(-z)) - right) / len(x) + 2 * SHRINK * kept
+        return float(np.mean(np.logaddexp(0.0, z) - right * z) + SHRINK * kept @ kept), slope
+
+    fitted = minimize(loss, np.zeros(x.shape[1]), jac=True, method="L-BFGS-B").x / size
+    return tuple(float(weight) for weight in fitted)
+
+
+def fit_left_out_odds(trials: Mapping[str, Array]) -> dict[str, tuple[float, ...]]:
+    """Fit for each storey the odds of poses on the others."""
+    return {name: fit_pose_odds(np.concatenate([rows for n, rows in trials.items() if n != name])) for name in trials}
+
+
+def measure_pose_loss(trials: Mapping[str, Array]) -> float:
+    """Measure the mean log loss of poses being right, of each storey by the odds of the others."""
+    odds = fit_left_out_odds(trials)
+    verdicts = {n: np.column_stack([rows[:, :-1] @ odds[n], rows[:, -1] <= RIGHT]) for n, rows in trials.items()}
+    return measure_log_loss(verdicts)
+
+
 def read_storeys() -> dict[str, WifiStorey]:
     """Read all storeys.
 
@@ -177,13 +242,16 @@ def fit_radio(settings: RadioLawFit, log_line: LogFn) -> FitResult:
         log_line(f"discount {discount:g}: log loss of storeys that were left out {losses[discount]:.3f}")
     discount = min(losses, key=lambda d: losses[d])
     law = build_law(sum_counts(counts, WIFI_STOREYS), discount)
+    trials = build_trials(storeys, counts, Path(settings.cache) / "radio", log_line)
     weights = {
         "discount": law.discount,
         "pose_discount": law.pose_discount,
         "blur": law.blur,
+        "pose_odds": np.round(fit_pose_odds(np.concatenate(list(trials.values()))), 4).tolist(),
         "log_density": np.round(law.log_density, DIGITS).tolist(),
     }
-    return FitResult(weights, {"log_loss": losses[discount]}, {"set": "wifi_malls", "storeys": list(WIFI_STOREYS)})
+    scores = {"log_loss": losses[discount], "pose_log_loss": measure_pose_loss(trials)}
+    return FitResult(weights, scores, {"set": "wifi_malls", "storeys": list(WIFI_STOREYS)})
 
 
 def fit(settings: RadioLawFit, log_line: LogFn) -> dict[str, float]:
@@ -198,4 +266,4 @@ def judge(settings: RadioLawFit, file: Path, log_line: LogFn) -> dict[str, Any]:
     return {"log_loss": measure_log_loss(score_cases(cases, law))}
 
 
-TASK = Task(RadioLawFit, fit, ("log_loss",), judge, "topomerge.landmarks", RADIO_LAW_FILE, hours=0.15, lower=("log_loss",))
+TASK = Task(RadioLawFit, fit, ("log_loss",), judge, "topomerge.landmarks", RADIO_LAW_FILE, hours=0.5, lower=("log_loss",))
