@@ -142,7 +142,7 @@ def test_poses_are_found_though_access_points_moved():
     pose, score = best
     at = b.landmarks.table["position"]
     error = np.linalg.norm((pose.apply(at) - FRAME.inverse().apply(at))[:, :2], axis=1).mean()
-    assert error < 4 and score == best.score > 5 and best.probability > 0.9 and pose.scale == 1
+    assert error < 4 and score == best.score > 5 and best.chance > 0.9 and pose.scale == 1
     again = propose_radio_poses(a, b)[0]
     assert again.pose == best.pose and np.array_equal(again.covariance, best.covariance)
 
@@ -151,7 +151,8 @@ def test_a_pose_of_few_places_is_told_less_sure_than_its_law_has_it():
     """The odds that ship: surer with more places, a smaller standard deviation, a larger lead; and never surer than the law."""
     few, many = (propose_radio_poses(build(hear(2, last)), build(hear(2, last, session=1), FRAME)) for last in (12, 45))
     assert few[0].places < many[0].places and few[0].probability < many[0].probability
-    assert np.allclose(compute_pose_features(few), [1.0, *np.log([few[0].sigma, few[0].score - few[1].score, few[0].places])])
+    margin = few[0].score - max([0.0, *(pose.score for pose in few[1:2])])
+    assert np.allclose(compute_pose_features(few), [1.0, *np.log([few[0].sigma, margin, few[0].places])])
     weights = load_radio_law().pose_odds
     assert weights[1] < 0 < weights[2] and weights[3] > 0
     bare = propose_radio_poses(

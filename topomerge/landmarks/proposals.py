@@ -20,7 +20,6 @@ from topomerge.types import Array, Sim3
 PROPOSING = ("tag", "text")  # kinds, the surest first
 MOST_MATCHES = 60  # strings of both maps that propose; the rarest
 MOST_PROPOSED = 12  # poses
-PROPOSED = 0.8  # probability from which on a pose by radio is tried on the walls, which tell more
 MOST_FACED = 6  # of them by one sign that faces a known way
 SUREST_SIGMA = 4.0  # m: less sure places propose nothing
 RARE_SHARE = 0.02  # of the signs, from which on a string stands in too many places
@@ -52,7 +51,7 @@ def propose_poses(
             poses += _propose_by_two(a, b, matches, scaled)
             poses += [] if scaled else _propose_by_one(a, b, matches, yaws)[:MOST_FACED]
     if "radio" in scorer.kinds and not scaled:
-        poses += [found.pose for found in propose_radio_poses(scorer.a, scorer.b) if found.probability >= PROPOSED]
+        poses += [found.pose for found in propose_radio_poses(scorer.a, scorer.b) if found.is_worth_trying]
     middle = scorer.b.grid.compute_centroids()[:: max(len(scorer.b.grid) // 1000, 1)].mean(axis=0)
     out: list[Sim3] = []
     for pose in (_snap_height(pose, heights) for pose in poses):

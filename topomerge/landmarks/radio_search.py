@@ -36,6 +36,7 @@ LEAST_PLACES = 3  # of each map: fewer have no turn
 RIGHT = 5.0  # m that b's scans may be off in the mean
 # Probability from which on a pose is told as sure: of 186 trials on storeys that were left out none of those was wrong.
 SURE = 0.95
+LIKELY, EXACT_ENOUGH = 0.9, 2.5  # chance, and m of the standard deviation of b's middle, from which on a pose is tried on walls
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +50,7 @@ class RadioPose:
         covariance: (3, 3) of x, y (m, of the middle of b's scans) and yaw (rad).
         sigma: standard deviation of where b's scans lie, m.
         places: that the map with fewer has: how much testifies.
+        chance: that this is the pose, and not another one or none, by the law alone.
     """
 
     pose: Sim3
@@ -57,6 +59,7 @@ class RadioPose:
     covariance: Array
     sigma: float
     places: float
+    chance: float
 
     def __iter__(self) -> Iterator[Sim3 | float]:
         return iter((self.pose, self.score))
@@ -65,6 +68,11 @@ class RadioPose:
     def is_sure(self) -> bool:
         """Is it told as sure?"""
         return self.probability >= SURE
+
+    @property
+    def is_worth_trying(self) -> bool:
+        """Is it proposed to a search of walls, which tell more?"""
+        return self.chance >= LIKELY and float(np.sqrt(max(np.trace(self.covariance[:2, :2]), 0.0))) <= EXACT_ENOUGH
 
 
 def compute_pose_features(poses: Sequence[RadioPose]) -> Array:
@@ -109,7 +117,7 @@ def propose_scan_poses(a: RadioScans, b: RadioScans, n: int, law: RadioLaw) -> l
     for (at, score), p in zip(kept, chances, strict=False):
         covariance = search.measure_covariance(at)
         sigma = float(np.sqrt(max(np.trace(covariance[:2, :2]) + covariance[2, 2] * search.reach**2, 0.0)))
-        poses.append(RadioPose(_build_pose(at, middle, height), score, float(p), covariance, sigma, places))
+        poses.append(RadioPose(_build_pose(at, middle, height), score, float(p), covariance, sigma, places, float(p)))
     if law.pose_odds:
         right = 1 / (1 + np.exp(-float(compute_pose_features(poses) @ law.pose_odds)))
         share = min(right / max(poses[0].probability, 1e-9), 1.0)
