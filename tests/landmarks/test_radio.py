@@ -159,7 +159,7 @@ def test_a_pose_of_few_places_is_told_less_sure_than_its_law_has_it():
         build(hear(2, 12)), build(hear(2, 12, session=1), FRAME), law=replace(load_radio_law(), pose_odds=())
     )
     assert bare[0].pose == few[0].pose and few[0].probability <= bare[0].probability
-    assert sum(pose.probability for pose in few) <= 1.0
+    assert sum(pose.probability for pose in few) <= 1.0 and type(few[0].probability) is float and type(few[0].is_sure) is bool
 
 
 def test_maps_that_share_nothing_are_told_as_unsure():

@@ -34,7 +34,7 @@ COARSE, EXACT = 25.0, 13.0  # m, up to which pairs of scans tell a pose
 REFINED = 400  # scans of a map, by which candidates are refined
 LEAST_PLACES = 3  # of each map: fewer have no turn
 RIGHT = 5.0  # m that b's scans may be off in the mean
-# Probability from which on a pose is told as sure: of 186 trials on storeys that were left out none of those was wrong.
+# Probability from which on a pose is told as sure: 55 of 240 trials on storeys that were left out, none of these wrong.
 SURE = 0.95
 LIKELY, EXACT_ENOUGH = 0.9, 2.5  # chance, and m of the standard deviation of b's middle, from which on a pose is tried on walls
 
@@ -119,8 +119,8 @@ def propose_scan_poses(a: RadioScans, b: RadioScans, n: int, law: RadioLaw) -> l
         sigma = float(np.sqrt(max(np.trace(covariance[:2, :2]) + covariance[2, 2] * search.reach**2, 0.0)))
         poses.append(RadioPose(_build_pose(at, middle, height), score, float(p), covariance, sigma, places, float(p)))
     if law.pose_odds:
-        right = 1 / (1 + np.exp(-float(compute_pose_features(poses) @ law.pose_odds)))
-        share = min(right / max(poses[0].probability, 1e-9), 1.0)
+        right = 1 / (1 + np.exp(-compute_pose_features(poses) @ law.pose_odds))
+        share = min(float(right) / max(poses[0].probability, 1e-9), 1.0)
         poses = [replace(pose, probability=pose.probability * share) for pose in poses]
     return poses[:n]
 
