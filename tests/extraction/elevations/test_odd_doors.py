@@ -22,7 +22,7 @@ from topomerge.extraction.elevations.doorways import classify_places, compute_do
 from topomerge.extraction.elevations.elevation import BANDS, DEPTHS, FACE_DTYPE, STRIP_CHANNELS, Elevations
 from topomerge.extraction.extract import extract, gather_evidence, read_navigable
 from topomerge.extraction.parameters import PRESETS
-from topomerge.extraction.stopwatch import Stopwatch
+from topomerge.progress import Stopwatch
 from topomerge.types import classify_door_state
 
 
