@@ -14,7 +14,7 @@ import pytest
 from tests.samples import box_points
 from topomerge.errors import InputError
 from topomerge.io import frame, point_warnings, read_chunks, read_points
-from topomerge.io.point_warnings import compute_flatness, warn_about
+from topomerge.io.frame import compute_flatness, warn_about
 from topomerge.io.points import PointSample
 from topomerge.types import VoxelGrid
 

@@ -18,7 +18,7 @@ from topomerge.errors import InputError
 from topomerge.extraction.elevations.elevation import WALL_SIGNATURE, compute_place_probabilities
 from topomerge.extraction.plans.plan_network import GRID_NETWORK_FILE, PLAN_NETWORK_FILE, PLAN_SIGNATURE
 from topomerge.networks.network import WEIGHTS_PACKAGE, Signature, Tensor, load_network, load_shipped_network, read_card
-from topomerge.registration.evidence.places import PLACE_SIGNATURE
+from topomerge.registration.places import PLACE_SIGNATURE
 from topomerge.registry import TASKS
 from topomerge.types import Array
 

@@ -21,9 +21,9 @@ import numpy as np
 from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError, is_memory_short
 from topomerge.io import frame
+from topomerge.io.frame import warn_about
 from topomerge.io.landmarks import read_tables_beside
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_options
-from topomerge.io.point_warnings import warn_about
 from topomerge.io.sightings import ObjectFinder
 from topomerge.progress import Progress
 from topomerge.types import (

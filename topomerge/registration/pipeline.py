@@ -20,8 +20,8 @@ from topomerge.landmarks.proposals import propose_poses
 from topomerge.matching.poses import PoseHypothesis, refine, select_distinct_hypotheses, wrap_yaw
 from topomerge.progress import Stopwatch, tell_step
 from topomerge.registration.bend.bend import Bend, bend
-from topomerge.registration.evidence.places import Places, score_places
 from topomerge.registration.judge import Judge, compute_winner_features
+from topomerge.registration.places import Places, score_places
 from topomerge.registration.posterior import check_same
 from topomerge.registration.prepared import Map, Prepared, prepare
 from topomerge.registration.refine import refine_pose

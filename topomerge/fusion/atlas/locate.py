@@ -25,10 +25,12 @@ from topomerge.fusion.atlas.place_index import (
     IndexedMap,
     IndexedStorey,
     PlaceIndex,
+    compute_features,
     open_index,
+    score_roughly,
+    search_coarsely,
     turn_points,
 )
-from topomerge.fusion.atlas.place_search import compute_features, score_roughly, search_coarsely
 from topomerge.io.maps import load_map
 from topomerge.io.points import read_chunks
 from topomerge.landmarks.evidence import LandmarkScorer
