@@ -87,7 +87,7 @@ def test_the_flat_roof_beside_a_hall_is_no_storey(more: dict[str, float]) -> Non
     assert np.allclose(np.sort(map.rooms["area"])[:4], 20, atol=1.0) and abs(map.rooms["area"].max() - 140) < 3
 
 
-@pytest.mark.parametrize("ceiling", [True, False])
+@pytest.mark.parametrize("ceiling", [True, pytest.param(False, marks=pytest.mark.longer)])
 def test_rooms_upstairs_beside_a_hall_are_a_storey(ceiling: bool) -> None:
     """The same with two rooms on the low ones; also where their own ceiling was not scanned."""
     points = [gym()]

@@ -91,7 +91,7 @@ def three_half_levels(rise: float) -> Scene:
     return scene
 
 
-@pytest.mark.parametrize("rise", [1.3, 1.4, 1.5])
+@pytest.mark.parametrize("rise", [*(pytest.param(rise, marks=pytest.mark.longer) for rise in (1.3, 1.4)), 1.5])
 def test_three_half_levels_have_all_their_rooms(rise: float) -> None:
     map = extract(three_half_levels(rise).points(0.005))
     columns = [(3, 2), (1.5, 6), (4.5, 6)]
@@ -190,7 +190,8 @@ def seats(scene: Scene, rows) -> Scene:
     return scene
 
 
-WITH_AND_WITHOUT_AISLE = pytest.mark.parametrize("rows", [((4.0, 16.0),), ((3.5, 9.4), (10.6, 16.5))])
+WITH_AISLE = pytest.param(((3.5, 9.4), (10.6, 16.5)), marks=pytest.mark.longer)
+WITH_AND_WITHOUT_AISLE = pytest.mark.parametrize("rows", [((4.0, 16.0),), WITH_AISLE])
 
 
 @WITH_AND_WITHOUT_AISLE

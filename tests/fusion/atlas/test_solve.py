@@ -77,7 +77,7 @@ def poisoned(maps: list[TopometricMap], registrations: dict, i: int, j: int, wro
     return {**registrations, pair: (PoseHypothesis(pose, probability=p),)}
 
 
-@pytest.mark.parametrize("p", [0.93, 0.997])
+@pytest.mark.parametrize("p", [pytest.param(0.93, marks=pytest.mark.longer), 0.997])
 def test_a_wrong_hypothesis_in_a_cycle_is_thrown_out_and_named(maps, registrations, p, monkeypatch):
     maps, first = maps[:4], {id(maps[0]), id(maps[3])}  # the poisoned pair is tried first
 
