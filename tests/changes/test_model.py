@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.cases import list_longer
 from tests.scenes import Scene
 from topomerge.changes.model import ElementRow, _decide_elsewhere, compare_with_model, estimate_common_shift
 from topomerge.errors import InputError
@@ -69,7 +70,7 @@ def test_what_is_built_as_drawn_is_seen(seen: dict[str, ElementRow]) -> None:
     assert all(abs(row.shift) < 0.005 for row in seen.values() if np.isfinite(row.shift))
 
 
-LONGER_SHIFTS = [pytest.param(shift, marks=pytest.mark.longer) for shift in (0.02, 0.05, 0.10)]
+LONGER_SHIFTS = list_longer(0.02, 0.05, 0.10)
 
 
 @pytest.mark.parametrize("shift", [-0.05, *LONGER_SHIFTS])

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import topomerge as tm
+from tests.cases import list_longer
 from tests.fusion.atlas.atlas_scenes import office_map, stranger
 from tests.fusion.plans_of import office
 from topomerge import archive
@@ -84,7 +85,7 @@ def test_a_part_of_a_map_is_found_where_it_was_cut() -> None:
     assert np.allclose(covariance, covariance.T) and (np.linalg.eigvalsh(covariance) > 0).all() and covariance[0, 0] < 0.1**2
 
 
-@pytest.mark.parametrize("frame", [Sim3(1.2, (4.0, -7.0, 0.6)), Sim3(-2.9, (30.0, 12.0, -2.0))])
+@pytest.mark.parametrize("frame", [Sim3(1.2, (4.0, -7.0, 0.6)), *list_longer(Sim3(-2.9, (30.0, 12.0, -2.0)))])
 def test_a_turned_scan_gives_the_pose_that_turns_it_back(frame: Sim3) -> None:
     straight, turned = answer_of_part(), locate(index(), scan_part(frame))
     assert turned.status == straight.status == "located"
