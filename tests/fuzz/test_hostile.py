@@ -116,6 +116,7 @@ def test_pictures_of_a_billion_pixels(worker: Worker, tmp_path: Path) -> None:
         assert "pixels" in refused(worker, tmp_path / "a.png", png(side, side, zlib.compress(bytes(1 << 20))))
 
 
+@pytest.mark.longer
 def test_a_large_picture_of_nothing(worker: Worker, tmp_path: Path) -> None:
     """The largest picture that is taken stays within the memory that a reader may use."""
     side = 5000
