@@ -116,6 +116,7 @@ def test_a_network_that_was_trained_is_exported_as_it_is_and_always_to_the_same_
     assert not (tmp_path / "nan.onnx").exists()
 
 
+@pytest.mark.longer
 def test_what_is_exported_normalises_enlarges_and_turns_nothing(tmp_path: Path) -> None:
     """The processor runs convolutions alone (docs/adr/0044); the function and the names of the weights stay."""
     torch, onnx = pytest.importorskip("torch"), pytest.importorskip("onnx")
