@@ -72,7 +72,8 @@ def register(name: str, schema: type[Any], group: str | None = None, package: st
     """
     from hydra.core.config_store import ConfigStore
 
-    ConfigStore.instance().store(f"{name}_schema", _build_node(schema), group=group, package=package if group else None)
+    node = _build_node(schema)  # type: ignore[arg-type]  # of a class, which can be hashed
+    ConfigStore.instance().store(f"{name}_schema", node, group=group, package=package if group else None)
 
 
 @cache
