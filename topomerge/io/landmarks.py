@@ -62,7 +62,7 @@ def read_tables_beside(path: Path, poses: str | None, suffixes: Sequence[str]) -
         What the tables hold, and warnings of those that may belong to another file.
 
     Raises:
-        InputError: as `read_landmark_file` and `radio_csv.read_radio_beside`.
+        InputError: as `read_landmark_file` and `read_radio_beside`.
     """
 
     readers = {TABLE_NAME: read_landmark_file, RADIO_TABLE: lambda table: read_radio_beside(table, path, poses)}
