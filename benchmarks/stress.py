@@ -26,7 +26,7 @@ from topomerge.datasets.simulation.scanner import scan_building
 from topomerge.datasets.simulation.walk import sample_part
 
 import topomerge as tm
-from benchmarks.speed.bench import DEPTH, WIDTH, storey
+from benchmarks.speed.bench import DEPTH, WIDTH, run_timed, storey
 from topomerge.embedding.learned import build_embedder
 from topomerge.matching.match import match
 from topomerge.types import Array, PointCloud, Sim3, TopometricMap
@@ -109,11 +109,9 @@ def load_maps(count: int = 30) -> None:
     """Merge so many partial maps of one office at once."""
     parts = [tm.extract(cloud) for cloud in simulate_partial_clouds(count)]
     print(f"{count} maps extracted, {measure_peak()} MB", flush=True)
-    began, start = time.process_time(), time.perf_counter()
-    result = tm.merge(parts)
-    spent = time.process_time() - began
+    result, seconds, spent = run_timed(lambda: tm.merge(parts))
     joined = sum(t is not None for t in result.transforms)
-    times = f"{spent:.0f} s of the processor, {time.perf_counter() - start:.0f} s"
+    times = f"{spent:.0f} s of the processor, {seconds:.0f} s"
     print(f"{count} maps: {result.status}, {joined} joined; {times}; {measure_peak()} MB")
 
 

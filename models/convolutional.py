@@ -11,7 +11,7 @@ from topomerge.extraction.elevations.elevation import DEPTHS, DILATIONS, PLACES,
 from topomerge.extraction.plans.plan_network import DOWN_LEVELS, EVIDENCE_CHANNELS, UP_LEVELS
 from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES
 from topomerge.networks.drawing import DRAWING_CLASSES
-from topomerge.registration.evidence.places import CONVOLUTIONS, PLANES
+from topomerge.registration.places import CONVOLUTIONS, PLANES
 
 
 def _build_layer(channels: int, width: int, stride: int = 1) -> nn.Sequential:

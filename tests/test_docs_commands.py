@@ -60,7 +60,8 @@ def take(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         from topomerge.training.search import compose_search
         from topomerge.training.tasks import compose_settings
 
-        compose_search([FLAGS.get(w, w) for w in words[1:]])
+        if any(w.startswith("search") for w in words):
+            compose_search([FLAGS.get(w, w) for w in words[1:]])
         plain = [FLAGS.get(w, w) for w in words[1:] if w != "-m" and not w.startswith("hydra")]
         compose_settings([select_first(w) for w in plain] if "-m" in words else plain)  # of a sweep, its first run
         return
@@ -127,7 +128,12 @@ def words_of(text: str) -> list[str]:
     return shlex.split(text)
 
 
-@pytest.mark.parametrize(("page", "text"), [pytest.param(p, t, id=f"{p}-{t[:60]}") for p, t in written()])
+def mark(page: str) -> list[pytest.MarkDecorator]:
+    """Commands of results stand there as they ran: the longer suite tries them again, the quick one those that people type."""
+    return [pytest.mark.longer] if (ROOT / "docs" / "results" / page).is_file() else []
+
+
+@pytest.mark.parametrize(("page", "text"), [pytest.param(p, t, id=f"{p}-{t[:60]}", marks=mark(p)) for p, t in written()])
 def test_commands_of_the_results_are_taken(page: str, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("hydra")
     take(words_of(text), monkeypatch)

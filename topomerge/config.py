@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, TypeVar
 
 from topomerge.errors import InputError
@@ -70,11 +71,19 @@ def register(name: str, schema: type[Any], group: str | None = None, package: st
         group: folder of the file below `configs/`; its keys stand at the top all the same, or in `package`.
     """
     from hydra.core.config_store import ConfigStore
+
+    node = _build_node(schema)  # type: ignore[arg-type]  # of a class, which can be hashed
+    ConfigStore.instance().store(f"{name}_schema", node, group=group, package=package if group else None)
+
+
+@cache
+def _build_node(schema: type[Any]) -> Any:
+    """Build what Hydra copies of a schema each time that it composes: once, as a sweep composes often."""
     from omegaconf import OmegaConf
 
     node = OmegaConf.structured(schema)
     _open_tables(node)
-    ConfigStore.instance().store(f"{name}_schema", node, group=group, package=package if group else None)
+    return node
 
 
 def _open_tables(node: Any) -> None:

@@ -10,7 +10,6 @@ For both, each measurement names the one piece of the other map that has most to
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
+from topomerge.progress import Stopwatch
 from topomerge.registration.bend import alignment as alignments
 from topomerge.registration.bend.alignment import Alignment
 from topomerge.registration.bend.bend import WINDOWS, settle_all
@@ -148,9 +148,9 @@ def time_bending(solve: Callable[[], Array]) -> tuple[Array, float]:
     """Run a solver several times; return its moves and the median of its seconds."""
     seconds = []
     for _ in range(RUNS):
-        began = time.perf_counter()
+        watch = Stopwatch()
         moves = solve()
-        seconds.append(time.perf_counter() - began)
+        seconds.append(watch.elapsed)
     return moves, float(np.median(seconds))
 
 

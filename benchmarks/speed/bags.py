@@ -16,13 +16,13 @@ import tempfile
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from time import perf_counter
 
 import numpy as np
 
 from benchmarks.speed.bench import print_line
 from tests.io.bags import Entry, Messages, walk_messages, write_bag
 from tests.io.walks import PERIOD, START, Walk
+from topomerge.progress import Stopwatch
 
 SEED, SPACING = 3, 0.025  # m, between the points of a lap
 AGAIN, NOISE = 10, 0.01  # each point so often, with other noise (m): 36,000 a scan, as of 32 beams
@@ -64,7 +64,7 @@ def iter_laps(walk: Walk, gigabytes: float, m: Messages) -> Iterable[Entry]:
 
 def measure(path: str, alone: bool) -> dict[str, float]:
     """Seconds and peak memory (MiB, with the process that reads), of extracting a bag or of reading it by the library alone."""
-    began, rooms = perf_counter(), 0
+    watch, rooms = Stopwatch(), 0
     if alone:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -78,7 +78,7 @@ def measure(path: str, alone: bool) -> dict[str, float]:
 
         rooms = len(extract(read_chunks(path)).rooms)
     usage = [resource.getrusage(who).ru_maxrss / 1024 for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return {"seconds": perf_counter() - began, "peak": sum(usage), "rooms": rooms}
+    return {"seconds": watch.elapsed, "peak": sum(usage), "rooms": rooms}
 
 
 def measure_in_process(path: Path, alone: bool) -> dict[str, float]:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import gc
+import resource
 from collections.abc import Callable
-from time import perf_counter
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
+from topomerge.progress import Stopwatch
+
+T = TypeVar("T")
 WIDTH, DEPTH, STOREY_HEIGHT = 50.0, 30.0, 3.0  # m: 1,500 m2
 ROOMS_A_SIDE = 10  # a side
 CORRIDOR = 2.4  # m
@@ -20,10 +23,18 @@ def time_best(fn: Callable[[], Any], repeat: int = 5) -> float:
     seconds = []
     for _ in range(repeat):
         gc.collect()  # a peer that returns lists must not pay for the garbage of another
-        start = perf_counter()
+        watch = Stopwatch()
         fn()
-        seconds.append(perf_counter() - start)
+        seconds.append(watch.elapsed)
     return min(seconds)
+
+
+def run_timed(work: Callable[[], T], who: int = resource.RUSAGE_SELF) -> tuple[T, float, float]:
+    """Run work: its result, seconds by the clock, and seconds of the processor, of this process or of those that it starts."""
+    before, watch = resource.getrusage(who), Stopwatch()
+    result = work()
+    seconds, after = watch.elapsed, resource.getrusage(who)
+    return result, seconds, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def print_line(name: str, ours: float, peer: float) -> str:

@@ -16,12 +16,12 @@ import sys
 import tempfile
 from dataclasses import replace
 from statistics import median
-from time import perf_counter, process_time
 
 from topomerge.datasets.pairs.example import make_file
 from topomerge.datasets.pairs.items import Item, Recipe, draw_items
 
-from benchmarks.speed.bench import print_line
+from benchmarks.speed.bench import print_line, run_timed
+from topomerge.progress import Stopwatch
 
 TARGET, LIMIT = 6.0, 1.5  # s a pair; GB a worker
 SINGLE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -38,11 +38,10 @@ RECIPE = Recipe(
 def build_one(item: Item) -> tuple[float, float]:
     """Seconds of a pair, and those that the processor worked."""
     with tempfile.TemporaryDirectory() as folder:
-        began, worked = perf_counter(), process_time()
-        row = make_file(item, [], folder)
-        if row.reason:
-            raise RuntimeError(row.reason)
-        return perf_counter() - began, process_time() - worked
+        reason, seconds, worked = build_in_worker(item, folder)
+    if reason:
+        raise RuntimeError(reason)
+    return seconds, worked
 
 
 def warm_up(folder: str, number: int) -> int:
@@ -53,9 +52,8 @@ def warm_up(folder: str, number: int) -> int:
 
 def build_in_worker(item: Item, folder: str) -> tuple[str, float, float]:
     """Make a pair in a worker: why not, seconds, and seconds that the processor worked."""
-    began, worked = perf_counter(), process_time()
-    row = make_file(item, [], folder)
-    return row.reason, perf_counter() - began, process_time() - worked
+    row, seconds, worked = run_timed(lambda: make_file(item, [], folder))
+    return row.reason, seconds, worked
 
 
 def time_all(items: list[Item], jobs: int) -> float:
@@ -67,9 +65,9 @@ def time_all(items: list[Item], jobs: int) -> float:
         warm: set[int] = set()
         while len(warm) < jobs:
             warm |= set(pool.map(warm_up, [folder] * jobs, range(jobs), chunksize=1))
-        began = perf_counter()
+        watch = Stopwatch()
         rows = list(pool.map(build_in_worker, items, [folder] * len(items), chunksize=1))
-        seconds = perf_counter() - began
+        seconds = watch.elapsed
     if any(reason for reason, _, _ in rows):
         raise RuntimeError([reason for reason, _, _ in rows if reason])
     busy, worked = (sum(row[k] for row in rows) for k in (1, 2))

@@ -12,12 +12,11 @@ import json
 import resource
 import subprocess
 import sys
-from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
 
-from benchmarks.speed.bench import STOREY_HEIGHT, WIDTH, print_line, storey
+from benchmarks.speed.bench import STOREY_HEIGHT, WIDTH, print_line, run_timed, storey
 from topomerge.evaluation.documents import FIGURES, build_stamp, write_headline
 
 STOREY_GAP = 0.4  # m
@@ -33,9 +32,7 @@ def measure(floors: int, preset: str, points: int, place: str) -> dict[str, Any]
     cloud = storey(points)
     step = np.array(STEPS[place], np.float32)
     chunks = (PointCloud(cloud + i * step) for i in range(floors))
-    began, worked = perf_counter(), process_time()
-    result = extract(chunks, preset=preset)
-    seconds, worked = perf_counter() - began, process_time() - worked
+    result, seconds, worked = run_timed(lambda: extract(chunks, preset=preset))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return {
         "seconds": seconds,

@@ -7,9 +7,10 @@ import os
 import resource
 import subprocess
 import sys
-import time
+from functools import partial
 from tempfile import TemporaryDirectory
 
+from benchmarks.speed.bench import run_timed
 from topomerge.kernels.ahead import load_loops
 
 
@@ -17,10 +18,9 @@ def main() -> None:
     """Print a line."""
     with TemporaryDirectory() as folder:
         environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
-        before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-        subprocess.run([sys.executable, "-c", "import topomerge.kernels"], env=environment, check=True, stderr=subprocess.DEVNULL)
-        seconds, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
-    busy = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        words = [sys.executable, "-c", "import topomerge.kernels"]
+        compile_all = partial(subprocess.run, words, env=environment, check=True, stderr=subprocess.DEVNULL)
+        _, seconds, busy = run_timed(compile_all, resource.RUSAGE_CHILDREN)
     signatures = sum(map(len, load_loops().values()))
     print(f"# {signatures} signatures: {seconds:.1f} s, {busy:.1f} s of processors, {os.cpu_count()} cores")
 

@@ -14,7 +14,7 @@ from benchmarks.speed.bench import print_line, time_best
 from topomerge.extraction.elevations.elevation import WALL_NETWORK_FILE, WALL_SIGNATURE
 from topomerge.extraction.plans.plan_network import PLAN_NETWORK_FILE, PLAN_SIGNATURE
 from topomerge.networks.network import load_shipped_network
-from topomerge.registration.evidence.places import PLACE_NETWORK_FILE, PLACE_SIGNATURE
+from topomerge.registration.places import PLACE_NETWORK_FILE, PLACE_SIGNATURE
 
 AGREE = 1e-5
 MODULES = {

@@ -12,12 +12,12 @@ import os
 import resource
 import subprocess
 import sys
-import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import yaml
 
+from benchmarks.speed.bench import run_timed
 from topomerge.evaluation.documents import ROOT, build_stamp, write_blocks, write_table
 
 COMMAND = "python -m benchmarks.speed.researcher"
@@ -128,10 +128,8 @@ def prepare(folder: Path) -> None:
 
 def time_step(words: str, folder: Path) -> tuple[float, float]:
     """Run a step; seconds of processor, of all its processes, and by the clock."""
-    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    run(words, folder)
-    clock, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, clock
+    _, clock, processor = run_timed(lambda: run(words, folder), resource.RUSAGE_CHILDREN)
+    return processor, clock
 
 
 def run(words: str, folder: Path) -> None:

@@ -12,15 +12,16 @@ import os
 import resource
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from benchmarks.speed.bench import print_line
+from benchmarks.speed.bench import print_line, run_timed
+from topomerge.progress import Stopwatch
 
 CACHE = Path("cache/benchmarks/whole")
 VOXEL = 0.2  # m, of KISS-Matcher
@@ -64,14 +65,11 @@ def merge(folder: Path) -> tuple[float, float, tuple[tuple[str, float], ...]]:
     """Merge two clouds by a command: seconds by the clock, cores that were busy, and shares of the steps and of the rest."""
     with TemporaryDirectory() as out:
         words = [str(folder / "a.ply"), str(folder / "b.ply"), "--force", "-q", "-o", f"{out}/merged"]
-        before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-        done = subprocess.run([sys.executable, "-m", "topomerge", "merge", *words], check=False)
+        command = partial(subprocess.run, [sys.executable, "-m", "topomerge", "merge", *words], check=False)
+        done, seconds, busy = run_timed(command, resource.RUSAGE_CHILDREN)
         if done.returncode not in (0, 2):  # 2: joined, though it is not believed
             raise SystemExit(f"{folder}: the merge ends with {done.returncode}")
-        seconds = time.perf_counter() - began
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
         steps = json.loads(Path(out, "merged", "merge.json").read_text(encoding="utf-8"))["seconds"]
-    busy = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     shares = [(step, value / seconds) for step, value in steps.items() if value > 0]
     rest = 1 - sum(share for _, share in shares)  # below 0 where two processes read and extract side by side
     return seconds, busy / seconds, (*shares, ("start, report and files", rest)) if rest > 0 else tuple(shares)
@@ -90,11 +88,11 @@ def time_peer(folder: Path) -> None:
     from topomerge.io.points import read_points
 
     b, a = (read_points(folder / f"{name}.ply").points.astype(float).T for name in "ba")
-    began = time.perf_counter()
+    watch = Stopwatch()
     matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(VOXEL))
     matched = [np.array(m, float).reshape(-1, 3).T for m in matcher.match(b, a)]
     matcher.solve(*matched)
-    print(time.perf_counter() - began)
+    print(watch.elapsed)
 
 
 def parse_words(words: Sequence[str]) -> None:

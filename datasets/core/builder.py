@@ -22,6 +22,7 @@ from topomerge import archive
 from topomerge.archive import convert_to_plain, replace_on_success
 from topomerge.code_digest import compute_code_digest
 from topomerge.errors import InputError
+from topomerge.progress import Stopwatch
 from topomerge.types import Array, LogFn
 
 ItemType = TypeVar("ItemType")
@@ -133,7 +134,7 @@ def make_item(name: str, folder: str, make: Callable[[], Mapping[str, Array]], l
         make: gives the arrays; among them `about`, the row of the manifest as JSON.
         longest: s that it may take.
     """
-    began = time.perf_counter()
+    watch = Stopwatch()
     try:
         with limit_threads(), limit_time(longest):
             archive.write(make(), Path(folder) / f"{name}.npz")
@@ -144,7 +145,7 @@ def make_item(name: str, folder: str, make: Callable[[], Mapping[str, Array]], l
         if isinstance(error, InputError) and not isinstance(error, TooLongError):
             with replace_on_success(Path(folder) / f"{name}.refused") as temporary:  # the same inputs would be refused again
                 temporary.write_text(reason + "\n", encoding="utf-8")
-    return BuildRow(name, reason, time.perf_counter() - began)
+    return BuildRow(name, reason, watch.elapsed)
 
 
 def read_refusal(folder: Path, name: str) -> str:
@@ -223,17 +224,17 @@ class BuildProgress:
     def __init__(self, total: int, log_line: LogFn, every: float, unit: str = "pairs") -> None:
         self.total, self.log_line, self.every, self.unit = total, log_line, every, unit
         self.done = self.refused = 0
-        self.began = self.last = time.monotonic()
+        self.last, self.watch = 0.0, Stopwatch()
 
     def __call__(self, row: BuildRow) -> None:
         self.done += 1
         if row.reason:
             self.refused += 1
             self.log_line(f"refused {row.name}: {row.reason}")
-        now = time.monotonic()
+        now = self.watch.elapsed
         if now - self.last >= self.every or self.done == self.total:
             self.last = now
-            each = (now - self.began) / self.done
+            each = now / self.done
             left = time.strftime("%H:%M:%S", time.gmtime(each * (self.total - self.done)))
             self.log_line(f"{self.done} of {self.total} {self.unit}, {self.refused} refused, {each:.2f} s each, {left} left")
 

@@ -42,9 +42,9 @@ from topomerge.extraction.extract import cut_rooms, read_navigable
 from topomerge.extraction.parameters import PRESETS, DefaultParameters
 from topomerge.extraction.plans.storey_plan import ClassifiedStorey
 from topomerge.extraction.scan import FINE_CELL
-from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.extraction.topology import build_topometric_map
 from topomerge.extraction.voxels import voxelise
+from topomerge.progress import Stopwatch
 from topomerge.types import ROOM_DTYPE, Array, LogFn, PointCloud, Sim3, TopometricMap, VoxelGrid
 
 CUPBOARDS = ("shelf", "cabinet", "wardrobe", "kitchen", "locker")  # kinds of furniture that stand before walls

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.cases import list_longer
 from tests.scenes import Scene
 from topomerge.changes.model import ElementRow, _decide_elsewhere, compare_with_model, estimate_common_shift
 from topomerge.errors import InputError
@@ -50,6 +51,12 @@ def built() -> TopometricMap:
     return scan()
 
 
+@pytest.fixture(scope="module")
+def seen(model: list[ModelElement], built: TopometricMap) -> dict[str, ElementRow]:
+    """What is found of each element in the scan of what was built as drawn."""
+    return judge(model, built, built)
+
+
 def judge(
     model: list[ModelElement], built: TopometricMap, found: TopometricMap, pose: Sim3 | None = None
 ) -> dict[str, ElementRow]:
@@ -57,17 +64,16 @@ def judge(
     return {row.element.guid: row for row in rows}
 
 
-def test_what_is_built_as_drawn_is_seen(model: list[ModelElement], built: TopometricMap) -> None:
-    rows = judge(model, built, built)
-    assert {guid for guid, row in rows.items() if row.state != "seen"} == {"far"} and rows["far"].state == "unseen"
-    assert "ceiling" not in rows
-    assert all(abs(row.shift) < 0.005 for row in rows.values() if np.isfinite(row.shift))
+def test_what_is_built_as_drawn_is_seen(seen: dict[str, ElementRow]) -> None:
+    assert {guid for guid, row in seen.items() if row.state != "seen"} == {"far"} and seen["far"].state == "unseen"
+    assert "ceiling" not in seen
+    assert all(abs(row.shift) < 0.005 for row in seen.values() if np.isfinite(row.shift))
 
 
-LONGER_SHIFTS = [pytest.param(shift, marks=pytest.mark.longer) for shift in (0.05, 0.10)]
+LONGER_SHIFTS = list_longer(0.02, 0.05, 0.10)
 
 
-@pytest.mark.parametrize("shift", [0.02, -0.05, *LONGER_SHIFTS])
+@pytest.mark.parametrize("shift", [-0.05, *LONGER_SHIFTS])
 def test_a_wall_that_stands_elsewhere_says_by_how_much(model: list[ModelElement], built: TopometricMap, shift: float) -> None:
     rows = judge(model, built, scan(shift))
     row = rows["at 4"]
@@ -119,8 +125,10 @@ def test_what_is_too_narrow_to_be_measured_is_not_called_elsewhere() -> None:
     assert wide[0] == "elsewhere" and wide[1] > 0.9 and narrow[0] == "seen"
 
 
-def test_a_door_that_stands_elsewhere_says_by_how_much(model: list[ModelElement], built: TopometricMap) -> None:
-    assert judge(model, built, built)["door"].state == "seen"
+def test_a_door_that_stands_elsewhere_says_by_how_much(
+    model: list[ModelElement], built: TopometricMap, seen: dict[str, ElementRow]
+) -> None:
+    assert seen["door"].state == "seen"
     for moved in (0.5, -0.8):
         door = box("door", "door", (3.95, 1.55 - moved, 0), (4.05, 2.45 - moved, 2.05))
         found = compare_with_model([e if e.guid != "door" else door for e in model], built, built, Placement(Sim3()))
@@ -160,8 +168,8 @@ def test_elements_are_read_with_their_ids(tmp_path: Path) -> None:
         read_elements(tmp_path / "cut.ifc")
 
 
-def test_rows_are_plain_values(model: list[ModelElement], built: TopometricMap) -> None:
-    row = judge(model, built, built)["at 4"]
+def test_rows_are_plain_values(seen: dict[str, ElementRow]) -> None:
+    row = seen["at 4"]
     told = row.serialise()
     assert told["guid"] == "at 4" and abs(told["shift_cm"]) < 0.5 and told["state"] == "seen"
     assert replace(row, shift=float("nan")).serialise()["shift_cm"] is None

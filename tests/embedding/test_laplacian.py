@@ -66,6 +66,7 @@ def test_sphere_to_one_percent():
     assert np.allclose(eigenvalues, true, rtol=0.01)
 
 
+@pytest.mark.longer
 def test_box_to_one_percent():
     coarse, fine = box_elements((20, 16, 12), 0.05, 12), box_elements((40, 32, 24), 0.025, 12)
     true = fine + (fine - coarse) / 3  # the error of linear elements falls with the square of the step

@@ -23,7 +23,7 @@ from topomerge.embedding.surroundings import (
     WIDE_PART,
     cut_crops,
 )
-from topomerge.structure.directions import estimate_wall_directions
+from topomerge.structure.lines import estimate_wall_directions
 from topomerge.types import TopometricMap
 
 PLANE = {name: k for k, name in enumerate(CROP_PLANES)}

@@ -7,7 +7,8 @@ import shapely
 from topomerge.datasets.core.solids import build_rectangle
 from topomerge.datasets.simulation.changed_sessions import TrueChange
 
-from topomerge.evaluation.changes import GROUPS, Settings, draw_cases, score_kinds, shift_element, tabulate, write_ratio
+from topomerge.evaluation.changes import GROUPS, draw_cases, score_kinds, shift_element, tabulate, write_ratio
+from topomerge.evaluation.tasks import TaskSettings
 from topomerge.io.ifc import ModelElement
 
 
@@ -42,14 +43,14 @@ def test_cases_of_both_sets_are_of_other_seeds_and_a_third_is_unchanged() -> Non
 
 
 def test_tables_of_nothing_and_of_something() -> None:
-    assert set(tabulate([], Settings())) == {"changes", "changes-same", "changes-models"}
+    assert set(tabulate([], TaskSettings())) == {"changes", "changes-same", "changes-models"}
     groups = {name: [1, 2, 1, 1] for name in GROUPS}
     row = {"what": "changed", "aligned": True, "groups": groups, "place": "a", "sensors": "tls → tls"}
-    assert "| walls new | 1 | 0.50 (1 building) | 1 of 2 |" in tabulate([row], Settings())["changes"]
+    assert "| walls new | 1 | 0.50 (1 building) | 1 of 2 |" in tabulate([row], TaskSettings())["changes"]
     assert write_ratio(np.array([0]), np.array([0]), [row]) == "–"
     model = {"what": "model", "aligned": False, "building": "m", "sensors": "tls", "states": ["seen"], "others": ["seen"]}
     model |= {"found": [[0.02, 0.021, "elsewhere"], [-0.05, 0.0, "seen"]]}
-    assert "| m | tls | no: given | 1 of 1 | 0 of 1 | 0 of 0 |" in tabulate([model], Settings())["changes-models"]
+    assert "| m | tls | no: given | 1 of 1 | 0 of 1 | 0 of 0 |" in tabulate([model], TaskSettings())["changes-models"]
 
 
 def test_elements_are_shifted() -> None:

@@ -18,8 +18,9 @@ from tests.package_copy import copied, edit
 from tests.scenes_map import building
 from topomerge.code_digest import compute_code_digest
 from topomerge.evaluation import predict
-from topomerge.evaluation.joined import Settings, tabulate
+from topomerge.evaluation.joined import tabulate
 from topomerge.evaluation.predict import DescriptorCache
+from topomerge.evaluation.tasks import TaskSettings
 from topomerge.types import Sim3
 
 
@@ -51,7 +52,7 @@ def row(name: str, iou: float, doubled: float) -> dict[str, object]:
 
 
 def test_the_table_has_a_line_for_each_way():
-    text = tabulate([row("one", 0.95, 0.01), row("two", 0.85, 0.03)], Settings())["joined"]
+    text = tabulate([row("one", 0.95, 0.01), row("two", 0.85, 0.03)], TaskSettings())["joined"]
     rigid, bent = text.splitlines()[4:]
     assert rigid.split("|")[3:6] == [" 0.900 ", " 0.800 ", " 0 % "]
     assert bent.split("|")[4:6] == [" 0.900 ", " 50 % "] and bent.split("|")[8:10] == [" 2.0 % ", " 50 % "]

@@ -5,21 +5,23 @@ import pytest
 from topomerge.datasets.pairs.lookalikes import LookalikeItem
 
 from topomerge.errors import InputError
-from topomerge.evaluation import sign_readers
+from topomerge.evaluation import landmarks
 from topomerge.evaluation.landmarks import (
     READ_ALONE,
     READINGS,
     RELATIONS,
     Settings,
+    draw_sign,
     list_inputs,
     measure,
     measure_building,
+    measure_reader,
     measure_wifi,
     read_landmarks,
     spread_belief,
     tabulate,
+    tabulate_readers,
 )
-from topomerge.evaluation.sign_readers import draw_sign, measure_reader, tabulate_readers
 from topomerge.io import pictures
 
 
@@ -109,14 +111,14 @@ def test_a_sign_has_letters_of_the_height_that_is_asked_for(height):
 
 def test_large_signs_are_read_and_tiny_ones_are_not(monkeypatch):
     pytest.importorskip("rapidocr_onnxruntime", exc_type=ImportError)
-    monkeypatch.setattr(sign_readers, "HEIGHTS", (3, 26))
-    monkeypatch.setattr(sign_readers, "ANGLES", (0.0,))
+    monkeypatch.setattr(landmarks, "HEIGHTS", (3, 26))
+    monkeypatch.setattr(landmarks, "ANGLES", (0.0,))
     tiny, large = measure_reader(3)["scored"]
     assert large[2:] == [4, 4, 0, 0, 0] and sum(tiny[4:]) > 0  # E-420, dashes aside
 
 
 def test_without_a_reader_a_line_says_what_helps(monkeypatch):
-    monkeypatch.setattr(sign_readers, "load_text_reader", lambda: None)
+    monkeypatch.setattr(landmarks, "load_text_reader", lambda: None)
     monkeypatch.setattr(pictures, "load_text_reader", lambda: None)
     with pytest.raises(InputError, match="data=reader: no reader of texts"):
         measure_reader(0)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests import scenes
+from tests.cases import list_longer
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS, DefaultParameters, ThesisParameters
@@ -175,7 +176,7 @@ def test_same_points_in_any_order_and_chunking_give_the_same_map():
     assert same(extract(points, walls=False), extract(voxelise(points), walls=False))  # walls are seen in finer cells than these
 
 
-@pytest.mark.parametrize("turn", [90, 37])
+@pytest.mark.parametrize("turn", [37, *list_longer(90)])
 def test_turned_about_the_vertical(turn):
     """The same rooms and doors, whatever the frame."""
     c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))

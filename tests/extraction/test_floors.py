@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import topomerge as tm
+from tests.cases import list_longer
 from tests.scenes import Scene
 from topomerge.types import Array, PointCloud
 
@@ -80,14 +81,14 @@ def gym(parapet: float = 0.0, slab: float = 0.3, hall: float = 7.0) -> np.ndarra
     return scene.wall((4, 0), (4, 10), 0, 3.0, doors=(2.5, 7.5)).wall((0, 5), (8, 5), 0, 3.0).points()
 
 
-@pytest.mark.parametrize("more", [{}, {"parapet": 0.6}, {"slab": 0.6}, {"hall": 5.6}])
+@pytest.mark.parametrize("more", [{}, *list_longer({"parapet": 0.6}, {"slab": 0.6}, {"hall": 5.6})])
 def test_the_flat_roof_beside_a_hall_is_no_storey(more: dict[str, float]) -> None:
     map = tm.extract(gym(**more))
     assert len(map.storeys) == 1 and len(map.rooms) == 5
     assert np.allclose(np.sort(map.rooms["area"])[:4], 20, atol=1.0) and abs(map.rooms["area"].max() - 140) < 3
 
 
-@pytest.mark.parametrize("ceiling", [True, False])
+@pytest.mark.parametrize("ceiling", [True, *list_longer(False)])
 def test_rooms_upstairs_beside_a_hall_are_a_storey(ceiling: bool) -> None:
     """The same with two rooms on the low ones; also where their own ceiling was not scanned."""
     points = [gym()]

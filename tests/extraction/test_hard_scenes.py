@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from tests.cases import list_longer
 from tests.scenes import HEIGHT, Scene, rectangle, stair
 from topomerge.extraction.extract import extract
 from topomerge.types import Array, PointCloud, TopometricMap
@@ -53,7 +54,7 @@ def split_levels(rise: float) -> Scene:
     return scene
 
 
-@pytest.mark.parametrize("rise", [1.2, 1.4, 1.5])
+@pytest.mark.parametrize("rise", [1.4, *list_longer(1.2, 1.5)])
 def test_two_half_levels_are_rooms_that_one_can_walk_between(rise: float) -> None:
     map = extract(split_levels(rise).points(0.005))
     places = [(3, 2, 0), (1.5, 6, 0), (4.5, 6, 0), (11, 2, rise), (9.5, 6, rise), (12.5, 6, rise)]
@@ -91,7 +92,7 @@ def three_half_levels(rise: float) -> Scene:
     return scene
 
 
-@pytest.mark.parametrize("rise", [1.3, 1.4, 1.5])
+@pytest.mark.parametrize("rise", [1.5, *list_longer(1.3, 1.4)])
 def test_three_half_levels_have_all_their_rooms(rise: float) -> None:
     map = extract(three_half_levels(rise).points(0.005))
     columns = [(3, 2), (1.5, 6), (4.5, 6)]
@@ -190,7 +191,8 @@ def seats(scene: Scene, rows) -> Scene:
     return scene
 
 
-WITH_AND_WITHOUT_AISLE = pytest.mark.parametrize("rows", [((4.0, 16.0),), ((3.5, 9.4), (10.6, 16.5))])
+WITH_AISLE = pytest.param(((3.5, 9.4), (10.6, 16.5)), marks=pytest.mark.longer)
+WITH_AND_WITHOUT_AISLE = pytest.mark.parametrize("rows", [((4.0, 16.0),), WITH_AISLE])
 
 
 @WITH_AND_WITHOUT_AISLE

@@ -14,7 +14,7 @@ from tests import scenes
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS, DefaultParameters, SharedParameters, ThesisParameters, resolve_parameters
-from topomerge.extraction.stopwatch import Stopwatch
+from topomerge.progress import Stopwatch
 
 
 def test_each_preset_has_only_what_it_uses() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from topomerge.datasets.buildings.procedural import make_building
+from topomerge.datasets.core.building import Building
 from topomerge.datasets.pairs.localisation import simulate_robot
 from topomerge.datasets.simulation.walk import sample_part
 
@@ -20,9 +21,15 @@ ROOMS = 6  # that both visit
 
 
 @cache
+def build_office() -> Building:
+    """The building that both drive through."""
+    return make_building("office", SEED)
+
+
+@cache
 def list_scans(name: str) -> list[tuple[float, Array, Array]]:
     """Time, pose (4, 4) in the robot's frame and points (n, 3) of the sensor, along a walk through the same rooms."""
-    building = make_building("office", SEED)
+    building = build_office()
     rooms = sample_part(building, ROOMS, np.random.default_rng(54))
     scans = simulate_robot(building, rooms.tolist(), FRAMES[name], np.random.default_rng([ord(name), 54]))
     return [(0.1 * n, pose, points) for n, (_, pose, points) in enumerate(scans)]

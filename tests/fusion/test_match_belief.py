@@ -26,7 +26,7 @@ from topomerge.io.maps import save_map
 from topomerge.matching.consistency import find_matches
 from topomerge.matching.match import Matching, match
 from topomerge.matching.room_plans import build_room_plans
-from topomerge.registration.evidence.places import LOOKED, SIDE, Crops, Places
+from topomerge.registration.places import LOOKED, SIDE, Crops, Places
 from topomerge.registration.verify import PLACE_AREA
 from topomerge.types import Sim3
 

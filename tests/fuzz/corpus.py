@@ -163,7 +163,7 @@ def read_landmarks(path: Path) -> int:
 
 def read_radio(path: Path) -> int:
     """Read readings of radio beside a walk."""
-    from topomerge.io.radio_csv import read_radio_csv
+    from topomerge.io.landmarks import read_radio_csv
     from topomerge.io.trajectory import Trajectory
 
     poses = np.tile(np.eye(4), (2, 1, 1))

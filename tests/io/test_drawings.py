@@ -9,6 +9,7 @@ from topomerge.datasets.drawings.pages import spoil_page
 from topomerge.datasets.drawings.shapes import DrawingShapes, OpeningShape, RoomShape
 from topomerge.datasets.drawings.sheet import Hand, load_font
 
+from tests.cases import list_longer
 from topomerge.extraction.extract import extract
 from topomerge.io.drawing import (
     PictureText,
@@ -253,7 +254,7 @@ def test_fonts_of_tex_do_not_write_what_they_lack(text):
     ]
 
 
-@pytest.mark.parametrize("labels", [True, False])
+@pytest.mark.parametrize("labels", [True, *list_longer(False)])
 def test_a_drawn_plan_has_its_rooms_and_nothing_outside(tmp_path, labels):
     map = extract(read_points(draw_case(tmp_path / "plan.png", labels), resolution=0.02, text=False))
     assert len(map.rooms) == 5 and (map.rooms["outside"] < 0.5).all()

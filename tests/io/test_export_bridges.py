@@ -15,7 +15,7 @@ from PIL import Image
 import topomerge as tm
 from tests.scenes_map import building
 from topomerge.errors import InputError
-from topomerge.io.exports.tf2 import FramePose, read_frame_poses
+from topomerge.io.exports.placements import FramePose, read_frame_poses
 from topomerge.types import Sim3, TopometricMap
 
 

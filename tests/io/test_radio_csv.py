@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from topomerge.errors import InputError
+from topomerge.io.landmarks import read_radio_csv
 from topomerge.io.points import read_points
-from topomerge.io.radio_csv import read_radio_csv
 from topomerge.io.trajectory import Trajectory, read_trajectory
 
 TUM = "# time tx ty tz qx qy qz qw\n0 0 0 1 0 0 0 1\n10 20 0 1 0 0 0 1\n"

@@ -13,6 +13,7 @@ import topomerge as tm
 from tests.scenes_map import building
 from topomerge import archive
 from topomerge.errors import InputError
+from topomerge.io import trajectory
 from topomerge.io.maps import load_map, save_map
 from topomerge.io.trajectory import SPARE_POSES, read_trajectory
 
@@ -96,16 +97,18 @@ def test_a_map_that_lies_is_refused_before_it_is_unpacked(tmp_path: Path, monkey
     assert unpacked == ["format.npy"]
 
 
-def test_no_more_poses_are_read_than_scans_can_need(tmp_path: Path) -> None:
+def test_no_more_poses_are_read_than_scans_can_need(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trajectory, "SPARE_TIMES", 2000)
+    monkeypatch.setattr(trajectory, "POSES_PER_SCAN", 100)
     path = tmp_path / "poses.txt"
     path.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 5000 + "no pose\n")
     assert len(read_trajectory(path, scans=3, last=40)) == 41 + SPARE_POSES
     with pytest.raises(InputError, match="line 5001"):
         read_trajectory(path, scans=5000)
-    path.write_text("".join(f"{k} 0 0 0 0 0 0 1\n" for k in range(210_100)))
-    with pytest.raises(InputError, match=r"more than 210,000 poses for 1 scans; give the trajectory of these scans"):
+    path.write_text("".join(f"{k} 0 0 0 0 0 0 1\n" for k in range(2110)))
+    with pytest.raises(InputError, match=r"more than 2,100 poses for 1 scans; give the trajectory of these scans"):
         read_trajectory(path, scans=1)
-    assert len(read_trajectory(path, scans=2)) == 210_100
+    assert len(read_trajectory(path, scans=2)) == 2110
 
 
 def test_arrays_of_an_archive_are_limited_together(tmp_path: Path) -> None:

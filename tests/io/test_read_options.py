@@ -13,8 +13,8 @@ import pytest
 
 from tests.samples import box_points
 from topomerge.errors import InputError
-from topomerge.io import frame, point_warnings, read_chunks, read_points
-from topomerge.io.point_warnings import compute_flatness, warn_about
+from topomerge.io import frame, read_chunks, read_points
+from topomerge.io.frame import compute_flatness, warn_about
 from topomerge.io.points import PointSample
 from topomerge.types import VoxelGrid
 
@@ -205,5 +205,5 @@ def test_marked_and_sorted_cells_show_the_same_flatness(monkeypatch: pytest.Monk
     points = np.random.default_rng(0).uniform(0, (5, 4, 2.5), (3000, 3))
     points[:1500, 2] = 0.04
     marked = compute_flatness(points, *np.percentile(points, (1, 99), axis=0))
-    monkeypatch.setattr(point_warnings, "MOST_SLAB_CELLS", 0)
+    monkeypatch.setattr(frame, "MOST_SLAB_CELLS", 0)
     assert marked == compute_flatness(points, *np.percentile(points, (1, 99), axis=0)) and marked[2] > 0.3

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.cases import list_longer
 from tests.io.rgbd import CAMERA, camera_poses, looking
 from tests.io.rtabmap_bases import OPTICAL, XYZ, Node, camera_bytes, packed, png, scan_info_bytes, write_rtabmap
 from tests.io.signs import SIGNS, TAG_SIGNS, poses_before_signs, take_picture, walk_poses
@@ -80,7 +81,7 @@ def test_radio_and_pressure_of_nodes(tmp_path: Path) -> None:
     assert pressure.table["number"].tolist() == [1013.2] and radio.table["group"].tolist() == [1, 2]
 
 
-@pytest.mark.parametrize("laser", [False, True])
+@pytest.mark.parametrize("laser", [False, *list_longer(True)])
 def test_signs_on_pictures_of_nodes(tmp_path: Path, laser: bool) -> None:
     """Also where the points are those of a laser."""
     pytest.importorskip("rapidocr_onnxruntime", exc_type=ImportError)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.cases import list_longer
 from tests.matching.turned_maps import turned
 from tests.scenes_map import building
 from topomerge import load_embedder
@@ -13,7 +14,7 @@ from topomerge.matching.match import match
 from topomerge.matching.room_matcher import COARSE_SCALES, find_best_scale
 
 
-@pytest.mark.parametrize("true", [0.6, 0.8, 1.0, 1.5])
+@pytest.mark.parametrize("true", [0.6, *list_longer(0.8, 1.0, 1.5)])
 def test_rooms_are_surest_at_the_true_scale(true: float) -> None:
     a, describe = building(3), load_embedder()
     rows_at, asked = describe.at_scales(a), []

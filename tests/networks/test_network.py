@@ -18,7 +18,7 @@ from topomerge.errors import InputError
 from topomerge.extraction.elevations.elevation import WALL_SIGNATURE, compute_place_probabilities
 from topomerge.extraction.plans.plan_network import GRID_NETWORK_FILE, PLAN_NETWORK_FILE, PLAN_SIGNATURE
 from topomerge.networks.network import WEIGHTS_PACKAGE, Signature, Tensor, load_network, load_shipped_network, read_card
-from topomerge.registration.evidence.places import PLACE_SIGNATURE
+from topomerge.registration.places import PLACE_SIGNATURE
 from topomerge.registry import TASKS
 from topomerge.types import Array
 
@@ -116,6 +116,7 @@ def test_a_network_that_was_trained_is_exported_as_it_is_and_always_to_the_same_
     assert not (tmp_path / "nan.onnx").exists()
 
 
+@pytest.mark.longer
 def test_what_is_exported_normalises_enlarges_and_turns_nothing(tmp_path: Path) -> None:
     """The processor runs convolutions alone (docs/adr/0044); the function and the names of the weights stay."""
     torch, onnx = pytest.importorskip("torch"), pytest.importorskip("onnx")

@@ -7,9 +7,9 @@ import pytest
 
 from tests.fusion.atlas.atlas_scenes import office_map
 from topomerge.errors import InputError
+from topomerge.fusion.decisions import estimate_matched_poses, place_by_hand
 from topomerge.fusion.fuse import match_common_rooms
 from topomerge.matching.poses import pose_difference
-from topomerge.registration.by_hand import estimate_matched_poses, place_by_hand
 from topomerge.registration.pipeline import register
 from topomerge.registration.prepared import prepare
 from topomerge.types import Sim3

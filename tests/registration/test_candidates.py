@@ -22,7 +22,7 @@ from topomerge.registration.pipeline import CLOSELY, build_candidate, build_cand
 from topomerge.registration.prepared import prepare
 from topomerge.registration.search import find_yaw_candidates, select_distinct_yaws
 from topomerge.registration.verify import MARGIN_CAP, rank, score_plausibility
-from topomerge.structure.directions import compute_direction_profile
+from topomerge.structure.lines import compute_direction_profile
 from topomerge.types import Sim3
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.cases import list_longer
 from tests.fusion.plans_of import MOVE, doubled, grid_of, off, office, part
 from tests.scenes import HEIGHT, Scene
 from topomerge.errors import InputError
@@ -150,8 +151,9 @@ def row():
     return scene.points()
 
 
-@pytest.mark.parametrize("first", [11.8, 19.8])
-@pytest.mark.parametrize("same", ["nothing", "storey"])
+@pytest.mark.parametrize(
+    ("same", "first"), [("nothing", 11.8), *list_longer(("nothing", 19.8), ("storey", 11.8), ("storey", 19.8))]
+)
 def test_empty_rooms_of_one_size_are_not_believed(row, first, same):
     """Neither map shows the corridor whole. They share a pair of rooms, or none: nothing tells which of them is which."""
     found = register(

@@ -10,7 +10,7 @@ import pytest
 
 from topomerge.matching.poses import PoseHypothesis, pair_storeys
 from topomerge.registration.search import SEARCH, find_height_offsets, find_scale_candidates, select_strongest
-from topomerge.structure.directions import DIRECTION_STEP, compute_direction_profile
+from topomerge.structure.lines import DIRECTION_STEP, compute_direction_profile
 from topomerge.types import Sim3
 
 NAN = float("nan")

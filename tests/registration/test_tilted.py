@@ -16,7 +16,7 @@ from topomerge.cli.main import main as cli
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.store import add, read_atlas
 from topomerge.fusion.result import serialise_merge
-from topomerge.io.exports.tf2 import read_frame_poses
+from topomerge.io.exports.placements import read_frame_poses
 from topomerge.types import (
     LEVELLED,
     Sim3,

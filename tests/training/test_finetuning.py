@@ -16,6 +16,7 @@ from topomerge.models.embedder import Embedder
 from topomerge.models.export import build_embedder_sample, export_embedder
 from topomerge.models.weights import read_embedder
 
+from tests.cases import list_longer
 from tests.graphs import write_set
 from tests.matching.turned_maps import turned
 from tests.scenes_map import building
@@ -68,7 +69,7 @@ def test_the_embedder_that_ships_is_read_back_for_training() -> None:
     assert abs(float(network.temperature.detach()) - runtime.temperature) < 1e-6
 
 
-@pytest.mark.parametrize("freeze", ["", "geometry", "encoders"])
+@pytest.mark.parametrize("freeze", ["encoders", *list_longer("", "geometry")])
 def test_the_whole_network_starts_from_a_run(settings: Training, tmp_path: Path, freeze: str) -> None:
     fit(replace(settings, name="first"), quiet)
     start = {"init_from": str(tmp_path / "first"), "network": Network(), "freeze": freeze, "rate": 1e-5, "seed": 7}

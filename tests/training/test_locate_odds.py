@@ -9,7 +9,7 @@ import pytest
 
 from topomerge.archive import find_weights_file
 from topomerge.fusion.atlas.locate import JudgedPose, compute_nowhere, compute_probabilities, load_odds
-from topomerge.fusion.atlas.place_search import FEATURES
+from topomerge.fusion.atlas.place_index import FEATURES
 from topomerge.training.locate_odds import LocateRows, fit_choice, score_choices
 from topomerge.types import Sim3
 

@@ -210,7 +210,7 @@ def test_a_registry_knows_what_packages_announce(monkeypatch: pytest.MonkeyPatch
         importlib.metadata.EntryPoint("root", "math:sqrt", "topomerge.tests"),
         importlib.metadata.EntryPoint("broken", "math:no_such", "topomerge.tests"),
     ]
-    monkeypatch.setattr("topomerge.registry.entry_points", lambda group: announced if group == "topomerge.tests" else [])
+    monkeypatch.setattr("topomerge.registry.list_announced", lambda group: announced if group == "topomerge.tests" else [])
     registry = Registry("key", "tests", shipped="math:floor")
     assert list(registry) == ["shipped", "root", "broken"] and len(registry) == 3
     assert registry["root"](4.0) == 2 and registry["shipped"](2.5) == 2

@@ -37,7 +37,7 @@ from topomerge.matching.consistency import load_odds_weights
 from topomerge.matching.room_matcher import load_matcher_weights
 from topomerge.networks.drawing import compute_drawing_probabilities
 from topomerge.networks.network import Network
-from topomerge.registration.evidence.places import load_weights as place_weights
+from topomerge.registration.places import load_weights as place_weights
 from topomerge.registration.verify import load_model
 from topomerge.registry import TASKS
 from topomerge.training import (

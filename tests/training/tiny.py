@@ -22,7 +22,7 @@ from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.extraction.room_odds import GRID_FEATURES, POSE_FEATURES, ROOM_FEATURES
 from topomerge.fusion.match_belief import BELIEVED_METHODS
 from topomerge.matching.consistency import compute_hypothesis_features
-from topomerge.registration.evidence.places import LOOKED, SIDE
+from topomerge.registration.places import LOOKED, SIDE
 from topomerge.training.feature_scale import PairFeatures
 from topomerge.training.match_belief import MatchRows
 from topomerge.training.match_odds import MatchEvidence

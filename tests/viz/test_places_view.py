@@ -11,7 +11,7 @@ from PIL import Image
 
 import topomerge as tm
 from tests.fusion.plans_of import office
-from topomerge.registration.evidence.places import LOOKED, PARTS, SIDE, Crops, Places
+from topomerge.registration.places import LOOKED, PARTS, SIDE, Crops, Places
 from topomerge.viz.merge_plan import lay_out_pair
 from topomerge.viz.merge_report import (
     AGAINST,

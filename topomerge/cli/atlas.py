@@ -41,6 +41,7 @@ from topomerge.cli.options import (
     parse_positive,
 )
 from topomerge.errors import InputError
+from topomerge.progress import Stopwatch
 
 if TYPE_CHECKING:
     from topomerge.fusion.atlas.partners import Workers
@@ -222,7 +223,7 @@ EVERY, SETTLE = 2.0, 2.0  # s
 
 def run_watch(args: argparse.Namespace) -> int:
     """`topomerge watch`: until Ctrl-C, or with --once until all that is there is in the atlas."""
-    began = time.monotonic()
+    clock = Stopwatch()
     watch: FolderWatcher | None = None
     try:
         watch = _build_monitor(args)
@@ -235,7 +236,7 @@ def run_watch(args: argparse.Namespace) -> int:
         if not isinstance(find_signal(stop), KeyboardInterrupt):
             raise
         done = "nothing was read yet" if watch is None else _format_summary(watch)
-        print_text(f"stopped after {time.monotonic() - began:.0f} s: {done}")
+        print_text(f"stopped after {clock.elapsed:.0f} s: {done}")
         return 130 if args.once else 0
     if not args.quiet:
         print_line(_format_summary(watch))

@@ -73,7 +73,7 @@ def _collect_export_options(args: argparse.Namespace, names: list[str]) -> dict[
 
         options["graph"] = build_map_graph(read_file_frames(place if place.is_dir() else place.parent))
     if "tf2" in names:
-        from topomerge.io.exports.tf2 import read_frame_poses
+        from topomerge.io.exports.placements import read_frame_poses
 
         options["transforms"] = read_frame_poses(place if place.is_dir() else place.parent, frames)
     elif frames:

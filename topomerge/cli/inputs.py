@@ -14,7 +14,6 @@ import os
 import signal
 import sys
 import threading
-import time
 import traceback
 import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -28,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 from topomerge.cli.console import ProgressBars, Report, exit_on_signals, format_failure, show_log, warn
 from topomerge.cli.options import SELECTIVE, collect_given, collect_reading_options, is_map
 from topomerge.errors import InputError
+from topomerge.progress import Stopwatch
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -201,7 +201,7 @@ def _load_map(path: str, args: argparse.Namespace, start_task: Starter) -> Loade
     Raises:
         InputError: as `iter_input_maps`.
     """
-    began = time.perf_counter()
+    watch = Stopwatch()
     try:
         if is_map(path):
             topomap = _load_corrected_map(path, getattr(args, "edits", None))
@@ -212,14 +212,14 @@ def _load_map(path: str, args: argparse.Namespace, start_task: Starter) -> Loade
             chunks = read_chunks(path, **collect_reading_options(path, args), progress=start_task("read"))
             topomap = extract(chunks, **collect_given(args, "voxel_size"), name=path, progress=start_task("extract"))
         topomap = replace(topomap, parameters={**topomap.parameters, **collect_given(args, "sensor")})
-        seconds = time.perf_counter() - began
+        seconds = watch.elapsed
         parts = _prepare_map(topomap) if getattr(args, "prepares", False) and not is_map(path) else None
     except InputError as error:
         text = str(error) if path in str(error) else f"{path}: {error}"
         if advised := [name for name in EXTRACT_ADVICE if name in text]:
             text += f" ({', '.join(advised)}: of `topomerge extract`, whose .tmap can be given here)"
         raise InputError(text) from error
-    extracting, preparing = 0.0, time.perf_counter() - began - seconds
+    extracting, preparing = 0.0, watch.elapsed - seconds
     if not is_map(path):
         extracting = min(sum(s for step, s in topomap.seconds.items() if not step.startswith("read")), seconds)
     return LoadedMap(topomap, seconds - extracting, extracting + preparing, parts)

@@ -19,7 +19,7 @@ from topomerge.extraction.plans.storey_plan import (
     is_observed_band,
 )
 from topomerge.kernels.rasters import compute_column_bits
-from topomerge.structure.directions import estimate_wall_directions
+from topomerge.structure.lines import estimate_wall_directions
 from topomerge.types import Array, TopometricMap
 
 FURNITURE_STEP = 1.0  # m above the floor, between low and high things

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
@@ -114,11 +113,6 @@ BENT_PAIRS = 40  # if no limit is given
 LARGE_COMMON = 80.0  # m2
 SENSOR_CLASSES = ("tls", "lidar", "depth", "tablet", "laser2d", "drawing")
 ROOM_HEADS = ("every room within 0.1 m, 1° %,", "median m,", "median °,")
-
-
-@dataclass
-class Settings(TaskSettings):
-    """Settings of the task."""
 
 
 def list_inputs(settings: TaskSettings) -> list[str]:

@@ -55,11 +55,6 @@ RIGHT = 0.01  # m
 ANCHOR = np.array([[5.0, 5.0, 0.0]])  # m, where poses are compared
 
 
-@dataclass
-class Settings(TaskSettings):
-    """Settings of the task."""
-
-
 @dataclass(frozen=True)
 class Case:
     """Two sessions in a building, or a scan of a model."""

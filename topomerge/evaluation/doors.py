@@ -11,7 +11,7 @@ door is. Doors of the map that lead to rooms that were only looked into count no
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from time import process_time
 
@@ -37,11 +37,6 @@ SHOWN_BY = PLAN, WALLS = "plan", "plan and walls"
 
 DOOR_COLUMNS: tuple[str, ...] = ("sensor", "doors by", "true doors", *STATES)
 DOOR_COLUMNS += ("precision", "called shut: right", "called half open: right", "edges P", "edges R", "rooms IoU", "s")
-
-
-@dataclass
-class Settings(TaskSettings):
-    """Settings of the task."""
 
 
 def draw_cases(development: bool) -> list[Case]:

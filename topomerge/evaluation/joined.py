@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -41,11 +40,6 @@ JOINED_PAIRS = 30  # if no limit is given
 WAYS = ("rigid", "bent")
 HEADS = ("pairs", "rooms of the better map", "of the joined map", "not below the better", "doors of the better", "of the joined",
          "doubled walls", "at most 2 %", "fusing s")  # fmt: skip
-
-
-@dataclass
-class Settings(TaskSettings):
-    """Settings of the task."""
 
 
 def list_inputs(settings: TaskSettings) -> list[str]:

@@ -41,7 +41,7 @@ from topomerge.matching.poses import wrap_yaw
 from topomerge.statistics import bootstrap_mean, compute_exact_interval
 from topomerge.types import Array, LogFn, PointCloud, Sim3
 
-MAKERS = ("topomerge.fusion.atlas.locate", "topomerge.fusion.atlas.place_search", "topomerge.datasets.pairs.localisation")
+MAKERS = ("topomerge.fusion.atlas.locate", "topomerge.fusion.atlas.place_index", "topomerge.datasets.pairs.localisation")
 MAPS = {"validation": 24, "test": 50}
 FIRST = {"validation": 0, "test": 24}  # building that is judged: by the first ones of the test the threshold was chosen
 SIZE_SCANS, ASKED, MANY = ("station", "sweep", "walk"), 5, 1000  # by which growth is measured; buildings; maps that none has made

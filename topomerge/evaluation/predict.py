@@ -26,6 +26,7 @@ from topomerge.fusion.pipeline import merge
 from topomerge.fusion.result import RoomMatch
 from topomerge.matching.assignment import compute_descriptor_costs
 from topomerge.matching.match import match
+from topomerge.progress import Stopwatch
 from topomerge.registration.pipeline import Registration, register
 from topomerge.registration.verify import load_model
 from topomerge.types import Array, TopometricMap
@@ -249,10 +250,10 @@ def predict_all(pairs: Sequence[Path], folder: Path, settings: Evaluation, log_l
     folder.mkdir(parents=True, exist_ok=True)
     targets = [folder / f"{p.stem}.npz" for p in pairs]
     left = [(p, t) for p, t in zip(pairs, targets, strict=True) if settings.remake or not t.exists()]
-    last = time.monotonic()
+    last, watch = 0.0, Stopwatch()
     for number, _ in enumerate(_iter_predicted(left, settings), 1):
-        if time.monotonic() - last > 10 or number == len(left):
-            last = time.monotonic()
+        if watch.elapsed - last > 10 or number == len(left):
+            last = watch.elapsed
             log_line(f"{len(targets) - len(left) + number} of {len(targets)} pairs predicted")
     return targets
 

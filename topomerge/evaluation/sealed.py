@@ -17,7 +17,6 @@ import os
 import re
 import shlex
 import sys
-import time
 from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
 from datetime import UTC, datetime
@@ -30,6 +29,7 @@ from topomerge.datasets.core.builder import run_script
 from topomerge.datasets.plans.sealed import SEALED, open_sealed_set
 from topomerge.errors import InputError
 from topomerge.evaluation.sealed_measures import SEALED_PARTS, Row, SealedItem, format_tables, list_items, measured
+from topomerge.progress import Stopwatch
 
 ROOT = Path(__file__).parent.parent.parent
 PAGE = ROOT / "docs" / "results" / "sealed.md"
@@ -144,11 +144,11 @@ def measure_and_append(arguments: Sequence[str]) -> None:
         check_page(page, __version__, options.again)
     before = list_blocks(page.read_text(encoding="utf-8")).count(__version__) if page and page.is_file() else 0
     data = Path(os.environ["TOPOMERGE_DATA"]) if os.environ.get("TOPOMERGE_DATA") and not options.small else None
-    began = time.time()
+    watch = Stopwatch()
     split, public = "train" if options.small else SEALED, parse_public_sets(options.public)
     rows = run(split, data, public, options.jobs, options.small, options.parts)
     text = format_block(
-        rows, __version__, shlex.join(["python", "-m", "topomerge.evaluation.sealed", *arguments]), time.time() - began, before
+        rows, __version__, shlex.join(["python", "-m", "topomerge.evaluation.sealed", *arguments]), watch.elapsed, before
     )
     if page:
         append_text(page, text)

@@ -1,6 +1,6 @@
 """Tasks of `evaluate.py` that measure what the library makes: rooms, doors, merges, joined maps, atlases, retrieval.
 
-A task is a module of this package with `Settings`, `measure`, `tabulate`, `list_inputs` and `MAKERS`; `run_task` does the rest:
+A task is a module of this package with `measure`, `tabulate`, `list_inputs` and `MAKERS`; `run_task` does the rest:
 settings from the command line, rows kept beside a report in ``runs/eval/<task>-<set>``, and tables between the marks of a page.
 """
 
@@ -93,9 +93,8 @@ class TaskSettings:
 
 
 class EvaluationModule(Protocol):
-    """The functions that the module of a task defines."""
+    """The functions that the module of a task defines, and `Settings` where it has more than `TaskSettings`."""
 
-    Settings: type[TaskSettings]
     MAKERS: tuple[str, ...]
 
     def measure(self, settings: Any, log_line: LogFn) -> list[Row]:
@@ -139,7 +138,7 @@ def read_settings(task: str, overrides: Sequence[str]) -> Any:
             raise InputError(f"{word}: give KEY=VALUE, such as data=dev")
     quoted = [f"{key}='{value}'" if key in ("data.set", "data.only") else word
               for word in plain for key, _, value in [word.partition("=")]]  # fmt: skip
-    return convert_to_dataclass(OmegaConf.from_dotlist(quoted), load_task(task).Settings)
+    return convert_to_dataclass(OmegaConf.from_dotlist(quoted), getattr(load_task(task), "Settings", TaskSettings))
 
 
 def run_task(task: str, overrides: Sequence[str], log_line: LogFn) -> Outcome:

@@ -11,7 +11,6 @@ same way.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from time import process_time
@@ -57,11 +56,6 @@ COLUMNS = {
     "iou": "outlines IoU",
     "iou_floor": "IoU of floors",
 }
-
-
-@dataclass
-class Settings(TaskSettings):
-    """Settings of the task."""
 
 
 def draw_cases(development: bool) -> list[Case]:

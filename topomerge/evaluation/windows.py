@@ -10,7 +10,6 @@ the map in rooms that were only looked into count nowhere, as in the other table
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -45,11 +44,6 @@ WINDOW_COLUMNS = (
     "sill off, m",
     "head off, m",
 )
-
-
-@dataclass
-class Settings(TaskSettings):
-    """Settings of the task."""
 
 
 def draw_cases(development: bool) -> list[Case]:

@@ -38,11 +38,11 @@ from topomerge.extraction.segment import (
     segment_storey,
 )
 from topomerge.extraction.slices import is_slice, raise_slice
-from topomerge.extraction.stopwatch import Progress, Stopwatch
 from topomerge.extraction.topology import build_topometric_map, select_rooms_with_floor
 from topomerge.extraction.views.view_rooms import segment_views
 from topomerge.extraction.walls import relabel_walls, unroll_walls
 from topomerge.numpy_nn import sigmoid
+from topomerge.progress import Progress, Stopwatch
 from topomerge.types import EDGE_DTYPE, LEVELLED, Array, PointCloud, TopometricMap, VoxelGrid, add_outline_odds
 
 # What the score of a passage weighs: the log odds of a door by the plan, and by the walls, on average along a doorway that they

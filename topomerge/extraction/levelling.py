@@ -19,7 +19,7 @@ from topomerge.types import Array, PointCloud, VoxelGrid, transform_landmarks, t
 # ceilings, but no walls: a cloud is tilted only where its walls, too, lean by as much and to the same side.
 
 LEAST_TILT = 1.0  # degrees: of real scans that are level 0.7 at most were found; from there on merges suffer
-LARGEST_TILT = 25.0  # degrees: beyond, another axis is up, of which `io.point_warnings` warns
+LARGEST_TILT = 25.0  # degrees: beyond, another axis is up, of which `io.frame` warns
 SAMPLE = 300_000  # points that are looked at
 PATCH_EDGES = (0.4, 0.8)  # m, of the cubes in which planes are fitted; the larger ones where the smaller ones show too few
 LEAST_POINTS = 8  # of a patch

@@ -32,6 +32,7 @@ from topomerge.io.grid import classify, extrude
 from topomerge.io.piece import ReadOptions
 from topomerge.io.pose_book import FramePose, PoseBook, find_pose, read_time, take_poses
 from topomerge.io.streams import MESSAGE_ERRORS, Received, infer_kind
+from topomerge.progress import Stopwatch
 from topomerge.types import PointCloud
 
 log = logging.getLogger(__name__)
@@ -128,7 +129,7 @@ class Bridge:
         self._mixed = False
         self._told: set[str] = set()
         self._waiting: deque[tuple[RobotTopics, Message]] = deque(maxlen=WAITING)
-        self._free, self._saved = 0.0, time.monotonic()
+        self._free, self._since_saved = 0.0, Stopwatch()
         self._transforms = self._build_transforms()
         for robot in self.robots:
             self.merger.get_robot(robot.name)
@@ -160,16 +161,16 @@ class Bridge:
 
     def _go_through(self, source: Received, workers: ThreadPoolExecutor) -> None:
         running: Future[list[dict[str, Any]]] | None = None
-        began = 0.0
+        watch = Stopwatch()
         try:
             for message in source:
                 if message is not None:
                     self.take(message)
                 if running is not None and running.done():
                     done, running = running, None
-                    self._finish(done.result(), time.monotonic() - began)
+                    self._finish(done.result(), watch.elapsed)
                 if running is None and time.monotonic() >= self._free and (clouds := self.merger.take_changed()):
-                    began = time.monotonic()
+                    watch = Stopwatch()
                     running = workers.submit(self.merger.update, clouds)
         finally:
             if running is not None:
@@ -182,13 +183,13 @@ class Bridge:
         if events:
             self._transforms = self._build_transforms()
             self.outbox.append(self._transforms)
-        if events or time.monotonic() - self._saved > SAVING:
+        if events or self._since_saved.elapsed > SAVING:
             self._save()
 
     def _save(self) -> None:
         if not self._mixed:
             self.merger.save()
-            self._saved = time.monotonic()
+            self._since_saved = Stopwatch()
 
     def _tell_all(self, events: Sequence[Mapping[str, Any]]) -> None:
         for event in events:

@@ -24,8 +24,8 @@ from topomerge.extraction.plans.storey_floor import FLOOR_PROPERTIES, join_floor
 from topomerge.extraction.plans.storey_plan import Floor
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.segment import LEAST_ROOM
-from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.extraction.storeys import find_storeys, measure_floor_to_ceiling
+from topomerge.progress import Stopwatch
 from topomerge.types import Array, TopometricMap, VoxelGrid
 
 SAME_SHARE = 0.5  # of the floor of the smaller of two rooms, in the larger one: they are one

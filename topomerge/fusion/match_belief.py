@@ -18,7 +18,7 @@ from topomerge.matching.match import Matching
 from topomerge.matching.poses import PlanFields
 from topomerge.matching.room_plans import build_room_plans
 from topomerge.numpy_nn import sigmoid
-from topomerge.registration.evidence.places import MOST_ODDS, Places, score_places
+from topomerge.registration.places import MOST_ODDS, Places, score_places
 from topomerge.registration.storeys import build_plans
 from topomerge.registration.verify import PLACE_AREA
 from topomerge.types import Array, TopometricMap

@@ -4,7 +4,6 @@ method 4).
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -18,7 +17,6 @@ from topomerge.blas import limit_blas_threads
 from topomerge.embedding.learned import DEFAULT, get_descriptor_name
 from topomerge.embedding.learned import build_embedder as make_embedder
 from topomerge.embedding.quarter_turns import Descriptor, Rows
-from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.fusion.atlas.maps import hash_map
 from topomerge.fusion.atlas.solve import AtlasSettings, RegistrationsByPair, solve
 from topomerge.fusion.fuse import fuse, match_common_rooms
@@ -37,7 +35,7 @@ from topomerge.landmarks.settle import Observation, find_observations
 from topomerge.matching.consistency import compute_match_probability
 from topomerge.matching.match import Matching, match
 from topomerge.matching.poses import PoseHypothesis
-from topomerge.progress import tell_step
+from topomerge.progress import Stopwatch, tell_step
 from topomerge.registration.bend.bend import NEITHER_BENDS
 from topomerge.registration.pipeline import FallbackProposals, Registration, register
 from topomerge.registration.posterior import POSTERIOR, WORDS, check_same, compute_evidence_limit, describe_posterior
@@ -229,10 +227,10 @@ def merge(
     config = MergeConfig(scale, threshold, embedder, rigid, same, force, poses, decided)
     prepared = [map if isinstance(map, Prepared) else None for map in maps]
     loaded_maps = [load_input(map.load() if isinstance(map, Prepared) else map) for map in maps]
-    began = time.perf_counter()
+    watch = Stopwatch()
     placed = place_pair(loaded_maps, config, prepared) if len(loaded_maps) == 2 else _place_set(loaded_maps, config)
     result = replace(_join(replace(placed, decided=decided)), descriptor=get_descriptor_name(embedder))
-    return replace(result, seconds=_split_seconds(placed.seconds, time.perf_counter() - began))
+    return replace(result, seconds=_split_seconds(placed.seconds, watch.elapsed))
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from topomerge.fusion.transfer import LANDMARK_PARAMETER
 from topomerge.landmarks.evidence import LandmarkEvidence
 from topomerge.landmarks.settle import Observation
 from topomerge.matching.match import describe_map
-from topomerge.registration.evidence.places import Places
 from topomerge.registration.pipeline import Registration
+from topomerge.registration.places import Places
 from topomerge.types import Array, Deformation, Placement, Sim3, TopometricMap, convert_pose_to_files
 from topomerge.writers import WRITERS
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import logging
 import math
 import os
-import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -23,6 +22,7 @@ from topomerge.errors import InputError
 from topomerge.io.depth_images import Camera, Frame, iter_pieces, iter_posed_scans
 from topomerge.io.piece import Piece, ReadOptions
 from topomerge.io.sightings import MOST_SIGHTINGS, Sighting, clean_text, compute_heading, fuse_sightings, is_legible
+from topomerge.progress import Stopwatch
 from topomerge.types import Array, Landmarks
 
 KEY_DISTANCE, KEY_ANGLE = 0.5, 15.0  # m and degrees by which the camera moves between two pictures that are read
@@ -85,7 +85,7 @@ class PictureReader:
         self.warnings: list[str] = []
         self.sightings: list[Sighting] = []
         self.read = self.unplaced = self.unread = 0
-        self.seconds = 0.0
+        self.watch = Stopwatch()
         self._views = np.zeros((0, 4, 4))  # poses of the last pictures that were read
         self._edges: list[float] = []
 
@@ -126,15 +126,14 @@ class PictureReader:
         self.unread += text_reader is None
         if text_reader is None and tag_reader is None:
             return
-        began = time.perf_counter()
-        shrunk, factor = shrink_picture(picture.image)
-        for box, text, confidence in text_reader(shrunk) if text_reader is not None else ():
-            value = clean_text(text)
-            if is_legible(value, confidence):
-                self._place("text", value, confidence, box * factor, picture)
-        for corners, value in tag_reader(grey.astype(np.uint8)) if tag_reader is not None else ():
-            self._place("tag", value, 1.0, corners, picture)
-        self.seconds += time.perf_counter() - began
+        with self.watch.measure("read"):
+            shrunk, factor = shrink_picture(picture.image)
+            for box, text, confidence in text_reader(shrunk) if text_reader is not None else ():
+                value = clean_text(text)
+                if is_legible(value, confidence):
+                    self._place("text", value, confidence, box * factor, picture)
+            for corners, value in tag_reader(grey.astype(np.uint8)) if tag_reader is not None else ():
+                self._place("tag", value, 1.0, corners, picture)
         self.read += 1
 
     def _place(self, kind: str, value: str, confidence: float, box: Array, picture: Picture) -> None:
@@ -150,7 +149,8 @@ class PictureReader:
         if self.unread:
             self.warnings.append(f"signs on pictures are not read: {explain_missing_reader()} (--no-text: without this line)")
         if self.read:
-            log.info("%d pictures were read in %.1f s, %.2f s each", self.read, self.seconds, self.seconds / self.read)
+            seconds = self.watch.seconds["read"]
+            log.info("%d pictures were read in %.1f s, %.2f s each", self.read, seconds, seconds / self.read)
         if self.unplaced:
             log.info("%d texts and tags on pictures have no depth and are left out", self.unplaced)
         return fuse_sightings(self.sightings, "pictures")

@@ -21,10 +21,11 @@ import numpy as np
 from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError, is_memory_short
 from topomerge.io import frame
+from topomerge.io.frame import warn_about
 from topomerge.io.landmarks import read_tables_beside
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_options
-from topomerge.io.point_warnings import warn_about
 from topomerge.io.sightings import ObjectFinder
+from topomerge.progress import Progress
 from topomerge.types import (
     Array,
     Landmarks,
@@ -192,7 +193,6 @@ class Gatherer:
         self.pending = cloud
 
 
-Progress = Callable[[float, str], None]
 Block = TypeVar("Block")
 MOST_FILES_LOOKED_AT = 1000  # in a folder that can't be read
 MESSAGE_LETTERS = 500  # of a message beside the path, at most: what it quotes of a damaged file may be long

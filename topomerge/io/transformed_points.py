@@ -13,7 +13,8 @@ import numpy as np
 from topomerge.archive import replace_on_success
 from topomerge.io import frame
 from topomerge.io.piece import BLOCK_POINTS, build_damage_error, read_options
-from topomerge.io.points import Progress, detect_format, iter_guarded, read_chunks
+from topomerge.io.points import detect_format, iter_guarded, read_chunks
+from topomerge.progress import Progress
 from topomerge.types import Array, PointCloud
 
 Move = Callable[[Array], Array]  # (n, 3) float64 points in metres, z up -> (n, 3)

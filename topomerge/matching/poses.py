@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.kernels import registration, run_in_slices
-from topomerge.structure.directions import DIRECTION_STEP, compute_direction_profile
+from topomerge.structure.lines import DIRECTION_STEP, compute_direction_profile
 from topomerge.types import Array, Sim3
 
 LARGEST_LOG_ODDS = 7.0

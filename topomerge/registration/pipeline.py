@@ -14,15 +14,14 @@ import numpy as np
 
 from topomerge.blas import limit_blas_threads
 from topomerge.errors import InputError
-from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.kernels import count_threads, run_side_by_side
 from topomerge.landmarks.evidence import LandmarkEvidence, LandmarkScorer
 from topomerge.landmarks.proposals import propose_poses
 from topomerge.matching.poses import PoseHypothesis, refine, select_distinct_hypotheses, wrap_yaw
-from topomerge.progress import tell_step
+from topomerge.progress import Stopwatch, tell_step
 from topomerge.registration.bend.bend import Bend, bend
-from topomerge.registration.evidence.places import Places, score_places
 from topomerge.registration.judge import Judge, compute_winner_features
+from topomerge.registration.places import Places, score_places
 from topomerge.registration.posterior import check_same
 from topomerge.registration.prepared import Map, Prepared, prepare
 from topomerge.registration.refine import refine_pose

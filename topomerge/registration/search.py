@@ -14,7 +14,7 @@ from scipy import fft, ndimage
 
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.matching.poses import PlanFields, PoseHypothesis, pair_storeys, refine, wrap_yaw
-from topomerge.structure.directions import DIRECTION_STEP
+from topomerge.structure.lines import DIRECTION_STEP
 from topomerge.types import Array, Sim3
 
 YAW_PEAKS = 10  # of the correlated direction profiles

@@ -20,10 +20,9 @@ import numpy as np
 from topomerge.edits.draft import find_room_place
 from topomerge.edits.journal import append_edits, build_edit, find_journal, read_journal, select_effective
 from topomerge.errors import InputError
-from topomerge.fusion.decisions import build_acceptance
+from topomerge.fusion.decisions import build_acceptance, place_by_hand
 from topomerge.fusion.pipeline import format_probability
 from topomerge.progress import PROGRESS_MARK, PROGRESS_VARIABLE
-from topomerge.registration.by_hand import place_by_hand
 from topomerge.registration.posterior import WORDS
 from topomerge.registration.prepared import prepare
 from topomerge.studio.folder import StudioFolder, read_listing

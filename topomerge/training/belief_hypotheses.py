@@ -18,10 +18,10 @@ from topomerge.datasets.real.maps import build_floor
 from topomerge.matching.poses import wrap_yaw
 from topomerge.metrics import is_pose_right
 from topomerge.networks.network import Network, Run
-from topomerge.registration.evidence.places import CROP_ARRAYS, Crops, Places, compute_place_log_odds, read_weights
-from topomerge.registration.evidence.places import load_weights as place_weights
 from topomerge.registration.judge import Judge
 from topomerge.registration.pipeline import build_candidate, count_repeats, select_rivals
+from topomerge.registration.places import CROP_ARRAYS, Crops, Places, compute_place_log_odds, read_weights
+from topomerge.registration.places import load_weights as place_weights
 from topomerge.registration.prepared import prepare
 from topomerge.registration.search import search, search_scaled
 from topomerge.registration.verify import rank

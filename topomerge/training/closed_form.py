@@ -4,7 +4,6 @@ same."""
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
@@ -13,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from topomerge.archive import replace_on_success
+from topomerge.progress import Stopwatch
 from topomerge.registry import TASKS
 from topomerge.training.run_folder import MetricsLog, begin_run, export_files, write_card
 from topomerge.training.settings import TaskSettings
@@ -43,12 +43,12 @@ def run_fit(settings: Settings, make: Callable[[Settings, LogFn], FitResult], lo
         log_line(f"{best}: is there")
         row = json.loads(metrics.read_text(encoding="utf-8").splitlines()[-1])
     else:
-        began = time.perf_counter()
+        watch = Stopwatch()
         fitted = make(settings, log_line)
         begin_run(replace(settings, resume=False), threads=settings.jobs)
         log = MetricsLog(settings)
         scores = {f"val/{name}": float(value) for name, value in fitted.metrics.items()}
-        row = {"epoch": 0, "seconds": time.perf_counter() - began, **scores}
+        row = {"epoch": 0, "seconds": watch.elapsed, **scores}
         log.append_row(row)
         log.close()
         best.parent.mkdir(parents=True, exist_ok=True)

@@ -21,8 +21,7 @@ from topomerge.datasets.core.builder import limit_threads
 from topomerge.datasets.pairs.localisation import MORE_SCANS, SCANS, load_located_map, make_located_map, make_located_scan
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.locate import LOCATE, find_places, measure_chance, prepare_query
-from topomerge.fusion.atlas.place_index import PlaceIndex
-from topomerge.fusion.atlas.place_search import FEATURES
+from topomerge.fusion.atlas.place_index import FEATURES, PlaceIndex
 from topomerge.io.maps import load_map
 from topomerge.matching.poses import wrap_yaw
 from topomerge.training.closed_form import FitResult, run_fit
@@ -33,7 +32,7 @@ from topomerge.types import Array, LogFn
 KINDS = (*SCANS, *MORE_SCANS)
 RIGHT = (0.5, np.radians(6.0))  # m and rad: a pose that is learned as right
 FOLDS = 6
-MAKERS = ("topomerge.fusion.atlas.place_search", "topomerge.datasets.pairs.localisation")  # of features and scans
+MAKERS = ("topomerge.fusion.atlas.place_index", "topomerge.datasets.pairs.localisation")  # of features and scans
 SHRINK = 1e-3  # of squared weights of standardised features
 DIGITS = 4
 

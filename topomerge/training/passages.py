@@ -30,8 +30,8 @@ from topomerge.extraction.extract import KINDS, SCORE_INPUTS, compute_inputs, ga
 from topomerge.extraction.parameters import PRESETS, DefaultParameters
 from topomerge.extraction.plans.passages import DOOR_FEATURES, compute_door_features
 from topomerge.extraction.segment import GrowingRooms, SegmentedStorey, log_odds, score_by_plan
-from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.numpy_nn import sigmoid
+from topomerge.progress import Stopwatch
 from topomerge.training.closed_form import FitResult, compute_calibration_error, run_fit
 from topomerge.training.packed_pairs import number_buildings, read_scan_building
 from topomerge.training.scan_settings import Passages

@@ -1,4 +1,4 @@
-"""Task `place_evidence`: the network that scores whether two squares from above show one place (`registration.evidence.places`).
+"""Task `place_evidence`: the network that scores whether two squares from above show one place (`registration.places`).
 
 Squares of simulated maps under their right pose and under wrong ones that the search proposed: another place of the building, a
 twin wing, another storey, another building. Furniture is moved, doors are opened and maps drift between the two. Turned, mirrored
@@ -22,7 +22,7 @@ from topomerge.datasets.pairs.lookalikes import build_lookalikes
 from topomerge.errors import InputError
 from topomerge.models.convolutional import PlaceLogOdds, PlaceNetwork
 from topomerge.models.export import build_sample
-from topomerge.registration.evidence.places import (
+from topomerge.registration.places import (
     PLACE_SIGNATURE,
     UPPER_PLANES,
     compute_network_log_odds,

@@ -22,6 +22,7 @@ from topomerge.code_digest import read_commit
 from topomerge.config import read_command
 from topomerge.errors import InputError
 from topomerge.networks import network as networks
+from topomerge.progress import Stopwatch
 from topomerge.registry import LOGGERS, NO_LOGGER
 
 RUN_FILE, CONFIG_FILE, RUN_FORMAT = "run.json", "config.json", 1
@@ -305,9 +306,9 @@ class EtaClock:
     """Seconds since it was made, and how many are left at the pace so far."""
 
     def __init__(self, done: int, total: int) -> None:
-        self.began, self.first, self.total = time.monotonic(), done, total
+        self.watch, self.first, self.total = Stopwatch(), done, total
 
     def format_time_left(self, done: int) -> str:
         """Return hh:mm:ss that remain when `done` of the total are done."""
-        seconds_each = (time.monotonic() - self.began) / max(done - self.first, 1)
+        seconds_each = self.watch.elapsed / max(done - self.first, 1)
         return time.strftime("%H:%M:%S", time.gmtime(seconds_each * (self.total - done)))

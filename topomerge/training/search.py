@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 import shutil
-import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,6 +19,7 @@ from typing import Any
 from topomerge.archive import replace_on_success
 from topomerge.config import compose_config, convert_to_dataclass
 from topomerge.errors import InputError
+from topomerge.progress import Stopwatch
 from topomerge.registry import TASKS
 from topomerge.training.instruments import REPORT
 from topomerge.training.loop import derive_seed
@@ -284,12 +284,12 @@ def run_trial(plan: Plan, number: int | None, log_line: LogFn) -> None:
             if row["epoch"] + 1 < settings.epochs and trial.should_prune():
                 raise optuna.TrialPruned
 
-        token, began = REPORT.set(report), time.monotonic()
+        token, watch = REPORT.set(report), Stopwatch()
         log_line(f"{name}: {' '.join(found)}")
         try:
             value = train(settings, lambda text: log_line(f"{name}: {text}"))[f"val/{plan.watch}"]
             study.tell(trial, value)
-            log_line(f"{name}: {plan.watch} {value:.3f} in {time.monotonic() - began:.0f} s")
+            log_line(f"{name}: {plan.watch} {value:.3f} in {watch.elapsed:.0f} s")
         except optuna.TrialPruned:
             study.tell(trial, state=optuna.trial.TrialState.PRUNED)
             log_line(f"{name}: ended early, as it is worse than most")

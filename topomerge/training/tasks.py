@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, make_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -102,9 +103,16 @@ def prepare_words(overrides: Sequence[str]) -> list[str]:
     register("optuna", Search, group=SEARCH, package=SEARCH)
     ready = bracket_lists(find_plugins(overrides))
     for task in get_word(overrides, "task", DEFAULT_TASK).split(","):
-        schema = make_dataclass("Composed", [(SEARCH, Any, None)], bases=(TASKS[task].get_schema(),))
-        register(task, schema, group="task")
+        register(task, _add_search_key(TASKS[task].get_schema()), group="task")
     return ready
+
+
+@cache
+def _add_search_key(schema: type[Any]) -> type[Any]:
+    """Add the key of a search for settings to those of a task."""
+    from topomerge.config import SEARCH
+
+    return make_dataclass("Composed", [(SEARCH, Any, None)], bases=(schema,))
 
 
 def compose_settings(overrides: Sequence[str] = ()) -> Any:

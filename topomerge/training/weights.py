@@ -16,6 +16,7 @@ from pathlib import Path
 from topomerge.archive import replace_on_success
 from topomerge.datasets.core.builder import run_script
 from topomerge.errors import InputError
+from topomerge.progress import Stopwatch
 from topomerge.registry import TASKS
 from topomerge.training.tasks import compose_settings, train
 
@@ -44,9 +45,9 @@ def main(arguments: Sequence[str]) -> int:
             _print_progress(
                 f"{task}: about {_format_duration(seconds, [task])}; in all about {_format_duration(seconds, left)} left"
             )
-            began = time.time()
+            watch = Stopwatch()
             make_task(task, runs, shared)
-            _record_seconds(runs, task, seconds.get(f"{task} so far", 0.0) + time.time() - began)
+            _record_seconds(runs, task, seconds.get(f"{task} so far", 0.0) + watch.elapsed)
 
     return run_script("weights", work)
 

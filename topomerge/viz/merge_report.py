@@ -24,8 +24,8 @@ from topomerge.fusion.transfer import transform_floor
 from topomerge.io.listing import format_json
 from topomerge.io.maps import save_map
 from topomerge.io.rooms_ply import assign_room_colours, save_rooms_ply
-from topomerge.registration.evidence.places import MOST_ODDS, PARTS, Places
 from topomerge.registration.pipeline import Registration
+from topomerge.registration.places import MOST_ODDS, PARTS, Places
 from topomerge.types import Array, Placement, Sim3, TopometricMap
 from topomerge.viz.merge_plan import Drawn, lay_out_pair, render_blend_view, render_deformation_table, render_lines
 from topomerge.viz.plan import build_scene_data

@@ -12,7 +12,7 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.io.rooms_ply import assign_room_colours
-from topomerge.structure.directions import estimate_wall_directions
+from topomerge.structure.lines import estimate_wall_directions
 from topomerge.types import LANDMARK_KINDS, Array, TopometricMap, find_room_names
 from topomerge.viz.plan import (
     DRAWN_AGAIN,

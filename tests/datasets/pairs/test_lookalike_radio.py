@@ -17,7 +17,7 @@ from topomerge.types import Sim3
 
 HOUSE = make_building("apartment", 3)
 ROOMS = np.arange(len(HOUSE.rooms))
-EXACT = replace(WIFI, density=5.0, shadow=0.0, noise=0.0, gain=0.0, missed=0.0, moved=0.0, sensitivity=-120.0)
+EXACT = replace(WIFI, density=2.5, shadow=0.0, noise=0.0, gain=0.0, missed=0.0, moved=0.0, sensitivity=-120.0)
 
 
 def simulate(kind: str, again: bool = False, draw: int = 0):

@@ -434,6 +434,7 @@ def test_merges_of_them_are_counted(maps_folder: Path, tmp_path: Path) -> None:
         run_task("merges", ["data=test", f"path={maps_folder}"], quiet)
 
 
+@pytest.mark.longer
 def test_the_matcher_of_rooms_takes_them(houses: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(room_matcher, "run_network", lambda job, *_: {"learned": len(job.learned), "watched": len(job.watched)})
     settings = compose_settings(["task=room_matcher", "data=folder", f"path={houses}", f"cache={cache}", "views=1"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.cases import list_longer
 from tests.extraction.elevations.doors import SHUT_DOOR, cupboard_and_board, extracted, three_doors, wide_opening
 from tests.scenes import two_rooms
 from tests.training.tiny import two_doors
@@ -97,7 +98,7 @@ def test_three_parts_in_a_row_are_one_and_none_are_none():
     assert not len(ways) and ways.dtype == DOORWAY_DTYPE and not len(shown)
 
 
-@pytest.mark.parametrize(("width", "turn"), [(2.0, 0.0), (2.4, 1.0), (3.0, 0.3)])
+@pytest.mark.parametrize(("width", "turn"), [(2.4, 1.0), *list_longer((2.0, 0.0), (3.0, 0.3))])
 def test_an_opening_wider_than_doors_is_one(width, turn):
     map = extracted(wide_opening(width).points(), turn)
     (edge,) = map.edges

@@ -9,8 +9,8 @@ from tests.extraction.elevations.doors import SHUT_DOOR, three_doors
 from topomerge.extraction.elevations.elevation import ACROSS, ALONG, BANDS, BEFORE, PAST_ENDS, Elevations, unroll
 from topomerge.extraction.extract import gather_evidence, read_navigable
 from topomerge.extraction.parameters import PRESETS
-from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.extraction.voxels import voxelise
+from topomerge.progress import Stopwatch
 from topomerge.types import VoxelGrid
 
 CLOUD = three_doors().points()

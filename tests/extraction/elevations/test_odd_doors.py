@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.cases import list_longer
 from tests.extraction.elevations.doors import (
     AJAR_DOOR,
     SHUT_DOOR,
@@ -22,7 +23,7 @@ from topomerge.extraction.elevations.doorways import classify_places, compute_do
 from topomerge.extraction.elevations.elevation import BANDS, DEPTHS, FACE_DTYPE, STRIP_CHANNELS, Elevations
 from topomerge.extraction.extract import extract, gather_evidence, read_navigable
 from topomerge.extraction.parameters import PRESETS
-from topomerge.extraction.stopwatch import Stopwatch
+from topomerge.progress import Stopwatch
 from topomerge.types import classify_door_state
 
 
@@ -52,7 +53,7 @@ def test_a_niche_in_an_outer_wall_leads_nowhere(depth: float):
     assert len(map.rooms) == 1 and not len(map.edges)
 
 
-@pytest.mark.parametrize(("width", "is_open"), [(1.8, True), (2.0, True), (1.6, False), (1.8, False), (2.0, False)])
+@pytest.mark.parametrize(("width", "is_open"), [(1.8, True), (1.8, False), *list_longer((2.0, True), (1.6, False), (2.0, False))])
 def test_a_double_door_is_one_door_as_wide(width: float, is_open: bool):
     map = extracted(double_door(width, is_open).points(0.003))
     (door,) = map.edges
@@ -67,7 +68,7 @@ def test_a_sliding_door_that_stands_half_open_is_one_open_door(cover: float):
     assert door["centre"][:2] == pytest.approx([4, 2], abs=0.15) and door["width"] == pytest.approx(0.9, abs=0.15)
 
 
-@pytest.mark.parametrize("angle", [0.5, 0.8, 1.1])
+@pytest.mark.parametrize("angle", [0.8, *list_longer(0.5, 1.1)])
 def test_a_leaf_that_stands_half_open_is_told_from_one_that_is_shut_or_wide_open(angle: float):
     map = extracted(ajar_door(angle).points(0.003))
     shut, ajar, wide = (map.edges[int(np.abs(map.edges["centre"][:, 1] - y).argmin())] for y in (SHUT_DOOR, AJAR_DOOR, 7.0))

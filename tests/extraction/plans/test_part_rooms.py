@@ -25,9 +25,9 @@ from topomerge.extraction.plans.plan import build_storey_plan
 from topomerge.extraction.plans.plan_network import compute_column_probabilities
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.segment import score_by_plan
-from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.extraction.storeys import find_storeys, measure_floor_to_ceiling
 from topomerge.extraction.voxels import voxelise
+from topomerge.progress import Stopwatch
 
 DOOR_X = 4.0  # m, of the wall with the door between the two rooms
 

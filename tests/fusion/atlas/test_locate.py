@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import topomerge as tm
+from tests.cases import list_longer
 from tests.fusion.atlas.atlas_scenes import office_map, stranger
 from tests.fusion.plans_of import office
 from topomerge import archive
@@ -50,6 +51,12 @@ def scan_part(frame: Sim3 = STRAIGHT, low: tuple[float, float] = LOW, high: tupl
 
 
 @cache
+def query() -> Query:
+    """The part, prepared once."""
+    return prepare_query(scan_part())
+
+
+@cache
 def index() -> PlaceIndex:
     """The office and a stranger."""
     return PlaceIndex.from_maps({"office": whole(), "stranger": stranger()})
@@ -61,8 +68,14 @@ def room_at(map: TopometricMap, place: Array) -> int:
     return int(map.navigable_room[np.hypot(*(floor[:, :2] - place[:2]).T).argmin()])
 
 
+@cache
+def answer_of_part() -> Location:
+    """Where the part is."""
+    return locate(index(), scan_part())
+
+
 def test_a_part_of_a_map_is_found_where_it_was_cut() -> None:
-    answer = locate(index(), scan_part())
+    answer = answer_of_part()
     assert answer.status == "located" and answer.told == 1, answer.reason
     place = answer.places[0]
     assert place.map == "office" and place.storey == 0
@@ -72,9 +85,9 @@ def test_a_part_of_a_map_is_found_where_it_was_cut() -> None:
     assert np.allclose(covariance, covariance.T) and (np.linalg.eigvalsh(covariance) > 0).all() and covariance[0, 0] < 0.1**2
 
 
-@pytest.mark.parametrize("frame", [Sim3(1.2, (4.0, -7.0, 0.6)), Sim3(-2.9, (30.0, 12.0, -2.0))])
+@pytest.mark.parametrize("frame", [Sim3(1.2, (4.0, -7.0, 0.6)), *list_longer(Sim3(-2.9, (30.0, 12.0, -2.0)))])
 def test_a_turned_scan_gives_the_pose_that_turns_it_back(frame: Sim3) -> None:
-    straight, turned = (locate(index(), scan_part(f)) for f in (Sim3(), frame))
+    straight, turned = answer_of_part(), locate(index(), scan_part(frame))
     assert turned.status == straight.status == "located"
     back = turned.places[0].pose @ frame
     assert np.allclose(back.apply(SENSOR[None]), straight.places[0].pose.apply(SENSOR[None]), atol=0.12)
@@ -84,15 +97,15 @@ def test_a_turned_scan_gives_the_pose_that_turns_it_back(frame: Sim3) -> None:
 def test_a_scan_of_another_building_is_not_here() -> None:
     """As sure as it may be: by the usual .99 it is told only that no place fits."""
     atlas = PlaceIndex.from_maps({"stranger": stranger()})
-    answer = locate(atlas, scan_part(), replace(LOCATE, absent=0.9))
+    answer = locate(atlas, query(), replace(LOCATE, absent=0.9))
     assert answer.status == "not here" and not answer.told and answer.nowhere >= 0.5 and "not here" in answer.reason
-    usual = locate(atlas, scan_part())
+    usual = locate(atlas, query())
     assert usual.status == "ambiguous" and not usual.told and "no place fits well" in usual.reason
 
 
 def test_two_copies_of_one_map_cannot_be_told_apart() -> None:
     twins = PlaceIndex.from_maps({"one": whole(), "two": whole(), "stranger": stranger()})
-    answer = locate(twins, scan_part())
+    answer = locate(twins, query())
     assert answer.status == "ambiguous" and answer.told == 2 and "cannot tell between 2" in answer.reason
     assert {p.map for p in answer.places[:2]} == {"one", "two"}
     assert answer.places[0].probability == pytest.approx(answer.places[1].probability, abs=1e-6)
@@ -102,7 +115,7 @@ def test_two_copies_of_one_map_cannot_be_told_apart() -> None:
 def test_maps_of_one_building_name_one_place() -> None:
     twins = PlaceIndex.from_maps({"one": whole(), "two": whole()})
     joined = replace(twins, maps=tuple(replace(m, building=0) for m in twins.maps))
-    answer = locate(joined, scan_part())
+    answer = locate(joined, query())
     assert answer.status == "located" and answer.places[0].probability > 0.9
 
 
@@ -135,7 +148,7 @@ def test_landmarks_name_the_maps_that_hold_the_same_rare_strings() -> None:
 
 
 def test_the_same_scan_gives_the_same_answer() -> None:
-    first, second = (locate(index(), scan_part()) for _ in range(2))
+    first, second = answer_of_part(), locate(index(), scan_part())
     assert replace(first, seconds={}) == replace(second, seconds={})
 
 
@@ -154,13 +167,13 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_an_atlas_keeps_its_index(built: Path, tmp_path: Path) -> None:
     house = Path(shutil.copytree(built, tmp_path / "house"))
-    first = tm.locate(house, scan_part())
+    first = tm.locate(house, query())
     files = sorted((house / INDEX_FOLDER).glob("*.npz"))
     assert len(files) == 2 and {f.stem for f in files} == {e.key for e in read_atlas(house).entries}
     before = [f.stat().st_mtime_ns for f in files]
-    again = tm.locate(house, scan_part())
+    again = tm.locate(house, query())
     assert [f.stat().st_mtime_ns for f in files] == before
-    direct = locate(index(), scan_part())
+    direct = answer_of_part()
     for answer in (again, direct):
         assert answer.status == first.status == "located" and answer.places[0].room == first.places[0].room
         assert answer.places[0].probability == pytest.approx(first.places[0].probability, abs=0.02)
@@ -198,7 +211,7 @@ def test_an_atlas_that_may_only_be_read_is_searched(built: Path, tmp_path: Path)
     shutil.rmtree(house / INDEX_FOLDER, ignore_errors=True)
     house.chmod(0o500)
     try:
-        assert tm.locate(house, scan_part()).status == "located"
+        assert tm.locate(house, query()).status == "located"
     finally:
         house.chmod(0o700)
 
@@ -236,8 +249,7 @@ def test_a_place_without_a_room_and_an_angle_of_nought() -> None:
 
 
 def test_all_probabilities_sum_to_one() -> None:
-    query: Query = prepare_query(scan_part())
-    judged = find_places(index(), query, LOCATE)
+    judged = find_places(index(), query(), LOCATE)
     assert len(judged) == LOCATE.judged and all(np.isfinite(j.features).all() for j in judged)
-    answer: Location = locate(index(), query)
+    answer: Location = locate(index(), query())
     assert 0 <= answer.nowhere <= 1 and all(0 <= p.probability <= 1 for p in answer.places)

@@ -15,7 +15,7 @@ from topomerge.fusion.pipeline import merge
 from topomerge.types import Sim3
 
 SYMMETRIC = [
-    (Arena(fold=2, seed=21), 3),
+    pytest.param(Arena(fold=2, seed=21), 3, marks=pytest.mark.longer),
     pytest.param(Arena(12.0, 8.0, fold=2, seed=22), 3, marks=pytest.mark.slow),
     pytest.param(Arena(11.0, 11.0, fold=2, round=True, seed=22), 4, marks=pytest.mark.slow),
     pytest.param(Arena(9.0, 9.0, fold=4, seed=41, bars=20), 3, marks=pytest.mark.slow),

@@ -16,11 +16,11 @@ from topomerge.extraction.convolution import Kernel, build_moore, build_sphere, 
 from topomerge.extraction.morphology import compute_horizontal_distance_field, label_components, spread_labels
 from topomerge.extraction.parameters import ThesisParameters
 from topomerge.extraction.plans.storey_plan import Floor
-from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.extraction.storeys import find_storeys, measure_floor_to_ceiling
 from topomerge.extraction.views.visibility import SparseVoxelOctree, Visibility, find_visible_cells
 from topomerge.kernels import graphs
 from topomerge.kernels import graphs as kernel
+from topomerge.progress import Stopwatch
 from topomerge.types import Array, VoxelGrid
 
 # Where to look from: local maxima of the horizontal distance field, raised to eye height (seeds 2.4).

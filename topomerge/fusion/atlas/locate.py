@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import repeat
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -26,15 +25,18 @@ from topomerge.fusion.atlas.place_index import (
     IndexedMap,
     IndexedStorey,
     PlaceIndex,
+    compute_features,
     open_index,
+    score_roughly,
+    search_coarsely,
     turn_points,
 )
-from topomerge.fusion.atlas.place_search import compute_features, score_roughly, search_coarsely
 from topomerge.io.maps import load_map
 from topomerge.io.points import read_chunks
 from topomerge.landmarks.evidence import LandmarkScorer
 from topomerge.landmarks.proposals import propose_poses
 from topomerge.matching.poses import PlanFields, PoseHypothesis, refine, wrap_yaw
+from topomerge.progress import Stopwatch
 from topomerge.registration.judge import Judge
 from topomerge.registration.search import find_yaw_candidates
 from topomerge.registration.storeys import build_plans
@@ -173,15 +175,15 @@ def locate(atlas: str | Path | PlaceIndex, scan: Any, settings: LocateSettings =
     Raises:
         InputError: no atlas, or a scan that can't be read or shows no walls.
     """
-    began = perf_counter()
+    watch = Stopwatch()
     index = atlas if isinstance(atlas, PlaceIndex) else open_index(atlas)
-    opened = perf_counter()
+    watch.lap("index")
     query = scan if isinstance(scan, Query) else prepare_query(scan)
-    prepared = perf_counter()
+    watch.lap("scan")
     judged = find_places(index, query, settings)
     answer = decide(index, query, judged, settings)
-    seconds = {"index": opened - began, "scan": prepared - opened, "search": perf_counter() - prepared}
-    return replace(answer, seconds={step: round(s, 4) for step, s in seconds.items()})
+    watch.lap("search")
+    return replace(answer, seconds={step: round(s, 4) for step, s in watch.seconds.items()})
 
 
 def prepare_query(scan: Any) -> Query:

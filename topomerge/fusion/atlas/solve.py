@@ -37,7 +37,7 @@ from topomerge.fusion.inputs import (
 )
 from topomerge.fusion.pose_graph import Assembler, Assembly, compute_residual
 from topomerge.matching.poses import PoseHypothesis
-from topomerge.progress import report_steps, tell_step
+from topomerge.progress import Stopwatch, report_steps, tell_step
 from topomerge.registration.bend.bend import NEITHER_BENDS
 from topomerge.registration.posterior import check_same
 from topomerge.registration.verify import load_model
@@ -127,7 +127,7 @@ def solve(
     Raises:
         InputError: as `atlas`; and a map has another key.
     """
-    began = time.perf_counter()
+    watch = Stopwatch()
     check_scale(settings.scale)
     check_same(settings.same)
     threshold = _compute_log_odds(resolve_link_threshold(settings.threshold, len(maps)))
@@ -137,11 +137,11 @@ def solve(
     ordered = Maps([maps[k] for k in order], settings.embedder, memory, [map_keys[k] for k in order])
     explorer = _Explorer(ordered, settings, threshold, {} if registrations is None else registrations, proposed or {})
     schedule = schedule or SolvingSchedule()
-    assembly = explorer.explore(began + schedule.seconds, schedule.workers)
+    assembly = explorer.explore(time.perf_counter() + schedule.seconds, schedule.workers)
     if schedule.answered is not None:
         schedule.answered(_build_result(assembly, explorer, names, order, rigid=True, fine=False))
     result = _build_result(assembly, explorer, names, order, settings.rigid)
-    return replace(result, maps=Maps(maps), seconds=time.perf_counter() - began, warnings=(*warnings, *result.warnings))
+    return replace(result, maps=Maps(maps), seconds=watch.elapsed, warnings=(*warnings, *result.warnings))
 
 
 def _check_maps(

@@ -29,6 +29,7 @@ from topomerge.io.landmarks import find_landmark_file, is_landmark_file, list_co
 from topomerge.io.listing import format_json
 from topomerge.io.maps import load_map
 from topomerge.io.points import PICTURES, list_suffixes
+from topomerge.progress import Stopwatch
 from topomerge.registration.pipeline import register
 from topomerge.types import Sim3, TopometricMap
 
@@ -291,15 +292,15 @@ class FolderWatcher:
 
     def _iter_batches(self, paths: list[str]) -> Iterator[list[_ReadFile]]:
         """Read files, as many as are written at once."""
-        batch, began = list[_ReadFile](), time.monotonic()
+        batch, clock = list[_ReadFile](), Stopwatch()
         for path in paths:
             examined = self._read_file(Path(path))
             if examined is not None:
                 batch.append(examined)
             maps = sum(one.map is not None for one in batch)
-            if maps >= MAPS_AT_ONCE or (batch and time.monotonic() - began > SECONDS_AT_ONCE):
+            if maps >= MAPS_AT_ONCE or (batch and clock.elapsed > SECONDS_AT_ONCE):
                 yield batch
-                batch, began = [], time.monotonic()
+                batch, clock = [], Stopwatch()
         if batch:
             yield batch
 

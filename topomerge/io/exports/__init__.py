@@ -26,10 +26,11 @@ Save = Callable[[Path], None]
 
 @dataclass(frozen=True)
 class Format:
-    """A format: its files' suffixes, the first one its own, and the function `module.save` (map, path, **options)."""
+    """A format: its files' suffixes, the first one its own, and the function of a module (map, path, **options)."""
 
     suffixes: tuple[str, ...]
     module: str
+    function: str = "save"
     folder: bool = False  # several files, named by `module.files`
     options: tuple[str, ...] = ()
     needs: tuple[str, str] | None = None  # Python package, extra
@@ -43,10 +44,10 @@ FORMATS = {
     "ros": Format((), "ros", folder=True, options=("storey",)),
     "rmf": Format((), "rmf", folder=True, options=("storey",)),
     "rviz": Format((".mcap",), "rviz", needs=("rosbags", "ros")),
-    "tf2": Format((".launch.xml", ".xml"), "tf2", options=("transforms",)),
-    "g2o": Format((".g2o",), "g2o", options=("graph",)),
-    "ply": Format((".ply",), "ply"),
-    "las": Format((".las", ".laz"), "las", needs=("laspy", "las")),
+    "tf2": Format((".launch.xml", ".xml"), "placements", "save_launch", options=("transforms",)),
+    "g2o": Format((".g2o",), "placements", "save_graph", options=("graph",)),
+    "ply": Format((".ply",), "points", "save_ply"),
+    "las": Format((".las", ".laz"), "points", "save_las", needs=("laspy", "las")),
     "ifc": Format((".ifc",), "ifc", needs=("ifcopenshell", "ifc")),
 }
 
@@ -90,7 +91,8 @@ def prepare_outputs(map: TopometricMap, name: str, path: Path, folder: bool, **o
         place, stem = (path.parent, path.name + "_") if folder else (path, "")
         files: list[tuple[Path, Save]] = module.prepare_files(map, place, stem, **given)
         return files
-    return [(path.with_name(path.name + form.suffixes[0]) if folder else path, partial(module.save, map, **given))]
+    save = partial(getattr(module, form.function), map, **given)
+    return [(path.with_name(path.name + form.suffixes[0]) if folder else path, save)]
 
 
 def save_export(map: TopometricMap, name: str, path: str | Path, min_confidence: float = 0.0, **options: Any) -> list[Path]:
@@ -102,7 +104,7 @@ def save_export(map: TopometricMap, name: str, path: str | Path, min_confidence:
         path: the file; for ros and rmf the folder, which is made.
         min_confidence: rooms, doors, stairs and windows that are less likely are left out, 0 to 1; 0: none.
         options: `storey` (geojson, ros, rmf) a number; `origin` (geojson) "latitude,longitude" or "latitude,longitude,heading";
-            `transforms` (tf2) as `topomerge.io.exports.tf2.read_frame_poses` gives them; `graph` (g2o) as
+            `transforms` (tf2) as `topomerge.io.exports.placements.read_frame_poses` gives them; `graph` (g2o) as
             `topomerge.fusion.frames.build_map_graph` builds it.
 
     Returns:

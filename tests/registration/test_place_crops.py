@@ -7,7 +7,7 @@ import pytest
 
 from tests.fusion.plans_of import MOVE, doubled, grid_of, office, part
 from topomerge.matching.poses import PlanFields
-from topomerge.registration.evidence.places import CROP_PIXEL, LEAST_SEEN, PARTS, SIDE, cut_crops
+from topomerge.registration.places import CROP_PIXEL, LEAST_SEEN, PARTS, SIDE, cut_crops
 from topomerge.registration.storeys import build_plans
 from topomerge.types import Sim3
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topomerge.registration.evidence.places import (
+from topomerge.registration.places import (
     LOOKED,
     MOST_ODDS,
     PARTS,

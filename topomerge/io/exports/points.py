@@ -1,4 +1,4 @@
-"""The occupied cells as LAS 1.4 or LAZ, with the number of their room and storey as extra dimensions."""
+"""The occupied cells as coloured points: PLY, and LAS 1.4 or LAZ with the number of their room and storey as extra dimensions."""
 
 from __future__ import annotations
 
@@ -8,14 +8,19 @@ from pathlib import Path
 import numpy as np
 
 from topomerge.archive import replace_on_success
-from topomerge.io.rooms_ply import NO_ROOM, assign_room_colours
+from topomerge.io.rooms_ply import NO_ROOM, assign_room_colours, save_rooms_ply
 from topomerge.types import TopometricMap
 
 SCALE = 0.001  # m
 NO_DATE = date(1970, 1, 1)  # of creation: the same map gives the same bytes
 
 
-def save(map: TopometricMap, path: Path) -> None:
+def save_ply(map: TopometricMap, path: Path) -> None:
+    """Write the PLY that `extract --ply` and `merge` write."""
+    save_rooms_ply(map, path)
+
+
+def save_las(map: TopometricMap, path: Path) -> None:
     """Write one point for each occupied cell, at its centre; compressed where the name ends in .laz.
 
     Extra dimensions `room` (-1: none) and `storey`, both int32; colours by room, in 16 bits.

@@ -1,4 +1,5 @@
-"""Where the maps of a merge or an atlas lie, for ROS 2: a launch file that publishes their frames by tf2's static transforms.
+"""Where the maps of a merge or an atlas lie: for ROS 2 a launch file that publishes their frames by tf2's static transforms, and
+a pose graph of g2o, to optimise it elsewhere, and to come back with `topomerge move`.
 
 ``ros2 launch merged.launch.xml``. The frame of a map is that of its file; the parent is the first map's. A bent merge has more to
 say than one transform: this one lays what both maps saw on each other. Source: the arguments of static_transform_publisher.
@@ -20,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from topomerge.archive import replace_on_success
 from topomerge.errors import InputError
+from topomerge.io.native.pose_graph import PoseGraph, format_pose_graph
 from topomerge.types import Array, Sim3, TopometricMap, is_level, read_levelling
 
 LISTINGS = ("merge.json", "atlas.json")
@@ -40,7 +42,7 @@ class FramePose:
     tilted: Array | None = None
 
 
-def save(map: TopometricMap, path: Path, transforms: Sequence[FramePose] = ()) -> None:
+def save_launch(map: TopometricMap, path: Path, transforms: Sequence[FramePose] = ()) -> None:
     """Write a launch file in XML.
 
     Raises:
@@ -51,6 +53,19 @@ def save(map: TopometricMap, path: Path, transforms: Sequence[FramePose] = ()) -
     nodes = [_format_node(k, transform) for k, transform in enumerate(transforms)]
     with replace_on_success(path) as temporary:
         temporary.write_text("\n".join(["<launch>", *nodes, "</launch>"]) + "\n", encoding="utf-8")
+
+
+def save_graph(map: TopometricMap, path: Path, graph: PoseGraph | None = None) -> None:
+    """Write the pose graph; a vertex is a map, by its number in merge.json or atlas.json.
+
+    Raises:
+        InputError: there is no graph, or the path can't be written.
+    """
+    del map
+    if graph is None:
+        raise InputError("g2o: needs to know where maps lie; give the folder of a merge or an atlas that brought some together")
+    with replace_on_success(path) as temporary:
+        temporary.write_text(format_pose_graph(graph), encoding="utf-8")
 
 
 def _format_node(number: int, transform: FramePose) -> str:
