@@ -37,7 +37,7 @@ class PageStream:
     Args:
         recipe: of the plans that are drawn; cache: folder of what is made of them.
         side: px.
-        jobs: processes that draw; 1: drawn here. They read the plans themselves: being sent them, one would start after the other.
+        jobs: processes that draw; 1: drawn here. They read the plans themselves; sent them, they would start in turn.
     """
 
     def __init__(

@@ -8,7 +8,7 @@ storey is warped. Random numbers are hashes of a pair's seed: they depend neithe
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -286,14 +286,14 @@ class DevicePairs:
         last = np.where(wrong, false[pair], 0)
         return np.asarray(powers[turns] @ flips[mirror[pair].astype(int)] @ powers[last], np.int64)
 
-    def send(self, *arrays: Array) -> list[Tensor]:
+    def send(self, arrays: Mapping[str, Array]) -> dict[str, Tensor]:
         """Send arrays of whole numbers to the device in one piece, int64, without waiting for it."""
-        sizes = [-(-array.size // ALIGNED) * ALIGNED for array in arrays]
+        sizes = [-(-array.size // ALIGNED) * ALIGNED for array in arrays.values()]
         flat = torch.empty(sum(sizes), dtype=torch.int64, pin_memory=self.device.type == "cuda")
-        for piece, array in zip(flat.split(sizes), arrays, strict=True):
+        for piece, array in zip(flat.split(sizes), arrays.values(), strict=True):
             piece[: array.size] = torch.from_numpy(np.ascontiguousarray(array).astype(np.int64)).flatten()
         pieces = flat.to(self.device, non_blocking=True).split(sizes)
-        return [piece[: array.size].view(array.shape) for piece, array in zip(pieces, arrays, strict=True)]
+        return {name: piece[: of.size].view(of.shape) for piece, (name, of) in zip(pieces, arrays.items(), strict=True)}
 
     def fill(self, structure: Structure, door: Array, doors: int | None = None) -> MapPair:
         """Return the batch of a structure, with values drawn on the device.
@@ -301,28 +301,28 @@ class DevicePairs:
         Args:
             door: (D,) which of the rooms' R * DOOR_CROPS doors there are; doors: so many of them, those after them fill it up.
         """
-        s = structure
-        pair = np.where(np.arange(len(s.room)) < s.real, s.pair[s.room_part], -1)
-        slot = np.full(len(s.room) * DOOR_CROPS, len(door))
-        slot[door[:doors]] = np.arange(len(door[:doors]))
-        room, room_part, edge, edge_part, true, clear, pair, side, map_of_room, ends, match, first, seed, rotation, size, \
-            pixel, door, slot = self.send(
-                s.room, s.room_part, s.edge, s.edge_part, s.true, s.clear, pair, s.side[s.room_part], s.part_map[s.room_part],
-                s.edge_index, s.match_index, self.first_room[s.part_map], s.seed, s.rotation,
-                self.sheet_size[s.part_map], self.sheet_first[s.part_map], door, slot,
-            )  # fmt: skip
-        views = self._draw_views(seed, rotation, size, pixel, self.sheet_size[s.part_map])
-        local = room - first[room_part]
-        tensors = self._draw_tables(room, room_part, local, edge, edge_part, seed, views)
-        tensors |= self._sample_crops(room, room_part, local, door, views)
+        s, names = structure, self.names
+        slots = np.full(len(s.room) * DOOR_CROPS, len(door))
+        slots[door[:doors]] = np.arange(len(door[:doors]))
+        arrays = {"room": s.room, "part": s.room_part, "edge": s.edge, "edge_part": s.edge_part, "door": door}
+        arrays |= {"pair": np.where(np.arange(len(s.room)) < s.real, s.pair[s.room_part], -1), "side": s.side[s.room_part]}
+        arrays |= {"true": s.true, "clear": s.clear, "ends": s.edge_index, "match": s.match_index, "slots": slots}
+        arrays |= {"map": s.part_map[s.room_part], "first": self.first_room[s.part_map], "seed": s.seed, "rotation": s.rotation}
+        arrays |= {"size": self.sheet_size[s.part_map], "pixel": self.sheet_first[s.part_map]}
+        sent = self.send(arrays)
+        room, part, seed = sent["room"], sent["part"], sent["seed"]
+        views = self._draw_views(seed, sent["rotation"], sent["size"], sent["pixel"], self.sheet_size[s.part_map])
+        local = room - sent["first"][part]
+        tensors = self._draw_tables(room, part, local, sent["edge"], sent["edge_part"], seed, views)
+        tensors |= self._sample_crops(room, part, local, sent["door"], views)
         batch = MapPair(
-            **{name: tensors[name] for name in self.names if name in tensors}, edge_index=ends, side=side, true=true,
-            map=room_part, clear=clear.bool(), building=self.building[map_of_room], match_index=match,
-            room_counts=torch.from_numpy(s.counts.ravel()), num_nodes=len(s.room),
+            **{name: tensors[name] for name in names if name in tensors}, edge_index=sent["ends"], side=sent["side"],
+            true=sent["true"], map=part, clear=sent["clear"].bool(), building=self.building[sent["map"]],
+            match_index=sent["match"], room_counts=torch.from_numpy(s.counts.ravel()), num_nodes=len(s.room),
         )  # fmt: skip
-        batch["batch"] = pair
-        if DOOR_PART in self.names:
-            batch["door_rows"], batch["door_slots"] = door, slot.view(-1, DOOR_CROPS)
+        batch["batch"] = sent["pair"]
+        if DOOR_PART in names:
+            batch["door_rows"], batch["door_slots"] = sent["door"], sent["slots"].view(-1, DOOR_CROPS)
         return batch
 
     def _draw_views(self, seed: Tensor, rotation: Tensor, size: Tensor, first: Tensor, sizes: Array) -> Views:
