@@ -24,6 +24,7 @@ from topomerge.embedding.network import (
 from topomerge.embedding.surroundings import CROP_SHAPES, DOOR_PART
 from topomerge.registry import POINTS
 
+DOOR_ROWS = ("door_rows", "door_slots")  # tensors of a batch: see `DoorsEncoder`
 QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # cosine and sine of 0 to 3 quarter turns
 
 
@@ -77,10 +78,15 @@ class GeometryEncoder(nn.Module):
         self.out = nn.Linear(joined, self.width) if joined else None
 
     def forward(self, tensors: Mapping[str, Tensor]) -> Tensor:
-        rooms = [module(tensors[find_tensor(part)]) for part, module in self.parts.items()]
+        rooms = [module(tensors[find_tensor(part)], *self._list_doors(part, tensors)) for part, module in self.parts.items()]
         terms = [self.out(self.join(torch.cat(rooms, dim=1)))] if self.join is not None and self.out is not None else []
         terms += [] if self.landmarks is None else [self.landmarks(tensors[LANDMARK_PART])]
         return terms[0] + terms[1] if len(terms) > 1 else terms[0]
+
+    @staticmethod
+    def _list_doors(part: str, tensors: Mapping[str, Tensor]) -> list[Tensor]:
+        """Return which crops of doors there are, where a batch tells."""
+        return [tensors[name] for name in DOOR_ROWS] if part == DOOR_PART and DOOR_ROWS[0] in tensors else []
 
 
 class Embedder(nn.Module):

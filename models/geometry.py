@@ -205,22 +205,30 @@ class SurroundingsEncoder(nn.Module):
 
 class DoorsEncoder(nn.Module):
     """Crops of doors (R, DOOR_CROPS, side, side, len(CROP_PLANES)) uint8 -> (R, width): mean and maximum over the doors that a
-    room has, of which those without a crop are none."""
+    room has, of which those without a crop are none.
+
+    Batches that are made on a device say which crops there are: `rows` (D,) of all R * DOOR_CROPS, and `slots` (R, DOOR_CROPS),
+    which of the D each is, or D. Nothing has to wait for the device then to count them.
+    """
 
     def __init__(self, width: int, dropout: float) -> None:
         super().__init__()
         self.each = SurroundingsEncoder(DOOR_PART, width, dropout)
         self.out = nn.Linear(2 * width, width)
 
-    def forward(self, crops: Tensor) -> Tensor:
+    def forward(self, crops: Tensor, rows: Tensor | None = None, slots: Tensor | None = None) -> Tensor:
         count, doors = crops.shape[:2]
         present = crops.flatten(2).amax(dim=2) > 0
-        if self.training:  # only those that are there: two of three are not
+        if rows is not None and slots is not None:
+            those = self.each(crops.flatten(0, 1).index_select(0, rows)).relu()
+            those = torch.cat([those, those.new_zeros((1, those.shape[1]))])
+            values = those.index_select(0, slots.flatten()) * present.flatten()[:, None]
+        elif self.training:  # only those that are there: two of three are not
             those = self.each(crops[present]).relu()
-            rows = those.new_zeros((count * doors, self.out.in_features // 2)).masked_scatter(present.flatten()[:, None], those)
+            values = those.new_zeros((count * doors, self.out.in_features // 2)).masked_scatter(present.flatten()[:, None], those)
         else:  # one shape for all maps, as other runtimes need it
-            rows = self.each(crops.flatten(0, 1)).relu() * present.flatten()[:, None]
-        rows = rows.unflatten(0, (count, doors))
-        mean = rows.sum(dim=1) / present.sum(dim=1, keepdim=True).clamp(min=1)
-        out: Tensor = self.out(torch.cat([mean, rows.amax(dim=1)], dim=1))
+            values = self.each(crops.flatten(0, 1)).relu() * present.flatten()[:, None]
+        values = values.unflatten(0, (count, doors))
+        mean = values.sum(dim=1) / present.sum(dim=1, keepdim=True).clamp(min=1)
+        out: Tensor = self.out(torch.cat([mean, values.amax(dim=1)], dim=1))
         return out

@@ -48,7 +48,7 @@ class Truth:
     """Rooms that belong together in a batch of N rooms.
 
     Args:
-        pair: (N,) which pair of maps a room is of.
+        pair: (N,) which pair of maps a room is of; -1: of none, but there to fill a batch up, without a say in any loss.
         side: (N,) 0 for a, 1 for b.
         same: (N, N) bool, the two are one true room, in the two maps of a pair.
         piece: (N, N) bool, the two are of one true room in one map.
@@ -157,7 +157,7 @@ def compute_matching_loss(
 
     main = RoomLosses(*LOSSES[settings.kind](settings, RoomBatch(embedding, temperature, truth, gather)))
     fixed = embedding if main.joint else embedding.detach()
-    weight = torch.where(truth.clear, 1.0, settings.faint)
+    weight = torch.where(truth.clear, 1.0, settings.faint) * (truth.pair >= 0)
     first = _compute_weighted_mean(main.values, weight * main.counts, processes)
     second = _compute_weighted_mean(compute_dustbin_loss(fixed, dustbin, temperature, truth), weight, processes)
     return {"loss": first + settings.dustbin * second, settings.kind: first.detach(), "dustbin": second.detach()}
@@ -193,7 +193,7 @@ def compute_info_nce(
     logits = embedding @ embedding.T / temperature
     same_pair = truth.pair[:, None] == truth.pair[None]
     weight = torch.where(same_pair, 1.0, easy * (truth.building[:, None] != truth.building[None]))
-    weight = weight * ~(truth.piece | torch.eye(len(logits), dtype=torch.bool, device=logits.device))
+    weight = weight * ~(truth.piece | torch.eye(len(logits), dtype=torch.bool, device=logits.device)) * (truth.pair >= 0)
     all_logits = logits
     if others is not None:
         all_logits = torch.cat([logits, embedding @ others.embedding.T / temperature], dim=1)

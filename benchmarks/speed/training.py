@@ -1,7 +1,7 @@
 """How fast the embedder trains: rooms a second, share of the time that goes into making batches, and how busy the card is.
 
 ``python -m benchmarks.speed.training MANIFEST --accelerator cuda --batches 32 128`` trains the network that ships for some steps
-on a set of pairs (`topomerge.datasets.pairs.build`), with batches made on the host and on the device.
+on a set of pairs (`topomerge.datasets.pairs.build`): with batches made on the host, on the device, and with steps as CUDA graphs.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,9 @@ from topomerge.models.embedder import Embedder
 
 from topomerge.config import compose
 from topomerge.embedding.network import Geometry, Network, Node
+from topomerge.training.batches import MapPair
+from topomerge.training.captured_step import CapturedStep
+from topomerge.training.descent import build_optimizer
 from topomerge.training.embedding import EmbeddingJob, start_fabric
 from topomerge.training.loop import State
 from topomerge.training.packed_pairs import GraphPair, load_pairs
@@ -32,7 +35,8 @@ SURROUNDINGS = Network(
     Geometry(["scalars", "surroundings", "wide_surroundings", "door_surroundings"], width=96),
     Node("gat", 2, around=10.0, ways=True),
 )
-WARM_UP = 5  # steps
+WARM_UP, GRAPHS_WARM_UP = 5, 80  # steps; the shapes that come are captured meanwhile
+WAYS = {"host": ("host", False), "device": ("device", False), "graphs": ("device", True)}  # `batches` and `graphs`
 SAMPLE_MS = 100  # between two looks at the card
 
 
@@ -63,27 +67,36 @@ def measure_training(pairs: Sequence[GraphPair], settings: Training, steps: int)
     torch.manual_seed(0)
     network = Embedder(settings.network)
     network.fit_scales([graph for pair in pairs[:200] for graph in (pair.a, pair.b)])
-    fused = fabric.device.type == "cuda"
-    optimizer = torch.optim.AdamW(network.parameters(), settings.rate, weight_decay=settings.decay, fused=fused)
+    on_cuda = fabric.device.type == "cuda"
+    optimizer = build_optimizer(settings, network, fused=on_cuda, capturable=on_cuda)
     job = EmbeddingJob(settings, fabric, network, optimizer, (pairs, []))
-    batches, state, rooms, waited, began = job.iter_batches(State()), State(), 0, 0.0, 0.0
+    batches, state = job.iter_batches(State()), State()
+    captures = isinstance(job.take_step, CapturedStep)
+    take_steps(job, batches, state, GRAPHS_WARM_UP if captures else WARM_UP)
+    synchronize(fabric.device)
     with CardMonitor() as card:
-        for k in range(WARM_UP + steps):
-            if k == WARM_UP:
-                synchronize(fabric.device)
-                rooms, waited, began = 0, 0.0, time.perf_counter()
-            before = time.perf_counter()
-            batch = next(batches)
-            waited += time.perf_counter() - before
-            rooms += job.count_items(batch)
-            job.train_step(batch, state)
-            state.step += 1
+        began = time.perf_counter()
+        rooms, waited = take_steps(job, batches, state, steps)
         synchronize(fabric.device)
         seconds = time.perf_counter() - began
     batches.close()
     busy = f"{statistics.mean(card.percent):.0f} % busy (most {max(card.percent):.0f} %)" if card.percent else "no card"
-    text = f"batch {settings.batch}, {settings.batches}: {rooms / seconds:.0f} rooms/s, {1000 * seconds / steps:.1f} ms a step"
+    way = "graphs" if captures else settings.batches
+    text = f"batch {settings.batch}, {way}: {rooms / seconds:.0f} rooms/s, {1000 * seconds / steps:.1f} ms a step"
     return f"{text}, {100 * waited / seconds:.0f} % of it for batches, {busy}"
+
+
+def take_steps(job: EmbeddingJob, batches: Iterator[MapPair], state: State, steps: int) -> tuple[int, float]:
+    """Take so many steps; return the rooms in them, and the seconds that the host was making batches."""
+    rooms, waited = 0, 0.0
+    for _ in range(steps):
+        before = time.perf_counter()
+        batch = next(batches)
+        waited += time.perf_counter() - before
+        rooms += job.count_items(batch)
+        job.train_step(batch, state)
+        state.step += 1
+    return rooms, waited
 
 
 def synchronize(device: torch.device) -> None:
@@ -93,23 +106,26 @@ def synchronize(device: torch.device) -> None:
 
 
 def main(
-    manifest: str = "", accelerator: str = "cpu", batches: Sequence[int] = (32, 128), steps: int = 20, threads: int = 1
-) -> None:
+    manifest: str = "", accelerator: str = "cpu", batches: Sequence[int] = (32, 128), steps: int = 20, threads: int = 1,
+    ways: Sequence[str] = tuple(WAYS),
+) -> None:  # fmt: skip
     """Measure.
 
     Args:
         manifest: of a set of pairs; empty: four small procedural ones are made.
         batches: pairs a step.
         threads: that make batches on the host.
+        ways: of `WAYS`; graphs need a card.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(manifest) if manifest else build_small_set(Path(folder))
         pairs = load_pairs(path, ["sheet"], around=SURROUNDINGS.node.around)
     print(f"{len(pairs)} pairs, {sum(len(t) for p in pairs for t in p.true) / len(pairs):.1f} rooms each")
-    for batch, where in itertools.product(batches, ("host", "device")):
+    for batch, way in itertools.product(batches, [way for way in ways if accelerator != "cpu" or not WAYS[way][1]]):
+        where, graphs = WAYS[way]
         common = {"accelerator": accelerator, "threads": threads, "network": SURROUNDINGS}
-        settings = Training(**common, batch=batch, batches=where, epochs=1)
-        repeated = list(pairs) * ((WARM_UP + steps) * batch // len(pairs) + 1)
+        settings = Training(**common, batch=batch, batches=where, graphs=graphs, epochs=1)
+        repeated = list(pairs) * ((GRAPHS_WARM_UP + steps) * batch // len(pairs) + 1)
         print(measure_training(repeated, settings, steps), flush=True)
 
 
@@ -128,6 +144,7 @@ def parse_words(words: Sequence[str]) -> dict[str, Any]:
     parser.add_argument("--batches", nargs="+", type=int, default=[32, 128], metavar="PAIRS")
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
     return vars(parser.parse_args(words))
 
 

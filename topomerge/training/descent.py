@@ -43,6 +43,15 @@ def build_optimizer(settings: Any, network: torch.nn.Module, **options: Any) -> 
     return optimizer
 
 
+def set_rate(optimizer: Any, rate: float) -> None:
+    """Set the learning rate of all groups, in place where it is a tensor that a graph reads."""
+    for group in optimizer.param_groups:
+        if isinstance(group["lr"], torch.Tensor):
+            group["lr"].fill_(rate)
+        else:
+            group["lr"] = rate
+
+
 def warmup_cosine(done: float, warmup: float) -> float:
     """Compute the factor of the learning rate after this share of all steps: a rise, then half a cosine down to 0."""
     if done < warmup:

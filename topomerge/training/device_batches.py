@@ -8,8 +8,8 @@ storey is warped. Random numbers are hashes of a pair's seed: they depend neithe
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -24,7 +24,6 @@ from topomerge.embedding.surroundings import (
     DOOR_CROPS,
     DOOR_PART,
     SHEET_PLANES,
-    TIE,
     WIDE_PART,
     WIDE_STEP,
 )
@@ -42,15 +41,15 @@ from topomerge.training.batches import (
     compute_quarter_turns,
     compute_relative_positions,
 )
+from topomerge.training.captured_step import BatchShape, BatchShapes
+from topomerge.training.crop_sampling import Storeys, Views, build_turns, sample_crops
 from topomerge.training.hashed_random import draw_normal, draw_uniform, draw_uniforms, hash_numbers
 from topomerge.training.packed_pairs import GraphPair
 from topomerge.training.settings import Augment
 from topomerge.types import Array
 
 SUPPORTED = {"x", "edge_index", "edge_attr", "edge_way", *CROP_SHAPES}  # tensors that are made on the device
-PIXELS_AT_ONCE = 1 << 26  # of crops: bounds the memory of coordinates
-EVEN_BYTES = 0x00FF00FF00FF00FF
-ROOM_BYTE = -(1 << 56)  # 255 in the highest of eight bytes
+ALIGNED = 64  # numbers of 8 bytes: kernels are compiled anew for tensors that start elsewhere
 # Streams of random numbers of a map: one of each kind of change.
 ROOM_LOSS, EDGE_LOSS, RATES, SIZES, LENGTHS, MIDDLES, DOORS, KNOTS, SHAPE, TURNS, GAPS = range(1, 12)
 
@@ -59,6 +58,22 @@ def supports_device_batches(network: Network, names: Sequence[str], augment: Aug
     """Tell whether batches of these tensors, changed in this way, can be made on a device."""
     changes = () if augment is None else (augment.walks, augment.slices, augment.rough)
     return network.turns > 1 and set(names) <= SUPPORTED and not any(changes)
+
+
+def pad_structure(s: Structure, shape: BatchShape) -> Structure:
+    """Fill a batch up: rooms come again, which are of no pair, and edges lead from the last of these to itself.
+
+    Rooms that come again leave the statistics of a batch much as they were; zeros would not.
+    """
+    rooms, edges = shape.rooms - len(s.room), shape.edges - len(s.edge)
+    again, first = np.arange(rooms) % len(s.room), np.zeros(edges, np.int64)
+    edge_index = np.concatenate([s.edge_index, np.full((2, edges), shape.rooms - 1)], axis=1)
+    edge_part = np.full(edges, s.room_part[again[-1]])
+    return replace(
+        s, room=np.concatenate([s.room, s.room[again]]), room_part=np.concatenate([s.room_part, s.room_part[again]]),
+        true=np.concatenate([s.true, np.full(rooms, -1)]), clear=np.concatenate([s.clear, np.zeros(rooms, bool)]),
+        edge=np.concatenate([s.edge, first]), edge_part=np.concatenate([s.edge_part, edge_part]), edge_index=edge_index,
+    )  # fmt: skip
 
 
 def concatenate_ranges(first: Array, count: Array) -> Array:
@@ -80,6 +95,7 @@ class Structure:
         seed: (P,) of the map's changes.
         edge_index: (2, E); match_index: (2, M) rooms of the batch.
         true: (R,); clear: (R,) bool; counts: (pairs, 2) rooms of a and b.
+        real: so many rooms are of the batch; those after them fill it up.
     """
 
     room: Array
@@ -96,6 +112,7 @@ class Structure:
     true: Array
     clear: Array
     counts: Array
+    real: int
 
 
 class DevicePairs:
@@ -106,6 +123,8 @@ class DevicePairs:
         names: tensors that the network reads, of `SUPPORTED`.
         augment: how maps are changed; None: not at all.
         device: that the network is on.
+
+    `shapes` are set where batches are filled up to a few shapes.
     """
 
     def __init__(self, pairs: Sequence[GraphPair], names: Sequence[str], augment: Augment | None, device: torch.device) -> None:
@@ -136,6 +155,10 @@ class DevicePairs:
         self.lengths = _mark_columns(edge_columns, {1: find_columns_of_power("edge_attr", 1)}).to(device)
         mirrored = [find_column("edge_attr", MIRRORED_COLUMNS["edge_attr"])]
         self.sign = (1 - _mark_columns(edge_columns, {2: mirrored})).to(device)
+        bytes_of = [~sum(255 << (8 * SHEET_PLANES.index(name)) for name in names) for names, _ in SEEN_AS]
+        self.gap_masks = torch.tensor(bytes_of, device=device)
+        self.gap_shares = torch.tensor(np.cumsum([share for _, share in SEEN_AS])[:-1], device=device, dtype=torch.float32)
+        self.shapes: BatchShapes | None = None
         self._load_sheets([(graph["sheet"], graph["sheet_room"]) for graph in graphs])
 
     def _load_sheets(self, sheets: Sequence[tuple[Tensor, Tensor]]) -> None:
@@ -154,14 +177,26 @@ class DevicePairs:
         for (planes, room), start in zip(once, first[:-1].tolist(), strict=True):
             pixels[start : start + room.numel(), : len(SHEET_PLANES)] = planes.reshape(-1, len(SHEET_PLANES))
             rooms[start : start + room.numel()] = room.reshape(-1)
-        self.pixels, self.pixel_rooms = pixels.view(torch.int64)[:, 0].to(self.device), rooms.to(self.device)
+        self.storeys = Storeys(pixels.view(torch.int64)[:, 0].to(self.device), rooms.to(self.device))
         of_map = np.array([number[key] for key in keys], np.int64)
         self.sheet_size, self.sheet_first = sizes[of_map], first[:-1][of_map]
 
     def make_batch(self, numbers: Sequence[int], seed_of: Callable[[int], int]) -> MapPair:
         """Return pairs of these numbers as a batch on the device, changed by the seeds of their numbers."""
         structure = self.decide(np.asarray(numbers, np.int64), np.array([seed_of(number) for number in numbers], np.uint64))
-        return self.fill(structure)
+        door = np.flatnonzero(self.has_door[structure.room])
+        if self.shapes is None:
+            return self.fill(structure, door)
+        shape = self.shapes.choose(len(structure.room), len(structure.edge), len(door))
+        return self.fill(pad_structure(structure, shape), np.resize(door, shape.doors), len(door))
+
+    def measure_mean(self, batch: int) -> BatchShape:
+        """Return what a batch of so many pairs holds on average if nothing is lost."""
+        doors = np.diff(np.concatenate([[0], np.cumsum(self.has_door.sum(axis=1))])[self.first_room])
+        share = batch / (len(self.rooms) // 2)
+        copies = [1, 1 if self.augment is None else 2]  # of a and of b
+        totals = [float(of.reshape(-1, 2).sum(axis=0) @ copies) for of in (self.rooms, self.edges, doors)]
+        return BatchShape(*(round(share * total) for total in totals))
 
     def decide(self, numbers: Array, seeds: Array) -> Structure:
         """Return what a batch holds: the rooms and edges that are left, and how each part is turned."""
@@ -203,7 +238,7 @@ class DevicePairs:
         rotation = self._draw_rotations(numbers, seeds, side, wrong)
         return Structure(
             room, edge, room_part, edge_part, maps[part], side, pair, rotation, map_seed[part], edge_index, match_index, true,
-            clear, kept.reshape(-1, 2),
+            clear, kept.reshape(-1, 2), len(room),
         )  # fmt: skip
 
     def _drop_rooms(self, maps: Array, seed: Array) -> tuple[Array, Array, Array, Array]:
@@ -251,51 +286,64 @@ class DevicePairs:
         last = np.where(wrong, false[pair], 0)
         return np.asarray(powers[turns] @ flips[mirror[pair].astype(int)] @ powers[last], np.int64)
 
-    def fill(self, structure: Structure) -> MapPair:
-        """Return the batch of a structure, with values drawn on the device."""
-        s, device = structure, self.device
-        rows = [s.room, s.room_part, s.edge, s.edge_part, s.true, s.clear, s.pair[s.room_part], s.side[s.room_part]]
-        rows.append(s.part_map[s.room_part])
-        sent = torch.from_numpy(np.concatenate(rows).astype(np.int64)).to(device, non_blocking=True)
-        room, room_part, edge, edge_part, true, clear, pair, side, map_of_room = sent.split([len(row) for row in rows])
-        ends, match = (torch.from_numpy(index).to(device, non_blocking=True) for index in (s.edge_index, s.match_index))
-        seed = torch.from_numpy(s.seed.astype(np.int64)).to(device)
-        rotation = torch.from_numpy(s.rotation).to(device)
-        views = self._draw_views(s, seed, rotation)
-        local = room - torch.from_numpy(self.first_room[s.part_map]).to(device)[room_part]
-        tensors = self._draw_tables(room, room_part, local, edge, edge_part, seed, views)
-        door = torch.from_numpy(np.flatnonzero(self.has_door[s.room])).to(device, non_blocking=True)
-        tensors |= self._sample_crops(room, room_part, local, door, views)
+    def send(self, arrays: Mapping[str, Array]) -> dict[str, Tensor]:
+        """Send arrays of whole numbers to the device in one piece, int64, without waiting for it."""
+        sizes = [-(-array.size // ALIGNED) * ALIGNED for array in arrays.values()]
+        flat = torch.empty(sum(sizes), dtype=torch.int64, pin_memory=self.device.type == "cuda")
+        for piece, array in zip(flat.split(sizes), arrays.values(), strict=True):
+            piece[: array.size] = torch.from_numpy(np.ascontiguousarray(array).astype(np.int64)).flatten()
+        pieces = flat.to(self.device, non_blocking=True).split(sizes)
+        return {name: piece[: of.size].view(of.shape) for piece, (name, of) in zip(pieces, arrays.items(), strict=True)}
+
+    def fill(self, structure: Structure, door: Array, doors: int | None = None) -> MapPair:
+        """Return the batch of a structure, with values drawn on the device.
+
+        Args:
+            door: (D,) which of the rooms' R * DOOR_CROPS doors there are; doors: so many of them, those after them fill it up.
+        """
+        s, names = structure, self.names
+        slots = np.full(len(s.room) * DOOR_CROPS, len(door))
+        slots[door[:doors]] = np.arange(len(door[:doors]))
+        arrays = {"room": s.room, "part": s.room_part, "edge": s.edge, "edge_part": s.edge_part, "door": door}
+        arrays |= {"pair": np.where(np.arange(len(s.room)) < s.real, s.pair[s.room_part], -1), "side": s.side[s.room_part]}
+        arrays |= {"true": s.true, "clear": s.clear, "ends": s.edge_index, "match": s.match_index, "slots": slots}
+        arrays |= {"map": s.part_map[s.room_part], "first": self.first_room[s.part_map], "seed": s.seed, "rotation": s.rotation}
+        arrays |= {"size": self.sheet_size[s.part_map], "pixel": self.sheet_first[s.part_map]}
+        sent = self.send(arrays)
+        room, part, seed = sent["room"], sent["part"], sent["seed"]
+        views = self._draw_views(seed, sent["rotation"], sent["size"], sent["pixel"], self.sheet_size[s.part_map])
+        local = room - sent["first"][part]
+        tensors = self._draw_tables(room, part, local, sent["edge"], sent["edge_part"], seed, views)
+        tensors |= self._sample_crops(room, part, local, sent["door"], views)
         batch = MapPair(
-            **{name: tensors[name] for name in self.names if name in tensors}, edge_index=ends, side=side, true=true,
-            map=room_part, clear=clear.bool(), building=self.building[map_of_room], match_index=match,
-            room_counts=torch.from_numpy(s.counts.ravel()), num_nodes=len(s.room),
+            **{name: tensors[name] for name in names if name in tensors}, edge_index=sent["ends"], side=sent["side"],
+            true=sent["true"], map=part, clear=sent["clear"].bool(), building=self.building[sent["map"]],
+            match_index=sent["match"], room_counts=torch.from_numpy(s.counts.ravel()), num_nodes=len(s.room),
         )  # fmt: skip
-        batch["batch"] = pair
+        batch["batch"] = sent["pair"]
+        if DOOR_PART in names:
+            batch["door_rows"], batch["door_slots"] = sent["door"], sent["slots"].view(-1, DOOR_CROPS)
         return batch
 
-    def _draw_views(self, s: Structure, seed: Tensor, rotation: Tensor) -> _Views:
-        """Draw how the storey of each part is turned, stretched, bent, and what of it is missing."""
+    def _draw_views(self, seed: Tensor, rotation: Tensor, size: Tensor, first: Tensor, sizes: Array) -> Views:
+        """Draw how the storey of each part is turned, stretched, bent, and what of it is missing; `sizes` as on the host."""
         augment, device = self.augment, self.device
-        size, first = (torch.from_numpy(of[s.part_map]).to(device) for of in (self.sheet_size, self.sheet_first))
         if augment is None:
             shape = torch.tensor([[0.0, 1.0, 1.0]], device=device).expand(len(seed), 3)
-            return _Views(seed, size, first, rotation.float(), shape, None, None, None)
+            return Views(seed, size, first, rotation.float(), shape, None, None, None)
         draws = draw_uniforms(seed[:, None], GAPS, torch.arange(3 + 4 * PATCHES, device=device))
         normal = draw_normal(seed[:, None], SHAPE, torch.arange(3, device=device))
         wild = torch.where(draws[:, 0] < WILD_SHARE, WILD, 1.0)
         angle, zoom = wild * math.radians(augment.tilt) * normal[:, 0], (wild * augment.zoom * normal[:, 1]).exp()
         shape = torch.stack([angle, zoom, (augment.scale * normal[:, 2]).exp()], dim=1)
-        rows, columns = ((self.sheet_size[s.part_map] // BEND_STEP).max(axis=0) + 2).tolist()
+        rows, columns = ((sizes // BEND_STEP).max(axis=0) + 2).tolist()
         index = torch.arange(2 * rows * columns, device=device)
         knots = augment.bend * draw_normal(seed[:, None], KNOTS, index).reshape(len(seed), rows, columns, 2)
-        return _Views(seed, size, first, rotation.float(), shape, knots, *self._draw_gaps(draws[:, 1:], size))
+        return Views(seed, size, first, rotation.float(), shape, knots, *self._draw_gaps(draws[:, 1:], size))
 
     def _draw_gaps(self, draws: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
         """Draw which planes a map lacks, as a mask of bytes, and patches that it did not see (P, 4, n): low and high x, y."""
-        edges = torch.tensor(np.cumsum([share for _, share in SEEN_AS])[:-1], device=self.device, dtype=torch.float32)
-        bytes_of = [~sum(255 << (8 * SHEET_PLANES.index(name)) for name in names) for names, _ in SEEN_AS]
-        mask = torch.tensor(bytes_of, device=self.device)[torch.bucketize(draws[:, 0].contiguous(), edges, right=True)]
+        mask = self.gap_masks[torch.bucketize(draws[:, 0].contiguous(), self.gap_shares, right=True)]
         count = (draws[:, 1] * (PATCHES + 1)).floor()
         starts, sides = draws[:, 2:].reshape(len(draws), 2, 2, PATCHES).unbind(dim=1)
         low = (starts * size[..., None]).floor()
@@ -304,7 +352,7 @@ class DevicePairs:
         return mask, torch.cat([low, high], dim=1)
 
     def _draw_tables(
-        self, room: Tensor, part: Tensor, local: Tensor, edge: Tensor, edge_part: Tensor, seed: Tensor, views: _Views
+        self, room: Tensor, part: Tensor, local: Tensor, edge: Tensor, edge_part: Tensor, seed: Tensor, views: Views
     ) -> dict[str, Tensor]:
         """Return features of rooms and edges, of other sizes, turned as their part is."""
         augment, out = self.augment, {"x": self.tables["x"][room], "edge_attr": self.tables["edge_attr"][edge]}
@@ -329,7 +377,7 @@ class DevicePairs:
             out["edge_way"] = (out["edge_way"].reshape(-1, 2, 2) @ turn.mT[edge_part]).flatten(1)
         return out
 
-    def _sample_crops(self, room: Tensor, part: Tensor, local: Tensor, door: Tensor, views: _Views) -> dict[str, Tensor]:
+    def _sample_crops(self, room: Tensor, part: Tensor, local: Tensor, door: Tensor, views: Views) -> dict[str, Tensor]:
         """Return the crops that the network reads, about middles and doors (D,) that lie elsewhere."""
         out = {}
         anchor, doors, augment = self.tables["anchor"][room].double(), self.tables["doors"][room].double(), self.augment
@@ -342,107 +390,13 @@ class DevicePairs:
             doors = doors + DOOR_SHIFT * draw_normal(seed, DOORS, index).reshape(-1, 2)
         for name, step in ((CROP_PART, 1), (WIDE_PART, WIDE_STEP)):
             if name in self.names:
-                out[name] = self._sample(anchor, part, local, CROP_SHAPES[name][0], step, views)
+                out[name] = sample_crops(self.storeys, views, anchor, part, local, CROP_SHAPES[name][0], step)
         if DOOR_PART in self.names:
             of = door // DOOR_CROPS
             crops = torch.zeros((len(doors), *CROP_SHAPES[DOOR_PART][1:]), dtype=torch.uint8, device=self.device)
-            crops[door] = self._sample(doors[door], part[of], local[of], DOOR_CROP, 1, views)
+            crops[door] = sample_crops(self.storeys, views, doors[door], part[of], local[of], DOOR_CROP, 1)
             out[DOOR_PART] = crops.unflatten(0, (len(room), DOOR_CROPS))
         return out
-
-    def _sample(self, middle: Tensor, part: Tensor, number: Tensor, side: int, step: int, views: _Views) -> Tensor:
-        """Return (n, side, side, 8) uint8 crops about places (n, 2) of the changed storeys of parts (n,), showing rooms (n,)."""
-        at_once = max(PIXELS_AT_ONCE // (side * side * step * step), 1)
-        chunks = [
-            self._sample_pixels(middle[k : k + at_once], part[k : k + at_once], number[k : k + at_once], side, step, views)
-            for k in range(0, len(middle), at_once)
-        ]
-        pixels = torch.cat(chunks) if chunks else torch.zeros((0, side * side), dtype=torch.int64, device=self.device)
-        return pixels[..., None].view(torch.uint8).unflatten(1, (side, side))
-
-    def _sample_pixels(self, middle: Tensor, part: Tensor, number: Tensor, side: int, step: int, views: _Views) -> Tensor:
-        """Return (n, side * side) int64, eight bytes a pixel; the arguments as of `_sample`."""
-        middle = (middle + (0.5 + TIE)).floor()
-        back = views.build_back()[part]
-        offset = (torch.arange(side, device=self.device) + 0.5 - side / 2) * step  # of blocks
-        grid = torch.cartesian_prod(offset, offset)
-        turned = back @ views.rotation[part]  # of a place about the middle -> of the map
-        centre = (back.double() @ middle[..., None])[..., 0].float()[:, None] + grid @ turned.mT
-        place = centre - views.measure_drift(centre, part)
-        if step == 1:
-            return self._read_pixels(place, part, number, views)
-        fine = torch.arange(step, device=self.device) + 0.5 - step / 2
-        within = torch.cartesian_prod(fine, fine) @ turned.mT
-        every = self._read_pixels((place[:, :, None] + within[:, None]).flatten(1, 2), part, number, views)
-        every = every.unflatten(1, (side * side, step * step))
-        bits = (step * step).bit_length() - 1  # sums of eight bytes, in four wider ones each
-        low, high = (((every >> k) & EVEN_BYTES).sum(dim=2) >> bits & EVEN_BYTES for k in (0, 8))
-        return low | (high << 8)
-
-    def _read_pixels(self, place: Tensor, part: Tensor, number: Tensor, views: _Views) -> Tensor:
-        """Return (n, m) int64, eight bytes a pixel, at places (n, m, 2) of the storeys as they were."""
-        x, y = place.floor().unbind(dim=-1)
-        size = views.size[part].float()
-        present = (x >= 0) & (y >= 0) & (x < size[:, :1]) & (y < size[:, 1:])
-        if views.patches is not None:
-            low_x, low_y, high_x, high_y = views.patches[part][:, None].unbind(dim=2)
-            at_x, at_y = x[..., None], y[..., None]
-            present &= ~((at_x >= low_x) & (at_y >= low_y) & (at_x < high_x) & (at_y < high_y)).any(dim=-1)
-        at = torch.where(present, views.first[part][:, None] + x.long() * views.size[part][:, 1:] + y.long(), 0)
-        pixels = self.pixels[at] if views.mask is None else self.pixels[at] & views.mask[part][:, None]
-        pixels = pixels | torch.where(self.pixel_rooms[at] == number[:, None], ROOM_BYTE, 0)
-        return torch.where(present, pixels, 0)
-
-
-@dataclass(frozen=True)
-class _Views:
-    """How the storey of each part of a batch is seen.
-
-    Args:
-        seed: (P,); size: (P, 2) pixels; first: (P,) pixel of it on the device.
-        rotation: (P, 2, 2) a place of a crop about its middle -> that of the storey.
-        shape: (P, 3) angle in rad, zoom, and scale of lengths.
-        knots: (P, m, n, 2) pixels by which places `BEND_STEP` apart moved; None: not at all.
-        mask: (P,) int64 of the bytes that are seen; patches: (P, 4, n) that are not; None: all is.
-    """
-
-    seed: Tensor
-    size: Tensor
-    first: Tensor
-    rotation: Tensor
-    shape: Tensor
-    knots: Tensor | None
-    mask: Tensor | None
-    patches: Tensor | None
-
-    def build_back(self) -> Tensor:
-        """Return (P, 2, 2): what takes back the turn and the zoom of a storey."""
-        return build_turns(-self.shape[:, 0], 1 / self.shape[:, 1])
-
-    def measure_drift(self, place: Tensor, part: Tensor) -> Tensor:
-        """Return (n, m, 2) pixels by which places (n, m, 2) of storeys moved, between the four knots about each."""
-        if self.knots is None:
-            return torch.zeros_like(place)
-        last = (self.size[part] // BEND_STEP + 1)[:, None]
-        at = torch.minimum((place / BEND_STEP).clamp(min=0), (last - 1e-3).to(place.dtype))
-        low = at.floor()
-        (u, v), (i, j) = (at - low)[..., None].unbind(dim=-2), low.long().unbind(dim=-1)
-        _, rows, columns, _ = self.knots.shape
-        flat, start = self.knots.reshape(-1, 2), part[:, None] * (rows * columns) + i * columns + j
-        a, b, c, d = (flat[start + k] for k in (0, columns, 1, columns + 1))
-        return torch.lerp(torch.lerp(a, b, u), torch.lerp(c, d, u), v)
-
-    def move(self, place: Tensor, part: Tensor) -> Tensor:
-        """Return (n, 2) float64 where places of storeys lie after turn, zoom and drift."""
-        moved = place + self.measure_drift(place.nan_to_num().float()[:, None], part)[:, 0]
-        out: Tensor = (build_turns(self.shape[:, 0], self.shape[:, 1])[part].double() @ moved[..., None])[..., 0]
-        return out
-
-
-def build_turns(angle: Tensor, zoom: Tensor) -> Tensor:
-    """Return (P, 2, 2) float32 matrices that turn by angles (P,), rad, and stretch by factors (P,)."""
-    c, s = zoom * angle.cos(), zoom * angle.sin()
-    return torch.stack([c, -s, s, c], dim=1).reshape(-1, 2, 2)
 
 
 def _mark_columns(count: int, marks: dict[int, Sequence[int]]) -> Tensor:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import multiprocessing
-from collections import deque
 from collections.abc import Generator, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +10,8 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from topomerge.datasets.drawings.pages import sample_drawing
-from topomerge.datasets.drawings.shapes import DrawingShapes, build_drawing_shapes
+from topomerge.datasets.drawings.page_stream import Page, PageStream
+from topomerge.datasets.drawings.shapes import DrawingRecipe
 from topomerge.errors import InputError
 from topomerge.models.convolutional import DrawingProbabilities, DrawingUNet
 from topomerge.networks.drawing import DRAWING_CLASSES, DRAWING_FILE, DRAWING_SIGNATURE
@@ -28,52 +25,6 @@ from topomerge.types import Array, LogFn
 
 TRAINED, WATCHED, JUDGED = 1, 2, 3  # streams of random numbers: no page is in two
 DARKER = 0.3  # by how much pages differ in brightness beyond what they are drawn with
-Page = tuple[Array, Array]  # (h, w, 3) picture and (h, w) classes, uint8
-_shapes: list[DrawingShapes] = []  # of a process that draws
-
-
-def _keep_shapes(shapes: list[DrawingShapes]) -> None:
-    _shapes[:] = shapes
-
-
-def _draw_page(seed: tuple[int, int, int], side: int) -> Page:
-    drawing = sample_drawing(_shapes, np.random.default_rng(seed), side)
-    return drawing.picture, drawing.classes
-
-
-class PageStream:
-    """Pages drawn one after the other, each from a seed of its own: by processes beside this one, or here.
-
-    Args:
-        seed, stream: of the random numbers; the n-th page follows from them and n alone.
-        jobs: processes; 1: drawn here.
-    """
-
-    def __init__(self, shapes: Sequence[DrawingShapes], seed: int, stream: int, side: int, jobs: int) -> None:
-        self.shapes, self.seed, self.side, self.jobs = list(shapes), (seed, stream), side, jobs
-        spawn = multiprocessing.get_context("spawn")
-        self.pool = ProcessPoolExecutor(jobs, spawn, _keep_shapes, (self.shapes,)) if jobs > 1 else None
-
-    def iter_pages(self, start: int, stop: int | None = None) -> Iterator[Page]:
-        """Yield the pages from number `start` on."""
-        if self.pool is None:
-            _keep_shapes(self.shapes)
-        coming: deque[Future[Page]] = deque()
-        number = start
-        while stop is None or number < stop or coming:
-            while self.pool is not None and len(coming) < 4 * self.jobs and (stop is None or number < stop):
-                coming.append(self.pool.submit(_draw_page, (*self.seed, number), self.side))
-                number += 1
-            if coming:
-                yield coming.popleft().result()
-            else:
-                yield _draw_page((*self.seed, number), self.side)
-                number += 1
-
-    def close(self) -> None:
-        """Stop the processes."""
-        if self.pool is not None:
-            self.pool.shutdown(cancel_futures=True)
 
 
 def fit(settings: DrawingSegmentation, log_line: LogFn) -> dict[str, float]:
@@ -83,25 +34,21 @@ def fit(settings: DrawingSegmentation, log_line: LogFn) -> dict[str, float]:
         InputError: no plan to draw.
     """
     with let_chief_first(settings):
-        shapes = build_drawing_shapes(settings.data, settings.cache, log_line)
-    watched = draw_pages(build_drawing_shapes(settings.watched, settings.cache, log_line), settings, WATCHED)
-    torch.manual_seed(derive_seed(settings.seed))
-    stream = PageStream(shapes, settings.seed, TRAINED, settings.crop, settings.jobs)
+        stream = PageStream(settings.data, settings.cache, (settings.seed, TRAINED), settings.crop, settings.jobs, log_line)
     try:
+        watched = draw_pages(settings.watched, settings, WATCHED, log_line)
+        torch.manual_seed(derive_seed(settings.seed))
         job = DrawingJob(settings, stream, watched)
-        log_line(f"{len(shapes)} plans, {sum(p.numel() for p in job.network.parameters())} weights")
+        log_line(f"{len(stream.shapes)} plans, {sum(p.numel() for p in job.network.parameters())} weights")
         return run_network(job, settings, settings.steps, log_line)
     finally:
         stream.close()
 
 
-def draw_pages(shapes: Sequence[DrawingShapes], settings: DrawingSegmentation, stream: int) -> list[Page]:
-    """Draw the pages that are watched, or judged."""
-    pages = PageStream(shapes, settings.seed, stream, settings.crop, settings.jobs)
-    try:
-        return list(pages.iter_pages(0, settings.watched_pages))
-    finally:
-        pages.close()
+def draw_pages(recipe: DrawingRecipe, settings: DrawingSegmentation, number: int, log_line: LogFn) -> list[Page]:
+    """Draw the pages that are watched, or judged, here: other processes would not have started by then."""
+    stream = PageStream(recipe, settings.cache, (settings.seed, number), settings.crop, 1, log_line)
+    return list(stream.iter_pages(0, settings.watched_pages))
 
 
 class DrawingJob(ExportedJob):
@@ -220,7 +167,7 @@ def score_pages(pages: Sequence[Page], network: Run) -> dict[str, float]:
 
 def judge(settings: DrawingSegmentation, file: Path, log_line: LogFn) -> dict[str, Any]:
     """Return scores of weights on pages of plans that trained nothing."""
-    pages = draw_pages(build_drawing_shapes(settings.heldout, settings.cache, log_line), settings, JUDGED)
+    pages = draw_pages(settings.heldout, settings, JUDGED, log_line)
     if not pages:
         raise InputError("heldout: no page to judge")
     return {**score_pages(pages, load_network(file, DRAWING_SIGNATURE)), "pages": len(pages)}

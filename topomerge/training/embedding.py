@@ -18,14 +18,15 @@ from topomerge.embedding.learned import STATE_FILE, STATE_SETTINGS
 from topomerge.embedding.network import LANDMARK_PART, Network, build_network
 from topomerge.errors import InputError
 from topomerge.matching.assignment import assign_certain, compute_certainty
-from topomerge.models.embedder import Embedder, match_scores
+from topomerge.models.embedder import DOOR_ROWS, Embedder, match_scores
 from topomerge.models.export import check_exporter, export_embedder
-from topomerge.models.losses import Objective
+from topomerge.models.losses import Objective, Truth
 from topomerge.models.weights import read_embedder, read_state, save_state
 from topomerge.networks.network import WEIGHTS_PACKAGE
 from topomerge.registry import SCHEDULES
 from topomerge.training.batches import AugmentedPairs, MapPair, add_invented_signs
-from topomerge.training.descent import build_optimizer
+from topomerge.training.captured_step import BatchShapes, CapturedStep, Step, can_capture
+from topomerge.training.descent import build_optimizer, set_rate
 from topomerge.training.device_batches import DevicePairs, supports_device_batches
 from topomerge.training.loop import (
     Loop,
@@ -121,12 +122,12 @@ def fit(settings: Training, log_line: LogFn = lambda text: print(text, file=sys.
     settings = with_own_pairs(settings, log_line, fabric)
     train, watched, replayed = _load_data(settings, log_line, fabric)
     network = _build_network(settings, train)
-    optimizer = build_optimizer(settings, network, fused=fabric.device.type == "cuda")  # one launch for all weights
+    on_cuda = fabric.device.type == "cuda"
+    optimizer = build_optimizer(settings, network, fused=on_cuda, capturable=on_cuda)  # one launch for all weights
     state = State()
     if settings.resume:
         state = State(**load_state(settings.folder / "last", network, optimizer))
     if is_main_process:
-        on_cuda = fabric.device.type == "cuda"
         name = torch.cuda.get_device_name() if on_cuda else "cpu"
         begin_run(settings, f"{fabric.world_size} x {name}, {find_precision(settings)}", torch.get_num_threads())
     fabric.barrier()
@@ -161,6 +162,13 @@ class EmbeddingJob:
         self.steps = max((self.own + self.drawn) // (settings.batch * fabric.world_size), 1)
         self.augment: Augment | None = None if settings.overfit else settings.augment
         self.pairs = self._load_pairs()
+        self.take_step: Step = self._descend
+        self.state = State()  # that the step under way is of
+        if isinstance(self.pairs, DevicePairs) and can_capture(settings, fabric, self.get_optimizer()):
+            self.pairs.shapes = BatchShapes(self.pairs.measure_mean(settings.batch))
+            for group in self.get_optimizer().param_groups:  # that graphs read it where it is
+                group["lr"] = torch.tensor(settings.rate, device=fabric.device)
+            self.take_step = CapturedStep(self._descend)
 
     def _load_pairs(self) -> AugmentedPairs | DevicePairs:
         """Return the pairs that batches are made of, on the device or on the host, as `batches` says.
@@ -215,15 +223,21 @@ class EmbeddingJob:
             InputError: the training diverged.
         """
         settings, done = self.settings, state.epoch * self.steps + state.step
-        for group in self.optimizer.param_groups:
-            factor = SCHEDULES[settings.schedule](done / (settings.epochs * self.steps), settings.warmup)
-            group["lr"] = settings.rate * factor
+        factor = SCHEDULES[settings.schedule](done / (settings.epochs * self.steps), settings.warmup)
+        self.state, state.rate = state, settings.rate * factor
+        set_rate(self.optimizer, state.rate)
         torch.manual_seed(derive_seed(settings.seed, state.epoch, state.step, self.fabric.global_rank, 1))  # of the dropout
         batch = batch.to(self.fabric.device)
-        losses = self.objective(batch.tensors, batch.truth)
+        read = (*self.network.tensors, *DOOR_ROWS, "map")
+        return self.take_step({name: batch[name] for name in read if name in batch}, batch.truth)
+
+    def _descend(self, tensors: Mapping[str, torch.Tensor], truth: Truth) -> dict[str, torch.Tensor]:
+        """Take a step of the optimizer down the gradient of a batch's loss."""
+        losses = self.objective(tensors, truth)
         self.optimizer.zero_grad()
         self.fabric.backward(losses["loss"])
-        norm = self.fabric.clip_gradients(self.objective, self.optimizer, max_norm=settings.clip, error_if_nonfinite=False)
+        limits = {"max_norm": self.settings.clip, "error_if_nonfinite": False}
+        norm = self.fabric.clip_gradients(self.objective, self.optimizer, **limits)
         lost = ~norm.isfinite()
         out = {name: value.detach() for name, value in losses.items()}
         if self.get_scaler() is not None:
@@ -231,7 +245,7 @@ class EmbeddingJob:
         elif self.get_optimizer().defaults.get("fused"):
             self.get_optimizer().found_inf, out["norm"] = lost.float(), norm  # type: ignore[attr-defined]
         elif lost:
-            raise build_diverged(state)
+            raise build_diverged(self.state)
         else:
             out["norm"] = norm
         self.optimizer.step()

@@ -262,7 +262,9 @@ class Loop:
             state.sums[name] = state.sums.get(name, 0.0) + value
         if self.average is not None:
             self.average.update(state.epoch * self.schedule.steps + state.step)
-        state.step, state.rate = state.step + 1, float(self.job.get_optimizer().param_groups[0]["lr"])
+        state.step, rate = state.step + 1, self.job.get_optimizer().param_groups[0]["lr"]
+        if not isinstance(rate, torch.Tensor):  # else on the device, and the job sets the state's
+            state.rate = float(rate)
         if state.step % STEPS_BETWEEN_CHECKS == 0 or self.stop:
             self._read_losses()
 

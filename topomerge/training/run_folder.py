@@ -28,7 +28,7 @@ from topomerge.registry import LOGGERS, NO_LOGGER
 RUN_FILE, CONFIG_FILE, RUN_FORMAT = "run.json", "config.json", 1
 PACKAGES = ("torch", "torch-geometric", "numpy", "topomerge")
 # Keys that a run may go on with other values of: how long, where and by how many workers it trains, and what it tells.
-MAY_CHANGE = {"epochs", "patience", "accelerator", "precision", "batches", "threads", "jobs", "cluster", "cache"}
+MAY_CHANGE = {"epochs", "patience", "accelerator", "precision", "batches", "graphs", "threads", "jobs", "cluster", "cache"}
 MAY_CHANGE |= {"name", "runs", "logger", "export", "resume", "overwrite", "top", "profile", "anomaly"}
 # Keys that follow from the `path` of one's own captures; `record_start` compares what the sets hold.
 OWN_SETS = {"data", "data.name", "heldout.name", "validation"}

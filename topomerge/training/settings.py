@@ -267,6 +267,7 @@ class Training(NetworkSettings):
     accelerator: of `ACCELERATORS`.
     precision: of `PRECISIONS`; `auto`: bf16 on CUDA, 32 bits elsewhere.
     batches: made on the `device` (`device_batches`), or by threads of the `host`; `auto`: on the device beside an accelerator.
+    graphs: run steps as CUDA graphs (`captured_step`) where batches are made on the card.
     """
 
     task: str = "embedding"
@@ -285,6 +286,7 @@ class Training(NetworkSettings):
     threads: int = 1
     precision: str = "auto"
     batches: str = "auto"
+    graphs: bool = True
     init_from: str = ""
     geometry_from: str = ""
     freeze: str = ""
