@@ -9,6 +9,7 @@ import edt
 import numpy as np
 from scipy.spatial import cKDTree
 
+from topomerge.extraction.drawn_doors import place_drawn_doors
 from topomerge.extraction.elevations.doorways import StoreyWalls
 from topomerge.extraction.elevations.wall_doors import add_wall_doors
 from topomerge.extraction.elevations.windows import add_windows
@@ -267,6 +268,8 @@ def estimate_attributes(
     map = add_room_probabilities(map, scan.rays, scan.raised)
     if doors:
         map = add_wall_doors(map, floor.classified_storeys, walls)
+    if scan.drawn_doors is not None:
+        map = place_drawn_doors(map, scan.drawn_doors)
     map, doubt = add_walked_doors(map, scan.places)
     map = select_distinct_doors(map)
     if scan.raised:

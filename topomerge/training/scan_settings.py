@@ -110,7 +110,7 @@ class DrawingSegmentation(RasterTask):
     fresh: int = 2
     watched_pages: int = 96
     rate: float = 3e-3
-    widths: list[int] = field(default_factory=lambda: [8, 24, 48, 96, 160, 224])
+    widths: list[int] = field(default_factory=lambda: [8, 24, 40, 64, 96, 128])
     classes: list[float] = field(default_factory=lambda: [1.0, 1.0, 2.0, 3.0, 3.0, 1.0, 2.0, 1.0])
     dice: float = 0.5
     ema: float = 0.999
