@@ -120,6 +120,7 @@ def meet_along_a_wall() -> TopometricMap:
     navigable = VoxelGrid.from_cells(cells, np.array([0.0, 0.0, 0.45]), 0.1, (80, 40, 1))
     rooms, edges, storeys = np.zeros(2, ROOM_DTYPE), np.zeros(1, EDGE_DTYPE), np.zeros(1, STOREY_DTYPE)
     rooms["area"], storeys["floor"] = 16.0, 0.5
-    edges["rooms"], edges["centre"], edges["kind"], edges["height"] = (0, 1), (4.0, 2.0, 0.5), "opening", 2.1
+    edges["rooms"], edges["centre"], edges["open"], edges["height"] = (0, 1), (4.0, 2.0, 0.5), True, 2.1
+    edges["kind"] = "opening"
     room = (navigable.cells[:, 0] >= 40).astype(np.int32)
     return TopometricMap(navigable, room, navigable, room, rooms, edges, storeys)
