@@ -44,7 +44,7 @@ def find_long(path: Path) -> Iterator[str]:
                 yield f"{where} is longer than {LONGEST_FUNCTION} lines"
             names = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
             count = len(names) - (names[:1] in (["self"], ["cls"]))
-            if count > MOST_PARAMETERS and not any("njit" in ast.unparse(d) for d in node.decorator_list):
+            if count > MOST_PARAMETERS and not any("jit" in ast.unparse(d) for d in node.decorator_list):
                 yield f"{where} has {count} parameters"
 
 

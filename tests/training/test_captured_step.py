@@ -28,20 +28,20 @@ KERNEL = """
 import torch
 from tests.graphs import pair
 from tests.training.test_device_batches import NAMES
-from topomerge.training import crop_sampling
 from topomerge.training.crop_kernel import sample_by_kernel
+from topomerge.training.crop_sampling import sample_by_torch
 from topomerge.training.device_batches import DevicePairs
 from topomerge.training.settings import Augment
-by_torch = crop_sampling.sample_by_torch
 def compare(storeys, views, crops):
-    expected = by_torch(storeys, views, crops)
+    expected = sample_by_torch(storeys, views, crops)
     few = crops.take(slice(0, 3))
     assert torch.equal(sample_by_kernel(storeys, views, few), expected[:3]) and expected.any()
     print("equal", crops.side, crops.step)
     return expected
-crop_sampling.sample_by_torch = compare
 for augment in (None, Augment()):
-    DevicePairs([pair(1, 4)], NAMES, augment, torch.device("cpu")).make_batch([0], int)
+    device = DevicePairs([pair(1, 4)], NAMES, augment, torch.device("cpu"))
+    device.sample = compare
+    device.make_batch([0], int)
 """
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.util import find_spec
 
 import torch
 from torch import Tensor
@@ -82,7 +81,7 @@ def build_turns(angle: Tensor, zoom: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Crops:
-    """What crops are taken of.
+    """Crops to take.
 
     Args:
         centre: (n, 2) float32 places of their middles on the storeys, but for the drift.
@@ -103,8 +102,8 @@ class Crops:
         return Crops(self.centre[rows], self.turned[rows], self.part[rows], self.number[rows], self.side, self.step)
 
 
-def sample_crops(storeys: Storeys, views: Views, middle: Tensor, part: Tensor, number: Tensor, side: int, step: int) -> Tensor:
-    """Return (n, side, side, 8) uint8 crops about places of the changed storeys, showing rooms.
+def place_crops(views: Views, middle: Tensor, part: Tensor, number: Tensor, side: int, step: int) -> Crops:
+    """Return the crops about places of the changed storeys, showing rooms.
 
     Args:
         middle: (n, 2) float64 places; part: (n,) of the batch; number: (n,) rooms.
@@ -112,14 +111,7 @@ def sample_crops(storeys: Storeys, views: Views, middle: Tensor, part: Tensor, n
     """
     back, whole = views.build_back()[part], (middle + (0.5 + TIE)).floor()
     centre = (back.double() @ whole[..., None])[..., 0].float()
-    crops = Crops(centre, (back @ views.rotation[part]).float(), part, number, side, step)
-    if len(middle) and middle.is_cuda and find_spec("triton") is not None:
-        from topomerge.training.crop_kernel import sample_by_kernel
-
-        pixels = sample_by_kernel(storeys, views, crops)
-    else:
-        pixels = sample_by_torch(storeys, views, crops)
-    return pixels[..., None].view(torch.uint8).unflatten(1, (side, side))
+    return Crops(centre, (back @ views.rotation[part]).float(), part, number, side, step)
 
 
 def sample_by_torch(storeys: Storeys, views: Views, crops: Crops) -> Tensor:

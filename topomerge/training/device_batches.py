@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 
 import numpy as np
 import torch
@@ -42,7 +43,7 @@ from topomerge.training.batches import (
     compute_relative_positions,
 )
 from topomerge.training.captured_step import BatchShape, BatchShapes
-from topomerge.training.crop_sampling import Storeys, Views, build_turns, sample_crops
+from topomerge.training.crop_sampling import Crops, Storeys, Views, build_turns, place_crops, sample_by_torch
 from topomerge.training.hashed_random import draw_normal, draw_uniform, draw_uniforms, hash_numbers
 from topomerge.training.packed_pairs import GraphPair
 from topomerge.training.settings import Augment
@@ -74,6 +75,15 @@ def pad_structure(s: Structure, shape: BatchShape) -> Structure:
         true=np.concatenate([s.true, np.full(rooms, -1)]), clear=np.concatenate([s.clear, np.zeros(rooms, bool)]),
         edge=np.concatenate([s.edge, first]), edge_part=np.concatenate([s.edge_part, edge_part]), edge_index=edge_index,
     )  # fmt: skip
+
+
+def choose_sampler(device: torch.device) -> Callable[[Storeys, Views, Crops], Tensor]:
+    """Return what samples crops on a device: one kernel where there is Triton, else torch."""
+    if device.type == "cuda" and find_spec("triton") is not None:
+        from topomerge.training.crop_kernel import sample_by_kernel
+
+        return sample_by_kernel
+    return sample_by_torch
 
 
 def concatenate_ranges(first: Array, count: Array) -> Array:
@@ -159,6 +169,7 @@ class DevicePairs:
         self.gap_masks = torch.tensor(bytes_of, device=device)
         self.gap_shares = torch.tensor(np.cumsum([share for _, share in SEEN_AS])[:-1], device=device, dtype=torch.float32)
         self.shapes: BatchShapes | None = None
+        self.sample = choose_sampler(device)
         self._load_sheets([(graph["sheet"], graph["sheet_room"]) for graph in graphs])
 
     def _load_sheets(self, sheets: Sequence[tuple[Tensor, Tensor]]) -> None:
@@ -390,13 +401,20 @@ class DevicePairs:
             doors = doors + DOOR_SHIFT * draw_normal(seed, DOORS, index).reshape(-1, 2)
         for name, step in ((CROP_PART, 1), (WIDE_PART, WIDE_STEP)):
             if name in self.names:
-                out[name] = sample_crops(self.storeys, views, anchor, part, local, CROP_SHAPES[name][0], step)
+                out[name] = self._sample(views, place_crops(views, anchor, part, local, CROP_SHAPES[name][0], step))
         if DOOR_PART in self.names:
             of = door // DOOR_CROPS
             crops = torch.zeros((len(doors), *CROP_SHAPES[DOOR_PART][1:]), dtype=torch.uint8, device=self.device)
-            crops[door] = sample_crops(self.storeys, views, doors[door], part[of], local[of], DOOR_CROP, 1)
+            crops[door] = self._sample(views, place_crops(views, doors[door], part[of], local[of], DOOR_CROP, 1))
             out[DOOR_PART] = crops.unflatten(0, (len(room), DOOR_CROPS))
         return out
+
+    def _sample(self, views: Views, crops: Crops) -> Tensor:
+        """Return (n, side, side, 8) uint8 crops."""
+        if not len(crops.part):
+            return torch.zeros((0, crops.side, crops.side, 8), dtype=torch.uint8, device=self.device)
+        pixels = self.sample(self.storeys, views, crops)
+        return pixels[..., None].view(torch.uint8).unflatten(1, (crops.side, crops.side))
 
 
 def _mark_columns(count: int, marks: dict[int, Sequence[int]]) -> Tensor:
