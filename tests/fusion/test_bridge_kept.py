@@ -176,7 +176,7 @@ def test_a_robot_that_drives_alone_is_kept_once_a_minute(tmp_path: Path) -> None
         pose = np.eye(4)
         pose[0, 3] = k
         bridge.merger.get_robot("a", "odom").add_scan(rng.uniform(-5, 5, (50, 3)), pose)
-        bridge._saved -= 40.0
+        bridge._since_saved._started -= 40.0
         bridge._finish([], 0.0)
         assert (tmp_path / "live" / "bridge.json").exists() == (k > 0)
     assert len(LiveMerger(tmp_path / "live").robots["a"].poses) == 2

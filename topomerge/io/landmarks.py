@@ -15,14 +15,16 @@ import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError
-from topomerge.io.trajectory import LONGEST_GAP, Trajectory, read_trajectory
 from topomerge.types import LANDMARK_DTYPE, LANDMARK_KINDS, MOST_LANDMARKS, Array, Landmarks, build_landmarks, clean_landmarks
+
+if TYPE_CHECKING:  # it imports SciPy, which few files need
+    from topomerge.io.trajectory import Trajectory
 
 COLUMNS = ("kind", "value", "x", "y", "z", "sigma", "room", "storey", "confidence", "number", "group", "time")
 WHOLE = ("room", "storey", "group")  # columns of whole numbers, -1 where nothing is known
@@ -314,6 +316,8 @@ def read_radio_beside(table: Path, path: Path, poses: str | None = None) -> Land
     if trajectory is None:
         first = _list_trajectories(path)[0]
         raise InputError(f"{table}: has no trajectory; put {first} (time tx ty tz qx qy qz qw) beside it, or take it away")
+    from topomerge.io.trajectory import read_trajectory
+
     return read_radio_csv(table, read_trajectory(trajectory))
 
 
@@ -336,6 +340,8 @@ def read_radio_csv(path: Path, trajectory: Trajectory) -> Landmarks:
     Raises:
         InputError: a trajectory without times, no such file, or a line that holds no reading; with its number.
     """
+    from topomerge.io.trajectory import LONGEST_GAP
+
     if trajectory.times is None or not len(trajectory):
         raise InputError(f"{path}: its trajectory has no times; give one in the format of TUM (time tx ty tz qx qy qz qw)")
     rows = _read_rows(path)
