@@ -16,6 +16,7 @@ from topomerge.extraction.elevations.windows import add_windows
 from topomerge.extraction.plans.storey_plan import Floor
 from topomerge.extraction.room_odds import add_room_probabilities
 from topomerge.extraction.scan import Scan
+from topomerge.extraction.topology import LEVEL_KINDS
 from topomerge.types import EDGE_DTYPE, Array, TopometricMap, select_rooms
 
 # A doorway joins the two rooms that lie across it, once (beyond the thesis).
@@ -23,7 +24,6 @@ from topomerge.types import EDGE_DTYPE, Array, TopometricMap, select_rooms
 # What is seen on a wall, in the plan, and by a sensor's way may be one doorway told twice, between different rooms: a sliver of a
 # third room often lies in it. Of the doors of 60 simulated validation maps a twentieth were such doubles.
 
-LEVEL_KINDS = ("door", "opening")
 # Many doorways were told twice, with a sliver of a third room between (docs/adr/0020).
 ONE_DOORWAY = 0.5  # m between the centres of what is one doorway
 SIDES_AT = (0.4, 0.6, 0.8)  # m before and behind a door, where its rooms are looked for

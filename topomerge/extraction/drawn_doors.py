@@ -12,7 +12,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from topomerge.extraction.topology import DOOR_MOST_WIDTH
+from topomerge.extraction.topology import DOOR_MOST_WIDTH, LEVEL_KINDS
 from topomerge.types import EDGE_DTYPE, Array, TopometricMap
 
 SURE_DOOR = 0.5  # probability from which a place is of a door
@@ -20,7 +20,6 @@ PLACE_STEP = 0.05  # m between places that are looked at
 BOTH_ROOMS = 0.35  # m from a place of a door to the farther of its two rooms, at most
 LEAST_WIDTH = 0.4  # m, of a door
 SAME_LEVEL = 0.5  # m between a drawn door and the floor of its storey
-LEVEL_KINDS = ("door", "opening")
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from topomerge.extraction.attributes import LEVEL_KINDS
+from topomerge.extraction.topology import LEVEL_KINDS
 from topomerge.io.landmarks import find_landmark_file, read_landmark_file
 from topomerge.io.maps import load_map
 from topomerge.types import (

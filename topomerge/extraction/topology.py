@@ -20,6 +20,7 @@ from topomerge.types import AREA_DTYPE, EDGE_DTYPE, ROOM_DTYPE, Array, Topometri
 
 # Where two rooms meet: doors, openings and stairs (seeds 2.7).
 
+LEVEL_KINDS = ("door", "opening")  # of edges that lead to the same storey
 DOOR_MOST_WIDTH = 1.6  # m: what is wider is an opening
 SAME_DOOR_DISTANCE = 0.8  # m: passages between the same rooms that are this close are one
 LEVEL_HEIGHT = 0.6  # m: what is higher or lower is another level

@@ -164,7 +164,8 @@ class EmbeddingJob:
         self.pairs = self._load_pairs()
         self.take_step: Step = self._descend
         self.state = State()  # that the step under way is of
-        if isinstance(self.pairs, DevicePairs) and can_capture(settings, fabric, self.get_optimizer()):
+        # Without an edge in the set there is none to fill batches up with.
+        if isinstance(self.pairs, DevicePairs) and self.pairs.edges.any() and can_capture(settings, fabric, self.get_optimizer()):
             self.pairs.shapes = BatchShapes(self.pairs.measure_mean(settings.batch))
             for group in self.get_optimizer().param_groups:  # that graphs read it where it is
                 group["lr"] = torch.tensor(settings.rate, device=fabric.device)
