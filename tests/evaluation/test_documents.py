@@ -51,6 +51,48 @@ def test_what_has_changed_is_named(page: Path, stamp: documents.Stamp, said: str
     assert bool(found) == bool(said) and all(said in line and line.startswith("page.md rooms: ") for line in found)
 
 
+def test_a_stamp_tells_which_rows_are_older(page: Path) -> None:
+    stamp = documents.build_stamp(COMMAND, MODULES, ["one"], tasks.describe_confirmed([{"confirmed": 2}, {"confirmed": 2}, {}]))
+    assert stamp.confirmed == "2 of 3 rows are older, 2 others came out alike" and not tasks.describe_confirmed([{}])
+    documents.write_blocks(page, {"rooms": "| a |"}, stamp)
+    assert documents.read_stamp(documents.BLOCK.findall(page.read_text())[0][1]) == stamp
+
+
+@pytest.mark.parametrize(
+    ("confirm", "changed", "measured"),
+    [
+        (0, (), ["a", "b", "c", "d", "e"]),
+        (2, (), ["a", "d"]),
+        (2, ("d",), ["a", "d", "b", "c", "e"]),
+        (2, ("b",), ["a", "d"]),  # a sample cannot see it
+        (9, ("b",), ["a", "b", "c", "d", "e"]),
+    ],
+)
+def test_older_rows_stay_where_a_sample_of_them_comes_out_alike(
+    tmp_path: Path, confirm: int, changed: tuple[str, ...], measured: list[str]
+) -> None:
+    now, calls = "old", []
+
+    def work(name: str) -> tasks.Row:
+        calls.append(name)
+        value = 1.0 if now == "new" and name in changed else 0.0
+        return {"iou": value, "nothing": float("nan"), "scans": [{"seconds": float(len(calls))}]}
+
+    def measure() -> list[tasks.Row]:
+        items = {name: (name,) for name in "abcde"}
+        return tasks.measure_missing(tmp_path / "rows.jsonl", items, work, list, tasks.TaskSettings(confirm=confirm), now)
+
+    first = measure()
+    assert calls == list("abcde") and [row["name"] for row in measure()] == calls and not any("confirmed" in r for r in first)
+    now, calls[:] = "new", []
+    rows = measure()
+    assert calls == measured and [row["code"] for row in rows] == ["new"] * 5
+    assert [row["name"] for row in rows if row.get("confirmed")] == [name for name in "abcde" if name not in measured]
+    assert [row["name"] for row in rows if row["iou"]] == [name for name in changed if name in measured]
+    measure()
+    assert calls == measured
+
+
 def test_a_block_without_a_stamp_is_stale(page: Path) -> None:
     assert list(results_check.find_stale([page], page.parent)) == ["page.md rooms: nothing says what made it"]
     page.write_text(page.read_text().replace("old words", "<!-- measured at commit abc123 -->"))

@@ -19,7 +19,10 @@ from topomerge.statistics import format_interval
 
 ROOT = Path(__file__).parent.parent.parent
 BLOCK = re.compile(r"<!-- ([\w-]+):begin -->\n(.*?)<!-- \1:end -->", re.DOTALL)
-STAMP = re.compile(r"<!-- made by `(?P<command>[^`]+)`; code (?P<code>\w+) of (?P<modules>[\w., ]+); data (?P<data>\w+) -->")
+STAMP = re.compile(
+    r"<!-- made by `(?P<command>[^`]+)`; code (?P<code>\w+) of (?P<modules>[\w., ]+); data (?P<data>\w+)"
+    r"(?:; (?P<confirmed>[^>]+))? -->"
+)
 OLD_STAMP = re.compile(r"<!-- measured at commit (?P<commit>\w+)[^>]*-->")
 NO_INPUTS = "none"
 
@@ -33,22 +36,25 @@ class Stamp:
         modules: whose code, and all that this imports and reads, decides what stands in it.
         code: digest of that.
         data: digest of the names of its inputs.
+        confirmed: which of its rows are older, if any, and what says that they hold.
     """
 
     command: str
     modules: tuple[str, ...]
     code: str
     data: str
+    confirmed: str = ""
 
     def write_comment(self) -> str:
         """Write the stamp as the comment that `read_stamp` reads."""
-        return f"<!-- made by `{self.command}`; code {self.code} of {', '.join(self.modules)}; data {self.data} -->"
+        made = f"made by `{self.command}`; code {self.code} of {', '.join(self.modules)}; data {self.data}"
+        return f"<!-- {'; '.join(filter(None, (made, self.confirmed)))} -->"
 
 
-def build_stamp(command: str, modules: Iterable[str], inputs: Iterable[str] = ()) -> Stamp:
+def build_stamp(command: str, modules: Iterable[str], inputs: Iterable[str] = (), confirmed: str = "") -> Stamp:
     """Build the stamp of what this state of the code makes of these inputs."""
     names = tuple(modules)
-    return Stamp(command, names, compute_code_digest(*names), digest_inputs(inputs))
+    return Stamp(command, names, compute_code_digest(*names), digest_inputs(inputs), confirmed)
 
 
 def digest_inputs(inputs: Iterable[str]) -> str:
@@ -60,7 +66,10 @@ def digest_inputs(inputs: Iterable[str]) -> str:
 def read_stamp(text: str) -> Stamp | None:
     """Read the stamp in the first line of a block; None where there is none."""
     found = STAMP.match(text.lstrip())
-    return found and Stamp(found["command"], tuple(found["modules"].split(", ")), found["code"], found["data"])
+    if found is None:
+        return None
+    modules = tuple(found["modules"].split(", "))
+    return Stamp(found["command"], modules, found["code"], found["data"], found["confirmed"] or "")
 
 
 def write_blocks(page: Path, blocks: Mapping[str, str], stamp: Stamp) -> list[str]:

@@ -87,7 +87,7 @@ def measure(settings: Settings, log_line: LogFn) -> list[Row]:
         items = {f"{building} {part}": (data, building, part) for building in STOREYS for part in range(PARTS)}
         return measure_missing(path, items, measure_building, log_line, settings)
     kept = str(Path(settings.cache) / "radio")
-    walks = {f"{name} {walks or 'all'}": (name, walks, trials, kept) for name in WIFI_STOREYS for walks in WALKS}
+    walks = {f"{name} {walks or 'all'} {trials}": (name, walks, trials, kept) for name in WIFI_STOREYS for walks in WALKS}
     return measure_missing(path, walks, measure_walks, log_line, settings)
 
 

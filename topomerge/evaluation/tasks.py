@@ -10,7 +10,7 @@ import json
 import os
 import re
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
@@ -81,6 +81,8 @@ class TaskSettings:
         write: a page whose marked blocks are written; empty: none.
         headline: a file of figures for the README whose entries of this task are written; empty: none.
         remake: measure again what is there.
+        confirm: rows of an older state of the code stay where so many of them, evenly spread, come out alike when they are
+            measured again; 0: all of them are measured again.
     """
 
     data: Data = field(default_factory=Data)
@@ -90,6 +92,7 @@ class TaskSettings:
     write: str = ""
     headline: str = ""
     remake: bool = False
+    confirm: int = 0
 
 
 class EvaluationModule(Protocol):
@@ -159,12 +162,19 @@ def run_task(task: str, overrides: Sequence[str], log_line: LogFn) -> Outcome:
         shlex.join(["python", "evaluate.py", f"task={task}", *(w for w in overrides if not w.startswith("task="))]),
         module.MAKERS,
         module.list_inputs(settings),
+        describe_confirmed(rows),
     )
     if settings.write:
         write_blocks(Path(settings.write), blocks, stamp)
     if settings.headline:
         write_headline(Path(settings.headline), compute_figures(module, rows, settings), stamp)
     return Outcome(rows, summary, folder)
+
+
+def describe_confirmed(rows: Sequence[Row]) -> str:
+    """Say how many rows are of older code, and how many of these were measured again; empty where none is."""
+    kept = [row["confirmed"] for row in rows if row.get("confirmed")]
+    return f"{len(kept)} of {len(rows)} rows are older, {min(kept)} others came out alike" if kept else ""
 
 
 def compute_figures(module: EvaluationModule, rows: Sequence[Row], settings: Any) -> dict[str, tuple[str, str]]:
@@ -194,30 +204,58 @@ def list_inputs_of(command: str) -> list[str] | None:
 def measure_missing(
     path: Path, items: Mapping[str, Any], work: Callable[..., Row], log_line: LogFn, settings: TaskSettings, code: str = ""
 ) -> list[Row]:
-    """Measure the items that a file of rows does not have, one line of JSON each; the rows of all items.
+    """Measure the items that a file of rows does not have from this state of the code; the rows of all items.
 
     Args:
+        path: one line of JSON a row, written as they come: what is stopped goes on where it was.
         items: name -> arguments of `work`, which can be sent to another process.
-        code: digest of what makes a row; rows of another one are measured again. Empty: rows are kept, and it is told.
+        settings: `remake` and `confirm` say what becomes of rows that are there.
+        code: digest of what makes a row; empty: of the module of `work` and all that it imports.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    rows = {} if settings.remake else read_rows(path)
-    now = code or compute_code_digest(work.__module__)
-    older = [name for name in items if name in rows and rows[name].get("code") != now]
-    if code:
-        rows = {name: row for name, row in rows.items() if name not in set(older)}
-    elif older:
-        log_line(f"{path}: {len(older)} of {len(items)} rows are of another state of the code; remake=true measures them again")
-    missing = {name: arguments for name, arguments in items.items() if name not in rows}
+    code = code or compute_code_digest(work.__module__)
     if settings.remake:
         path.unlink(missing_ok=True)
-    with path.open("a", encoding="utf-8") as file:
+    rows = {name: row for name, row in read_rows(path).items() if name in items}
+    older = {name: row for name, row in rows.items() if row["code"] != code}
+    rows = {name: row for name, row in rows.items() if name not in older}
+    sample = list(older)[:: -(-len(older) // settings.confirm)] if older and settings.confirm else []
+
+    def measure(names: Iterable[str]) -> None:
+        missing = {name: items[name] for name in names if name not in rows}
         for done, row in enumerate(iterate_rows(missing, work, settings.jobs), 1):
-            rows[row["name"]] = row | {"code": now}
-            file.write(json.dumps(rows[row["name"]]) + "\n")
-            file.flush()
+            keep(row | {"code": code})
             log_line(f"{done} of {len(missing)}: {row['name']}")
-    return [rows[name] for name in items if name in rows]
+
+    def keep(row: Row) -> None:
+        rows[row["name"]] = row
+        file.write(json.dumps(row) + "\n")
+        file.flush()
+
+    with path.open("a", encoding="utf-8") as file:
+        measure(sample)
+        unlike = [name for name in sample if drop_costs(rows[name]) != drop_costs(older[name])]
+        if sample and not unlike:
+            log_line(f"{len(sample)} of {len(older)} older rows came out alike: the others stay")
+            for name in [name for name in older if name not in rows]:
+                keep(older[name] | {"code": code, "confirmed": len(sample)})
+        elif older:
+            said = f"; {unlike[0]} came out otherwise" if unlike else ""
+            log_line(f"{len(older)} rows are of another state of the code and are measured again{said}")
+        measure(items)
+    return [rows[name] for name in items]
+
+
+COSTS = re.compile(r"code|confirmed|.*(seconds|_s|_mib|_mb)")
+
+
+def drop_costs(value: Any) -> Any:
+    """Drop from a row, at any depth, what two measurements of the same code do not share: seconds, memory, the code's digest."""
+    if isinstance(value, dict):
+        return {key: drop_costs(inner) for key, inner in value.items() if not COSTS.fullmatch(key)}
+    if isinstance(value, list | tuple):
+        return [drop_costs(inner) for inner in value]
+    return str(value) if isinstance(value, float) else value  # not a number equals itself
 
 
 def iterate_rows(items: Mapping[str, Any], work: Callable[..., Row], jobs: int) -> Iterator[Row]:
