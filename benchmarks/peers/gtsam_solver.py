@@ -117,10 +117,10 @@ def solve_with_gtsam(gtsam: Any, given: Problem) -> Array:
     graph, start, sure = gtsam.NonlinearFactorGraph(), gtsam.Values(), []
 
     def add(factor: Callable[[Any], Any], place: Array, information: Array, certain: bool) -> None:
-        there = compute_effect(place)
+        effect = compute_effect(place)
         if certain:
             sure.append(graph.size())
-        graph.add(factor(gtsam.noiseModel.Gaussian.Information(there.T @ information @ there)))
+        graph.add(factor(gtsam.noiseModel.Gaussian.Information(effect.T @ information @ effect)))
 
     for k, (anchor, sigma) in enumerate(zip(anchors, prior[:, :3], strict=True)):
         start.insert(k, gtsam.Pose2())

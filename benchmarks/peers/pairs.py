@@ -129,9 +129,9 @@ def iter_peer_pairs(what: str, done: set[str]) -> Iterator[PeerPair]:
     left = [path for path in list_cached_order(what) if path.stem not in done]
     items = load_raw_items({path.stem for path in left}) if what == "raw" else {}
     if older := [path for path in left if what == "raw" and path.stem not in items]:
-        made = "python evaluate.py task=merges data=test"
+        command = "python evaluate.py task=merges data=test"
         raise InputError(
-            f"{older[0]}: was made by another version, its points can't be simulated again; make the pairs anew: {made}"
+            f"{older[0]}: was made by another version, its points can't be simulated again; make the pairs anew: {command}"
         )
     for path in left:
         pair = load_grids(path)

@@ -101,9 +101,9 @@ def tabulate(rows: Sequence[Row]) -> str:
         outcomes = [classify_outcome(row["ours"]) for row in some]
         seconds = float(np.median([k["seconds"] for row in some for k in row["kiss"]]))
         ours = float(np.median([row["ours"]["seconds"] for row in some]))
-        told = [outcomes.count("right"), outcomes.count("wrong")]
+        counts = [outcomes.count("right"), outcomes.count("wrong")]
         lines.append(
-            [kind, len(some), right, near, best, f"{seconds:.2f}", f"{seconds * MAPS['test']:.0f}", *told, f"{ours:.2f}"]
+            [kind, len(some), right, near, best, f"{seconds:.2f}", f"{seconds * MAPS['test']:.0f}", *counts, f"{ours:.2f}"]
         )
     heads = ["scan", "scans", "KISS-Matcher, own map: within 0.3 m, 5°", "within 1 m, 15°", "… and of the maps the most inliers"]
     heads += ["s a map, median", "so s for 50 maps", "`locate` in 50 maps: told right", "told wrong", "s in all"]
@@ -127,8 +127,8 @@ def main(scans: str = "15", maps: str = "10") -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
     settings = TaskSettings()
     folder = Path(settings.cache) / "locate" / "test"
-    wanted = [(FIRST["test"] + k // len(KINDS), KINDS[k % len(KINDS)]) for k in range(int(scans))]
-    items = {f"{number} {kind} {maps}": (number, kind, int(maps), folder) for number, kind in wanted}
+    queries = [(FIRST["test"] + k // len(KINDS), KINDS[k % len(KINDS)]) for k in range(int(scans))]
+    items = {f"{number} {kind} {maps}": (number, kind, int(maps), folder) for number, kind in queries}
     path = Path(settings.cache) / "evaluation" / "locate_peers.jsonl"
     rows = measure_missing(path, items, compare_scan, print, settings, compute_code_digest(*MAKERS))
     table = tabulate(rows)

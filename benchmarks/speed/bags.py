@@ -25,7 +25,7 @@ from tests.io.walks import PERIOD, START, Walk
 from topomerge.progress import Stopwatch
 
 SEED, SPACING = 3, 0.025  # m, between the points of a lap
-AGAIN, NOISE = 10, 0.01  # each point so often, with other noise (m): 36,000 a scan, as of 32 beams
+REPEATS, NOISE = 10, 0.01  # each point so often, with other noise (m): 36,000 a scan, as of 32 beams
 POINT_BYTES = 16
 
 
@@ -48,10 +48,10 @@ def iter_laps(walk: Walk, gigabytes: float, m: Messages) -> Iterable[Entry]:
     """The messages of as many laps as give the bag its size."""
     rng, size, lap = np.random.default_rng(0), 0, 0
     while size < gigabytes * 1e9:
-        scans = (np.repeat(s, AGAIN, axis=0) for s in walk.scans)
+        scans = (np.repeat(s, REPEATS, axis=0) for s in walk.scans)
         scans = [s + rng.normal(0, NOISE, s.shape).astype(np.float32) for s in scans]
-        again = Walk(scans, walk.poses, walk.times + lap * PERIOD * len(scans))
-        for entry in walk_messages(again)(m):
+        lap_walk = Walk(scans, walk.poses, walk.times + lap * PERIOD * len(scans))
+        for entry in walk_messages(lap_walk)(m):
             if entry[0] == "/tf_static" and lap:
                 continue
             yield entry
@@ -84,8 +84,8 @@ def measure(path: str, alone: bool) -> dict[str, float]:
 def measure_in_process(path: Path, alone: bool) -> dict[str, float]:
     """`measure` in a process of its own."""
     command = [sys.executable, "-m", "benchmarks.speed.bags", "--measure", str(path), "alone" if alone else "extract"]
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    result: dict[str, float] = json.loads(said.splitlines()[-1])
+    output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    result: dict[str, float] = json.loads(output.splitlines()[-1])
     return result
 
 

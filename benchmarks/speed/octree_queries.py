@@ -70,8 +70,8 @@ def _encode_key(x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _find_slot(key, mask):  # type: ignore[no-untyped-def]  # pragma: no cover
-    mixed = key * np.int64(0x1E3779B97F4A7C15)  # Fibonacci hashing: the high bits depend on every bit of the key
-    return ((mixed >> 36) ^ (mixed >> 20)) & mask
+    hashed = key * np.int64(0x1E3779B97F4A7C15)  # Fibonacci hashing: the high bits depend on every bit of the key
+    return ((hashed >> 36) ^ (hashed >> 20)) & mask
 
 
 @njit(cache=True, error_model="numpy")

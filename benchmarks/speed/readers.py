@@ -87,23 +87,23 @@ class Recording:
     text: bool = False
 
 
-def write_table_beside(folder: Path, told: bool) -> Path:
+def write_table_beside(folder: Path, with_landmarks: bool) -> Path:
     """Write a cloud, and signs in a table beside it."""
     write_cloud(folder / "a.ply", "quality")
-    if told:
+    if with_landmarks:
         rows = (f"text,{k % 1000}.{k},{k % 9},{k % 7},1.5" for k in range(ROWS))
         (folder / "a.landmarks.csv").write_text("\n".join(["kind,value,x,y,z", *rows]) + "\n")
     return folder / "a.ply"
 
 
-def write_radio_beside(folder: Path, told: bool) -> Path:
+def write_radio_beside(folder: Path, with_landmarks: bool) -> Path:
     """Write a cloud, and readings of radio and a trajectory beside it."""
     write_cloud(folder / "a.ply", "quality")
     times = np.arange(0, 1000.0)
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     poses[:, 0, 3] = times / 100
     write_tum(folder / "a.poses.txt", poses, times)
-    if told:
+    if with_landmarks:
         rows = (f"{k * 1000 / ROWS:.3f},aa:bb:cc:00:00:{k % 100:02d},{-40 - k % 50}" for k in range(ROWS))
         (folder / "a.radio.csv").write_text("\n".join(["time,bssid,rssi", *rows]) + "\n")
     return folder / "a.ply"
@@ -119,15 +119,15 @@ def write_cloud(path: Path, field: str) -> Path:
     return path
 
 
-def write_classes(folder: Path, told: bool) -> Path:
+def write_classes(folder: Path, with_landmarks: bool) -> Path:
     """Write a cloud whose field is one of classes, or another one."""
-    return write_cloud(folder / "a.ply", "label" if told else "quality")
+    return write_cloud(folder / "a.ply", "label" if with_landmarks else "quality")
 
 
-def write_bag_readings(folder: Path, told: bool) -> Path:
+def write_bag_readings(folder: Path, with_landmarks: bool) -> Path:
     """Write a walk with WiFi, BLE and pressure at each scan, or without."""
     walk = repeat_walk()
-    return write_bag(folder, "mcap", (readings_messages if told else walk_messages)(walk))
+    return write_bag(folder, "mcap", (readings_messages if with_landmarks else walk_messages)(walk))
 
 
 def repeat_walk() -> Walk:
@@ -137,10 +137,10 @@ def repeat_walk() -> Walk:
     return Walk(walk.scans * LAPS, np.tile(walk.poses, (LAPS, 1, 1)), times)
 
 
-def write_node_readings(folder: Path, told: bool) -> Path:
+def write_node_readings(folder: Path, with_landmarks: bool) -> Path:
     """Write a database of a laser with radio, pressure, labels and tags at each node, or without."""
     nodes = scan_nodes(repeat_walk(), "0.23.0")
-    if told:
+    if with_landmarks:
         tag = np.eye(4)
         radio = packed(np.array([[-70.0, 6.0]]))
         more = {"sensors": [(1, -61.0, 5.0), (3, 1013.2, 5.1)], "user_data": radio, "tags": [(7, tag)]}
@@ -148,31 +148,31 @@ def write_node_readings(folder: Path, told: bool) -> Path:
     return write_rtabmap(folder / "a.db", nodes)
 
 
-def write_map(folder: Path, told: bool) -> Path:
+def write_map(folder: Path, with_landmarks: bool) -> Path:
     """Write a map, with landmarks or without."""
     map = office_map(0)
     at = np.random.default_rng(0).uniform(*map.grid.bounds, (ROWS, 3))
     signs = build_landmarks("text", [f"{k % 1000}.{k}" for k in range(ROWS)], "table", at)
-    save_map(add_landmarks(map, signs) if told else map, folder / "a.tmap")
+    save_map(add_landmarks(map, signs) if with_landmarks else map, folder / "a.tmap")
     return folder / "a.tmap"
 
 
-def write_pictures(folder: Path, told: bool) -> Path:
+def write_pictures(folder: Path, with_landmarks: bool) -> Path:
     """Write pictures and depth of the corridor of signs as files."""
     return write_corridor(folder / "a", walk_poses(PICTURES))
 
 
-def write_picture(folder: Path, told: bool) -> Path:
+def write_picture(folder: Path, with_landmarks: bool) -> Path:
     """Write one picture of them, for which the readers are loaded all the same."""
     return write_corridor(folder / "a", walk_poses(PICTURES)[:1])
 
 
-def write_node_pictures(folder: Path, told: bool) -> Path:
+def write_node_pictures(folder: Path, with_landmarks: bool) -> Path:
     """Write them as nodes of RTAB-Map."""
     return write_rtabmap(folder / "a.db", picture_nodes(walk_poses(PICTURES)))
 
 
-def write_bag_pictures(folder: Path, told: bool) -> Path:
+def write_bag_pictures(folder: Path, with_landmarks: bool) -> Path:
     """Write them as topics of a bag."""
     return write_bag(folder, "mcap", corridor_messages(walk_poses(PICTURES), "images", True))
 
@@ -214,10 +214,10 @@ def measure_readers(recordings: tuple[Recording, ...], repeat: int) -> str:
             folders = [Path(name) / part for part in ("with", "without")]
             for folder in folders:
                 folder.mkdir()
-            told = recording.write(folders[0], True)
-            bare = told if recording.text else recording.write(folders[1], False)
+            with_landmarks = recording.write(folders[0], True)
+            bare = with_landmarks if recording.text else recording.write(folders[1], False)
             without = measure_reading(bare, {"text": False} if recording.text else {}, repeat)
-            own = measure_reading(told, {}, repeat)
+            own = measure_reading(with_landmarks, {}, repeat)
         unit, count = recording.unit
         count = count or len(repeat_walk().scans)
         costs = [f"{own[0] - without[0]:.2f}", f"{1000 * (own[0] - without[0]) / count:.2f}"]

@@ -24,7 +24,7 @@ from topomerge.types import Array
 ROOMS = (10_000, 100_000, 1_000_000)
 VECTOR, ALIKE, ASKED = 256, 20, 120  # numbers of a vector, rooms of one look, vectors that are looked for
 LOOK_NOISE, SEEN_NOISE = 0.6, 0.4  # length of what is added to a look, and to a room that is seen again
-MADE_AT_ONCE = 50_000
+BATCH_ROOMS = 50_000
 SEARCH_COLUMNS = (
     "| rooms | exact, ms per query | index, ms per query | exact / index | room itself first: exact, index "
     "| recall of the 10 nearest | memory, MB: exact, index | file, MB | build, s | load, s |\n"
@@ -43,8 +43,8 @@ def draw_table(rng: np.random.Generator, rooms: int) -> Array:
     """Return (rooms, VECTOR) vectors."""
     looks = add_noise(rng, np.zeros((max(rooms // ALIKE, 1), VECTOR), np.float32), 1.0)
     table = np.empty((rooms, VECTOR), np.float32)
-    for k in range(0, rooms, MADE_AT_ONCE):
-        part = table[k : k + MADE_AT_ONCE]
+    for k in range(0, rooms, BATCH_ROOMS):
+        part = table[k : k + BATCH_ROOMS]
         part[:] = add_noise(rng, looks[rng.integers(0, len(looks), len(part))], LOOK_NOISE)
     return table
 
@@ -68,7 +68,7 @@ def measure(rooms: int) -> str:
     index = RoomsIndex(VECTOR)
     began = process_time()
     index.add(["all"], [rooms], table)
-    made = process_time() - began
+    build_seconds = process_time() - began
     exact, by_index = find_nearest(table, asked)[0], index.find_nearest(asked)[0]
     slow, fast = time_query(find_nearest, table, asked), time_query(index.find_nearest, asked)
     print_line(f"room_search_{rooms}", fast, slow)
@@ -85,7 +85,7 @@ def measure(rooms: int) -> str:
     searches = (
         f"{rooms:,} | {slow * 1e3:.2f} | {fast * 1e3:.2f} | {slow / fast:.1f} | {first[0]:.2f}, {first[1]:.2f} | {recall:.2f}"
     )
-    return f"| {searches} | {memory[0]:,.0f}, {memory[1]:,.0f} | {size:,.0f} | {made:,.0f} | {read:.1f} |"
+    return f"| {searches} | {memory[0]:,.0f}, {memory[1]:,.0f} | {size:,.0f} | {build_seconds:,.0f} | {read:.1f} |"
 
 
 def main(rooms: Sequence[int] = ROOMS) -> None:

@@ -19,7 +19,7 @@ WALL = 0.4  # m from the rooms to the outer face of their walls
 GROUND_CELL = 1.0  # m between the vertices of the ground
 DEPTH = (6.0, 18.0)  # m of ground on each side
 DROP = (0.0, 0.5)  # m from the lowest floor down to the ground
-BUMPS = 0.08  # m, standard deviation of the ground's height
+GROUND_ROUGHNESS = 0.08  # m, standard deviation of the ground's height
 BOUNDS = ("street", "fence", "hedge", "open")  # what may end a side
 PLANT_AREA = 25.0  # m2 of ground a tree or bush, at the greenest
 LEAVES = (25, 70)  # triangles of a crown
@@ -58,7 +58,7 @@ def _add_ground(soup: TriangleSoup, box: Array, taken: shapely.Geometry, low: fl
     counts = np.ceil((box[1] - box[0]) / GROUND_CELL).astype(int) + 1
     x, y = (np.linspace(box[0, k], box[1, k], counts[k]) for k in (0, 1))
     places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-    vertices = np.column_stack([places, low + rng.normal(0, BUMPS, len(places))])
+    vertices = np.column_stack([places, low + rng.normal(0, GROUND_ROUGHNESS, len(places))])
     corner = (np.arange(counts[0] - 1)[:, None] * counts[1] + np.arange(counts[1] - 1)).ravel()
     right, up = corner + counts[1], corner + 1
     triangles = np.concatenate([np.column_stack([corner, right, up]), np.column_stack([right, right + 1, up])])

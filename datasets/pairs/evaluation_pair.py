@@ -31,7 +31,7 @@ COLUMN_SIZE = 0.2  # m, columns by which the area in common is measured
 UNDER_FLOOR = 0.15  # m: what is that far below a floor is the ceiling of the storey below
 STOREY_APART = 1.0  # m between two storeys, at least
 FEWEST_COLUMNS = 50  # columns: maps that share fewer have no middle of what both saw
-LAID_IOU = 0.4  # IoU from which rooms that lie over each other are one
+SAME_ROOM_IOU = 0.4  # IoU from which rooms that lie over each other are one
 
 
 class HasTruth(Protocol):
@@ -217,7 +217,7 @@ def match_overlapping_rooms(pair: Pair, maps: Sequence[TopometricMap]) -> Array:
         return np.zeros((0, 2), np.int64)
     rooms, fit = find_matches(t, (build_room_plans(maps[0]), build_room_plans(maps[1])))
     matches: list[tuple[int, int]] = []
-    for i, j in rooms[np.argsort(-fit, kind="stable")][: int((fit >= LAID_IOU).sum())].tolist():
+    for i, j in rooms[np.argsort(-fit, kind="stable")][: int((fit >= SAME_ROOM_IOU).sum())].tolist():
         if i not in {k[0] for k in matches} and j not in {k[1] for k in matches}:
             matches.append((i, j))
     return np.array(sorted(matches), np.int64).reshape(-1, 2)

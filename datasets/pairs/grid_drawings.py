@@ -45,7 +45,7 @@ from topomerge.types import Array, LogFn, Sim3
 UNSCALED_EVERY = 3  # every third drawing has no scale
 WALL_CELL = 0.1  # m
 WALLS_APART = 0.3  # m between walls that differ
-LOOKED_BACK = 3  # pairs before this one, the nearest of which that is of another building is drawn as a stranger
+LOOKBACK = 3  # pairs before this one, the nearest of which that is of another building is drawn as a stranger
 Plans = Sequence[tuple[object, ...]]
 
 
@@ -93,7 +93,7 @@ def build_drawings(
     tasks = []
     for k, item in enumerate(built):
         if item.set < len(recipe.drawings) and item.number < recipe.drawings[item.set]:
-            before = tuple(built[max(k - LOOKED_BACK, 0) : k][::-1])
+            before = tuple(built[max(k - LOOKBACK, 0) : k][::-1])
             given = [list(select_plans(one.item, plans)) for one in (item, *before)]
             for side in "ab":
                 tasks += [(DrawingItem(item, before, side, own), given, str(folder)) for own in (True, False)]

@@ -112,13 +112,13 @@ def _choose_walk_poses(walk: Walk, kind: str, room: int, rng: np.random.Generato
 MAPPED_KINDS = ("office", "hospital", "school", "hotel", "lab", "openplan", "apartment", "house")
 MAPPED_SENSORS = ("tls", "lidar", "depth", "laser2d", "tls")  # of the maps, in turn
 MAPPED_ROOMS = 14  # of a map, at most
-STRANGER = 5_000  # seeds further on: buildings without a map
+OTHER_BUILDING_SEEDS = 5_000  # seeds further on: buildings without a map
 
 
 def draw_building(split: str, number: int, negative: bool = False) -> tuple[Building, Array, np.random.Generator]:
     """Draw a building, the rooms that its map visits, and what draws the rest."""
     first, _ = get_seed_range(split)
-    seed = first + 40_000 + number + STRANGER * negative
+    seed = first + 40_000 + number + OTHER_BUILDING_SEEDS * negative
     rng = np.random.default_rng([seed, 54])
     building = make_building(MAPPED_KINDS[number % len(MAPPED_KINDS)], seed, 2 if number % 6 == 5 else 1)
     return building, sample_part(building, MAPPED_ROOMS, rng), rng

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from topomerge.datasets.pairs.evaluation_pair import LAID_IOU, measure_common_area
+from topomerge.datasets.pairs.evaluation_pair import SAME_ROOM_IOU, measure_common_area
 
 from topomerge.errors import InputError
 from topomerge.io.piece import OPTION_NAMES
@@ -397,8 +397,8 @@ def find_overlap(truth: PairTruth, maps: tuple[TopometricMap, TopometricMap]) ->
     rooms, fit = find_matches(pose, plans)
     if truth.rooms is not None:
         found = {(int(i), int(j)): float(value) for (i, j), value in zip(rooms, fit, strict=True)}
-        return RoomOverlap(pose, given, np.array([found.get((i, j), LAID_IOU) for i, j in truth.rooms]), common)
-    return RoomOverlap(pose, rooms[fit >= LAID_IOU], fit[fit >= LAID_IOU], common)
+        return RoomOverlap(pose, given, np.array([found.get((i, j), SAME_ROOM_IOU) for i, j in truth.rooms]), common)
+    return RoomOverlap(pose, rooms[fit >= SAME_ROOM_IOU], fit[fit >= SAME_ROOM_IOU], common)
 
 
 def _check_rooms(truth: PairTruth, given: Array, maps: Sequence[TopometricMap]) -> None:

@@ -94,8 +94,8 @@ def prepare_outputs(
         seen = replace(READERS[reader], kinds=tuple(SIMULATED_LANDMARKS[kind] for kind in kinds if kind != "wifi"))
         read = simulate_signs(building, simulated, seen, frame)
         if "wifi" in kinds:
-            heard = simulate_wifi(building, simulated, frame)
-            read = [join_landmarks(both) for both in zip(read, heard, strict=True)]
+            wifi = simulate_wifi(building, simulated, frame)
+            read = [join_landmarks(both) for both in zip(read, wifi, strict=True)]
         files += [(folder / f"{name}.landmarks.csv", partial(save_landmarks, of)) for name, of in zip(clouds, read, strict=True)]
     return files
 

@@ -112,8 +112,8 @@ def test_tasks_keep_their_runs_too(tmp_path, monkeypatch):
     monkeypatch.setattr(match_odds, "build_pair_evidence", lambda *_: pytest.fail("data was made"))
     with pytest.raises(InputError, match="holds a run"):
         train(compose_settings(words), quiet)
-    with pytest.raises(InputError, match=r"pull \(was 0.05, now 0.1\)"):
-        train(compose_settings([*words, "resume=true", "pull=0.1"]), quiet)
+    with pytest.raises(InputError, match=r"l2 \(was 0.05, now 0.1\)"):
+        train(compose_settings([*words, "resume=true", "l2=0.1"]), quiet)
 
 
 @pytest.mark.longer

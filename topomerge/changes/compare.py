@@ -112,7 +112,7 @@ def _find_splits(layers: StoreyLayers, whole: Array, parts: Array, walls: Sequen
 
 
 def _find_enclosed(
-    layers: StoreyLayers, own: Array, other: Array, walls: Sequence[WallChange], told: set[int]
+    layers: StoreyLayers, own: Array, other: Array, walls: Sequence[WallChange], reported: set[int]
 ) -> list[tuple[int, Array, float, float, dict[str, float]]]:
     """Rooms of one map whose ground the other one saw and in which none of its rooms lies, and whose border walls make that only
     the first one has: room, outline, m2, probability and evidence."""
@@ -121,7 +121,7 @@ def _find_enclosed(
     found, sizes = [], np.bincount(other[other >= 0], minlength=1)
     close = [(wall.probability, layers.rasterise(shapely.Polygon(wall.outline).buffer(BORDER))) for wall in walls]
     seen = (layers.new if own is layers.old.room else layers.old).free
-    for room in np.setdiff1d(np.unique(own[own >= 0]), sorted(told)).tolist():
+    for room in np.setdiff1d(np.unique(own[own >= 0]), sorted(reported)).tolist():
         mask = own == room
         area, share = float(mask.sum()) * CHANGE_CELL**2, float((mask & seen).sum() / mask.sum())
         inside = other[mask & (other >= 0)]
@@ -160,7 +160,7 @@ def _trace_box(layers: StoreyLayers, mask: Array) -> Array:
     return layers.compute_points(np.array([low, [high[0], low[1]], high, [low[0], high[1]]]))[:, :2]
 
 
-def _find_grown(layers: StoreyLayers, walls: Sequence[WallChange], told: tuple[set[int], set[int]]) -> list[RoomChange]:
+def _find_grown(layers: StoreyLayers, walls: Sequence[WallChange], reported: tuple[set[int], set[int]]) -> list[RoomChange]:
     """Rooms that won or lost ground to their neighbours because a wall between them was moved."""
     old, new, both = layers.old.room, layers.new.room, layers.both
     if not walls or not (old >= 0).any() or not (new >= 0).any():
@@ -171,7 +171,7 @@ def _find_grown(layers: StoreyLayers, walls: Sequence[WallChange], told: tuple[s
     tree = shapely.STRtree([shapely.Polygon(w.outline) for w in walls])
     found = []
     for r, n in enumerate(table.argmax(axis=1).tolist()):
-        if r in told[0] or n in told[1] or table[r, n] == 0 or int(table[:, n].argmax()) != r:
+        if r in reported[0] or n in reported[1] or table[r, n] == 0 or int(table[:, n].argmax()) != r:
             continue
         won, lost = both & (new == n) & (old != r), both & (old == r) & (new != n) & (new >= 0)
         mask = won if won.sum() > lost.sum() else lost

@@ -93,9 +93,9 @@ def check_cloud_options(
     if useless and all(is_map(path) for path in paths):
         name = next(iter(useless)).replace("_", "-")
         raise InputError(f"--{name}: is for clouds, of no use to a .tmap; give the scan that it was made of, or leave it out")
-    for name, (able, wanted, _) in SELECTIVE.items():
+    for name, (able, input_kind, _) in SELECTIVE.items():
         if hasattr(args, name) and not any(is_taker(path, name) for path in paths):
-            raise InputError(f"--{name.replace('_', '-')}: is for {able}; give such a {wanted}, or leave it out")
+            raise InputError(f"--{name.replace('_', '-')}: is for {able}; give such a {input_kind}, or leave it out")
 
 
 def collect_reading_options(path: str, args: argparse.Namespace) -> dict[str, Any]:

@@ -113,14 +113,14 @@ def score_pair(case: Case) -> Row:
         return row
     changes = compare_maps(maps[0], maps[1], placement)
     row |= {"align_s": aligned - began, "compare_s": process_time() - aligned, "m2": sum(changes.compared.values())}
-    reported = list_told(changes, pair)
+    reported = list_reported(changes, pair)
     row["groups"] = {name: score_kinds(reported, pair.changes, kinds) for name, kinds in GROUPS.items()}
     elements = [c.element for c in changes.changes]
     row["alarms"] = {e: elements.count(e) for e in ("wall", "door", "room", "furniture")}
     return row
 
 
-def list_told(changes: Changes, pair: ChangedPair) -> list[tuple[str, Array]]:
+def list_reported(changes: Changes, pair: ChangedPair) -> list[tuple[str, Array]]:
     """List kind and place (2,) m, in the building's coordinates, of what is said to have changed; what moved is gone and new."""
     back = pair.frames[0].inverse()
 
@@ -137,9 +137,9 @@ def list_told(changes: Changes, pair: ChangedPair) -> list[tuple[str, Array]]:
     return reported
 
 
-def score_kinds(told: Sequence[tuple[str, Array]], true: Sequence[TrueChange], kinds: Sequence[str]) -> list[int]:
+def score_kinds(reported: Sequence[tuple[str, Array]], true: Sequence[TrueChange], kinds: Sequence[str]) -> list[int]:
     """Count [right, told, found, true] of some kinds: of what is told, right or on something unseen; of what was seen, found."""
-    own = [at for kind, at in told if kind in kinds]
+    own = [at for kind, at in reported if kind in kinds]
     real = [t for t in true if TRUTH_KINDS.get(t.kind, t.kind) in kinds]
     apart = np.array([[shapely.distance(t.outline, shapely.Point(at)) for t in real] for at in own]).reshape(len(own), len(real))
     right, unjudged, taken = 0, 0, set()

@@ -47,8 +47,8 @@ class Stamp:
 
     def write_comment(self) -> str:
         """Write the stamp as the comment that `read_stamp` reads."""
-        made = f"made by `{self.command}`; code {self.code} of {', '.join(self.modules)}; data {self.data}"
-        return f"<!-- {'; '.join(filter(None, (made, self.confirmed)))} -->"
+        origin = f"made by `{self.command}`; code {self.code} of {', '.join(self.modules)}; data {self.data}"
+        return f"<!-- {'; '.join(filter(None, (origin, self.confirmed)))} -->"
 
 
 def build_stamp(command: str, modules: Iterable[str], inputs: Iterable[str] = (), confirmed: str = "") -> Stamp:

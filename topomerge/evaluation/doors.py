@@ -32,7 +32,7 @@ from topomerge.types import Array, LogFn, TopometricMap
 MAKERS = ("topomerge.extraction.extract", "topomerge.metrics", "topomerge.evaluation.scans")
 DOOR_SEEDS, TRAINING = 800_720, 5_700  # first seeds
 FRAMES = 0.7  # share of the doors with frames and handles
-STATES, SAID = ("open", "half", "shut"), ("right", "said", "said half")
+STATES, ANSWERS = ("open", "half", "shut"), ("right", "said", "said half")
 SHOWN_BY = PLAN, WALLS = "plan", "plan and walls"
 
 DOOR_COLUMNS: tuple[str, ...] = ("sensor", "doors by", "true doors", *STATES)
@@ -87,9 +87,9 @@ def score_doors(case: Case, scan: Scan, how: str) -> Row:
         own = requested & (state == name)
         row[name] = [int((present & own).sum()), int(own.sum())]
     row["right"] = [verdict.doors.right, verdict.doors.extracted]
-    said_shut = ~edges["open"] & ~find_looked_into(map, edges)
-    said_half = edges["half"] & ~find_looked_into(map, edges)
-    for name, predicted, true in (("said", said_shut, "shut"), ("said half", said_half, "half")):
+    predicted_shut = ~edges["open"] & ~find_looked_into(map, edges)
+    predicted_half = edges["half"] & ~find_looked_into(map, edges)
+    for name, predicted, true in (("said", predicted_shut, "shut"), ("said half", predicted_half, "half")):
         really = np.zeros(len(edges), bool)
         really[pairs[:, 1]] = state[pairs[:, 0]] == true
         row[name] = [int((predicted & really).sum()), int(predicted.sum())]
@@ -116,10 +116,10 @@ def tabulate(rows: Sequence[Row], settings: TaskSettings) -> dict[str, str]:
     for sensor in (*dict.fromkeys(r["sensor"] for r in rows), "all"):
         for how in SHOWN_BY:
             some = [r for r in rows if r["how"] == how and sensor in (r["sensor"], "all")]
-            total = {name: np.sum([r[name] for r in some], axis=0).tolist() for name in (*STATES, *SAID)}
+            total = {name: np.sum([r[name] for r in some], axis=0).tolist() for name in (*STATES, *ANSWERS)}
             edges = np.nanmean([r["edges"] for r in some], axis=0)
             rest = [*edges, np.mean([r["iou"] for r in some]), np.mean([r["seconds"] for r in some])]
             count = sum(total[name][1] for name in STATES)
-            shares = [write_share(total[name]) for name in (*STATES, *SAID)]
+            shares = [write_share(total[name]) for name in (*STATES, *ANSWERS)]
             lines.append([sensor, how, count, *shares, *(f"{v:.2f}" for v in rest)])
     return {"doors": f"{len(rows) // len(SHOWN_BY)} maps.\n\n{write_table(DOOR_COLUMNS, lines)}"}

@@ -316,9 +316,9 @@ def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
         edits = [row["edits"], f"{row['edits_a_room']:.2f}", *counts, f"{row['minutes']:.1f}"]
         lines.append([row["kind"], row["true_rooms"], *ious, *doors, *edits])
     minutes = sum(row["minutes"] for row in rows)
-    rooms, edits_made = (sum(row[name] for row in rows) for name in ("true_rooms", "edits"))
+    rooms, n_edits = (sum(row[name] for row in rows) for name in ("true_rooms", "edits"))
     text = (
-        f"{len(rows)} maps with {rooms} true rooms: {edits_made} edits, {edits_made / max(rooms, 1):.2f} a room "
+        f"{len(rows)} maps with {rooms} true rooms: {n_edits} edits, {n_edits / max(rooms, 1):.2f} a room "
         f"(mean over maps {write_mean(rows, 'edits_a_room')}), {minutes:.1f} minutes. "
         f"Mean IoU {write_mean(rows, 'iou_before')} before and {write_mean(rows, 'iou_after')} after."
     )

@@ -38,7 +38,7 @@ PRIOR = {
     "own other half": 0.03,
     "other look-alikes": 0.04,
 }
-MADE_ALIKE = {
+LOOKALIKE_NAMES = {
     "modules": "repeated modules",
     "shifted-row": "repeated modules",
     "mirror": "own mirror image",
@@ -68,7 +68,7 @@ def classify_negative(row: Row) -> str:
     Look-alikes are all in, as those that share rooms must not merge a period away.
     """
     if row.get("lookalike"):
-        return MADE_ALIKE.get(row["lookalike"], "other look-alikes")
+        return LOOKALIKE_NAMES.get(row["lookalike"], "other look-alikes")
     if row["kind"] == "overlap":
         return "no room in common" if classify_pair(row).startswith("none") else ""
     if row["kind"] in ("strangers", "other-building"):

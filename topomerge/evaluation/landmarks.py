@@ -314,8 +314,8 @@ def read_landmarks(item: LookalikeItem, reading: Reader | RadioSettings | None) 
     return (Landmarks(), Landmarks()) if reading is None else read_lookalike_signs(item, reading)
 
 
-def _register_pair(pair: GridPair, told: tuple[Landmarks, Landmarks]) -> Row:
-    a, b = (build_bare_map(g, f, t) for g, f, t in zip((pair.a, pair.b), pair.free, told, strict=True))
+def _register_pair(pair: GridPair, landmarks: tuple[Landmarks, Landmarks]) -> Row:
+    a, b = (build_bare_map(g, f, t) for g, f, t in zip((pair.a, pair.b), pair.free, landmarks, strict=True))
     with limit_threads():
         registration = register(a, b)
     pose: Any = registration.transform
@@ -473,14 +473,14 @@ def tabulate_readers(rows: Sequence[Row]) -> str:
             mine = scored[(scored[:, 0] == height) & (scored[:, 1] == angle)]
             if not len(mine):
                 continue
-            told = mine[mine[:, 3] > 0]
-            alike, unlike, gaps = told[:, 4:].sum(axis=0)
-            right = int((told[:, 4:].sum(axis=1) == 0).sum())
+            readings = mine[mine[:, 3] > 0]
+            alike, unlike, gaps = readings[:, 4:].sum(axis=0)
+            right = int((readings[:, 4:].sum(axis=1) == 0).sum())
             low, high = compute_exact_interval(right, len(mine))
             wrong = alike + unlike + gaps
             shares = [f"{100 * part / wrong:.0f} %" if wrong else "–" for part in (alike, gaps)]
-            error = f"{wrong / told[:, 2].sum():.3f}" if len(told) else "–"
+            error = f"{wrong / readings[:, 2].sum():.3f}" if len(readings) else "–"
             lines.append(
-                [height, f"{angle:.0f}°", len(mine), len(mine) - len(told), right, f"{low:.2f}–{high:.2f}", error, *shares]
+                [height, f"{angle:.0f}°", len(mine), len(mine) - len(readings), right, f"{low:.2f}–{high:.2f}", error, *shares]
             )
     return write_table(SIGN_HEADS, lines)

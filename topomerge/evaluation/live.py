@@ -123,10 +123,10 @@ def judge_event(event: Row, robots: Sequence[tuple[str, int, Sim3, Any]]) -> Row
     if "matrix" not in event:
         return row
     matrix, true = np.array(event["matrix"]), frame_a @ frame_b.inverse()
-    told = Sim3(float(np.arctan2(matrix[1, 0], matrix[0, 0])), tuple(matrix[:3, 3].tolist()))
+    published = Sim3(float(np.arctan2(matrix[1, 0], matrix[0, 0])), tuple(matrix[:3, 3].tolist()))
     middle = np.mean([pose[:3, 3] for _, pose, _ in scans_b], axis=0)[None]
-    away = float(np.linalg.norm(told.apply(middle) - true.apply(middle)))
-    right = one == two and away < RIGHT[0] and abs(wrap_yaw(told.yaw - true.yaw)) < RIGHT[1]
+    away = float(np.linalg.norm(published.apply(middle) - true.apply(middle)))
+    right = one == two and away < RIGHT[0] and abs(wrap_yaw(published.yaw - true.yaw)) < RIGHT[1]
     return {**row, "away": away, "right": bool(right)}
 
 
@@ -138,14 +138,14 @@ def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
         for pair, together in row["together"].items():
             own = [e for e in row["events"] if e["pair"] == pair]
             joined = next((e for e in own if e.get("right")), None)
-            told = next((t for t, of in row["areas"] if of[pair] >= least), None) if together else None
+            tellable = next((t for t, of in row["areas"] if of[pair] >= least), None) if together else None
             ends = [e for e in own if e.get("right") or e["event"] == "parted"]
             wrong = [(e, next((f["time"] for f in ends if f["time"] > e["time"]), None)) for e in own if e.get("right") is False]
             lines.append([
                 f"{row['name']}, {row['robots']} robots", pair[0] + ", " + pair[1], "one" if together else "two",
-                f"{row['areas'][-1][1][pair]:.0f}" if together else "–", "–" if told is None else f"{told:.0f}",
+                f"{row['areas'][-1][1][pair]:.0f}" if together else "–", "–" if tellable is None else f"{tellable:.0f}",
                 "–" if joined is None else f"{joined['time']:.0f}",
-                "–" if joined is None or told is None else f"{max(joined['time'] - told, 0.0):.0f}",
+                "–" if joined is None or tellable is None else f"{max(joined['time'] - tellable, 0.0):.0f}",
                 ", ".join("to the end" if gone is None else f"{gone - e['time']:.0f} s" for e, gone in wrong) or "none",
                 f"{row['end']:.0f}", f"{100 * (row['robots'] * RATE * row['add'] + row['update']):.0f}",
             ])  # fmt: skip

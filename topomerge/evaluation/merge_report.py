@@ -369,8 +369,8 @@ def tabulate_own(rows: Sequence[Row]) -> str:
     for r in sorted(rows, key=lambda r: (r["kind"] != "overlap", r["pair"])):
         off = ["–", "–"] if r["err"] is None else [f"{r['err'][0]:.2f}", f"{r['err'][2]:.1f}"]
         verdict = "two places" if r["kind"] != "overlap" else "right" if r["right"] else "wrong"
-        said_so = f"{r['probability']:.2f}{' believed' if r['believed'] else ''}"
-        lines.append([r["pair"], f"{r['common']:.0f}", verdict, said_so, *off, f"{r['seconds']:.1f}"])
+        probability = f"{r['probability']:.2f}{' believed' if r['believed'] else ''}"
+        lines.append([r["pair"], f"{r['common']:.0f}", verdict, probability, *off, f"{r['seconds']:.1f}"])
     return f"{warnings}\n\n{write_table(('pair', 'm² in common', 'pose', 'probability', 'off m', 'off °', 's'), lines)}"
 
 

@@ -237,8 +237,13 @@ def tabulate_left_out(rows: Sequence[Row]) -> str:
         if not of:
             continue
         values = np.concatenate([np.array(v, float).reshape(-1, 2) for v in of[0]["verdicts"].values()])
-        told = 1 / (1 + np.exp(-values[:, 0]))
-        cells = [len(values), f"{measure_log_loss({'all': values}):.3f}", f"{told.mean():.2f}", f"{values[:, 1].mean():.2f}"]
+        probability = 1 / (1 + np.exp(-values[:, 0]))
+        cells = [
+            len(values),
+            f"{measure_log_loss({'all': values}):.3f}",
+            f"{probability.mean():.2f}",
+            f"{values[:, 1].mean():.2f}",
+        ]
         for walks in WALKS[:2]:
             trials = np.array(of[walks]["trials"], float)
             z = np.sqrt(np.mean(trials[:, 0] ** 2 / trials[:, 2] ** 2))

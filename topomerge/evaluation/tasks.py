@@ -240,8 +240,8 @@ def measure_missing(
             for name in [name for name in older if name not in rows]:
                 keep(older[name] | {"code": code, "confirmed": len(sample)})
         elif older:
-            said = f"; {unlike[0]} came out otherwise" if unlike else ""
-            log_line(f"{len(older)} rows are of another state of the code and are measured again{said}")
+            unlike_row = f"; {unlike[0]} came out otherwise" if unlike else ""
+            log_line(f"{len(older)} rows are of another state of the code and are measured again{unlike_row}")
         measure(items)
     return [rows[name] for name in items]
 

@@ -186,8 +186,8 @@ def voxelise(
     cells, counts, sums = lattice.get_cells()
     if not len(cells):
         raise InputError("no finite point: nothing to voxelise")
-    for told_apart in (select_without_strays, select_largest_place):
-        kept, warning = told_apart(cells, counts, edge)
+    for separate in (select_without_strays, select_largest_place):
+        kept, warning = separate(cells, counts, edge)
         if warning:
             warn(warnings, warning)
             cells, counts, sums = cells[kept], counts[kept], sums[kept]

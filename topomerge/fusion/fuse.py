@@ -86,22 +86,22 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
     order = sorted(range(len(poses)), key=lambda n: parts[n].assumed)  # what was assumed comes last
     placements = [Placement.of(pose, (bends or {}).get(k), maps[k].grid.edge) for k, pose in poses]
     windows, marks = [], {}
-    laid: list[PlacedPart] = []
+    placed_parts: list[PlacedPart] = []
     floors: list[tuple[TopometricMap, PlacedCells]] = []
     for n in order:
         map = maps[poses[n][0]]
-        first_room = sum(len(part.table) for part in laid)
+        first_room = sum(len(part.table) for part in placed_parts)
         placed = cells.place_cells(map, placements[n])
         cells.add_map(map, placements[n], placed, int(first_bits[n]), first_room, parts[n].assumed and n != order[0])
         floors.append((map, placed[2]))
         windows.append(transform_windows(map, placements[n]))
-        laid.append(transform_part(map, placements[n]))
+        placed_parts.append(transform_part(map, placements[n]))
         if len(map.landmarks):
-            marks[n] = transform_part_landmarks(map, placements[n], laid[-1].rooms)
+            marks[n] = transform_part_landmarks(map, placements[n], placed_parts[-1].rooms)
     name = JOINED.join(maps[k].source or "map" for k, _ in poses)
-    rooms = [part.rooms for part in laid]
-    joined = _build_joined(cells, floors, laid, name)
-    joined = add_joined_windows(add_part_doors(add_part_odds(joined, rooms), laid), windows)
+    rooms = [part.rooms for part in placed_parts]
+    joined = _build_joined(cells, floors, placed_parts, name)
+    joined = add_joined_windows(add_part_doors(add_part_odds(joined, rooms), placed_parts), windows)
     if marks:
         joined = add_joined_landmarks(joined, marks, [maps[k].title for k, _ in poses])
     first = maps[poses[0][0]].levelling
@@ -246,12 +246,12 @@ class _JoinedCells:
 
 
 def _build_joined(
-    joined: _JoinedCells, laid: Sequence[tuple[TopometricMap, PlacedCells]], parts: Sequence[PlacedPart], name: str
+    joined: _JoinedCells, placed_cells: Sequence[tuple[TopometricMap, PlacedCells]], parts: Sequence[PlacedPart], name: str
 ) -> TopometricMap:
     """Rooms and narrowings of what was joined, and doors where rooms were cut anew.
 
     Args:
-        laid: the maps, with the cells that their floor fills.
+        placed_cells: the maps, with the cells that their floor fills.
         parts: the same maps as they lie in the joined one.
     """
     cells = decode_cells(joined.codes)
@@ -260,7 +260,7 @@ def _build_joined(
     grid = VoxelGrid.from_cells(cells - base, joined.origin + base * joined.edge, joined.edge, properties=tables)
     provenance, label = grid.properties["provenance"], grid.properties["room"]
     grid = replace(grid, properties={})
-    floors = [select_part_floor(map, lattice - base, rows, grid) for map, (lattice, rows) in laid]
+    floors = [select_part_floor(map, lattice - base, rows, grid) for map, (lattice, rows) in placed_cells]
     if any(len(floor.cells) for floor in floors):
         map = _carry_rooms(grid, label, floors, parts)
         map = replace(map, source=name)

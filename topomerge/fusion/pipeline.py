@@ -354,8 +354,8 @@ def _join(result: MergeResult) -> MergeResult:
         pose = poses[m] if k == 0 else poses[k].inverse() @ poses[m]
         sure = 1.0 if result.decided.get((k, m)) is not None else result.probability
         matches += _iter_room_matches(result.maps, (k, m), pose, sure, result.bends)
-    told = tuple(w for w in joined.warnings if w.startswith(CONTRADICTING))
-    return replace(result, matches=tuple(matches), map=joined, warnings=(*result.warnings, *told))
+    contradictions = tuple(w for w in joined.warnings if w.startswith(CONTRADICTING))
+    return replace(result, matches=tuple(matches), map=joined, warnings=(*result.warnings, *contradictions))
 
 
 def _iter_room_matches(

@@ -33,7 +33,7 @@ from topomerge.types import Array, Landmarks, join_landmarks
 JUDGED_FLOOR = 4.0  # m2 of floor below which nothing is judged
 OUTSIDE_SHARE = 1 / 3  # of the floor: more outside of every wall is suspicious; of real maps that are read rightly up to .26 is
 FEW_WALLS = 4  # of 8 directions in which a place outside of the walls meets one, at most
-PIXELS_LOOKED_AT = 4_000_000  # of a larger picture every second, third ... pixel
+SAMPLED_PIXELS = 4_000_000  # of a larger picture every second, third ... pixel
 BODY_RADIUS = 0.25  # m; floor where no body fits is no floor but the lines of walls
 LEAST_DOORWAY, DOOR_STEP = 0.05, 0.06  # probability of a door; m between places of it, at most
 SLAB = 0.3  # m between the walls of a drawn storey and the next floor
@@ -50,7 +50,7 @@ def is_inverted(occupied: Array, free: Array, resolution: float) -> bool:
     """
     if occupied.sum() <= free.sum() or not free.any():  # there is more floor than walls
         return False
-    step = max(1, math.ceil(math.sqrt(occupied.size / PIXELS_LOOKED_AT)))
+    step = max(1, math.ceil(math.sqrt(occupied.size / SAMPLED_PIXELS)))
     occupied, free, resolution = occupied[::step, ::step], free[::step, ::step], resolution * step
     if not (occupied.any() and free.any()):
         return False
@@ -82,7 +82,7 @@ def measure_outside_share(occupied: Array, free: Array) -> float:
     Args:
         occupied, free: (h, w) bool.
     """
-    step = max(1, math.ceil(math.sqrt(occupied.size / PIXELS_LOOKED_AT)))
+    step = max(1, math.ceil(math.sqrt(occupied.size / SAMPLED_PIXELS)))
     if step > 1:  # no wall may be lost, or it would not enclose anything
         padded = np.pad(occupied, [(0, -side % step) for side in occupied.shape])
         rows, columns = padded.shape
@@ -114,7 +114,7 @@ MODES = ("trinary", "scale", "raw")
 JPEG_MAGIC = b"\xff\xd8\xff"
 MOST_PAGES = 100  # of a TIFF that are counted
 NOISE_SHARE = 0.05  # of the floor: less in a picture without loss are edges that somebody smoothed, and stay
-TOLD_SHARE = 0.01  # of the floor: more noise around the grey of unknown is told
+NOISE_SHARE = 0.01  # of the floor: more noise around the grey of unknown is told
 
 
 @dataclass(frozen=True)
@@ -425,7 +425,7 @@ def _remove_unknown(
     noise = 1.0 - known.sum() / max(int(free.sum()), 1)
     if not (is_floor or lossy or (noise >= NOISE_SHARE and is_clear_cut(grey, levels[free]))):
         return free, ""
-    if not is_floor and noise < TOLD_SHARE:
+    if not is_floor and noise < NOISE_SHARE:
         return known, ""
     what = "its grey of unknown" if is_floor else f"noise of {noise:.0%} of the floor around its grey of unknown"
     where = path.name if path != plan.image else "a map_server yaml"

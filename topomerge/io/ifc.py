@@ -24,7 +24,7 @@ from topomerge.io.mesh import sample
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_in_subprocess
 from topomerge.types import LANDMARK_KINDS, Array, Landmarks, TrueRoom
 
-NOT_SAID = re.compile(rb"'[^']*'|/\*.*?\*/", re.DOTALL)  # strings and comments
+LITERALS = re.compile(rb"'[^']*'|/\*.*?\*/", re.DOTALL)  # strings and comments
 STATEMENT = re.compile(rb"#(\d+)\s*=\s*([^;]*)")
 ENTITY_REFERENCE = re.compile(rb"#(\d+)")
 DEEPEST = 5000  # references one behind the other; models of buildings have 15
@@ -74,7 +74,7 @@ def parse_references(text: bytes) -> tuple[Array, Array, int]:
 
     What does not exist is left out, and what boundaries of spaces say of each other.
     """
-    text = NOT_SAID.sub(b"", text)
+    text = LITERALS.sub(b"", text)
     statements = [(match[1], match[2]) for match in STATEMENT.finditer(text)]
     row = {name: i for i, (name, _) in enumerate(statements)}
     paired = {name for name, statement in statements if PAIRED.match(statement)}

@@ -68,21 +68,21 @@ def read_tables_beside(path: Path, poses: str | None, suffixes: Sequence[str]) -
     """
 
     readers = {TABLE_NAME: read_landmark_file, RADIO_TABLE: lambda table: read_radio_beside(table, path, poses)}
-    found, told = [], []
+    found, warnings = [], []
     for name, read in readers.items():
         table, shared = _find_table(path, name), _find_shared_table(path, name)
         if table is None and shared is not None:
             if _is_alone(path, suffixes):
                 table = shared
             else:
-                told.append(
+                warnings.append(
                     f"{shared}: lies beside several files and was not read; name it {path.stem}.{name} if it is this one's"
                 )
         if table is not None:
             found.append(read(table))
             if lost := count_lost(found[-1]):
-                told.append(f"{table}: {lost} landmark{'s' * (lost != 1)} without a place, a room and a storey; say where")
-    return found, told
+                warnings.append(f"{table}: {lost} landmark{'s' * (lost != 1)} without a place, a room and a storey; say where")
+    return found, warnings
 
 
 def _find_shared_table(path: Path, name: str) -> Path | None:

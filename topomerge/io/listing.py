@@ -39,7 +39,7 @@ from topomerge.io.landmarks import serialise_landmarks
 from topomerge.types import EDITED, LANDMARK_KINDS, ROOM_ODDS, Landmarks, TopometricMap, find_room_names
 
 LISTING_FORMAT = 1
-EDGE_FACTS = ("kind", "open", "half", "confidence", "lower", "upper")
+EDGE_FIELDS = ("kind", "open", "half", "confidence", "lower", "upper")
 DIGITS = 6  # micrometres: the digits behind are noise
 
 
@@ -97,7 +97,7 @@ def convert_map_to_json(map: TopometricMap) -> dict[str, Any]:
 
 def _build_edge_entry(edge: Any, ends: str) -> dict[str, Any]:
     door = {name: edge[name] for name in ("centre", "width", "height", "direction")}
-    return {ends: edge["rooms"], "door": door, **{name: edge[name] for name in EDGE_FACTS}}
+    return {ends: edge["rooms"], "door": door, **{name: edge[name] for name in EDGE_FIELDS}}
 
 
 def _build_window_entry(window: Any) -> dict[str, Any]:

@@ -148,8 +148,8 @@ class Gatherer:
             self.warnings.append(f"{self.dropped:,} points were not finite and are left out")
         self.warnings += warn_about(self.sample.points, self.up)
         found = join_landmarks([*self.landmarks, self.objects.find_objects("classes of points")])
-        told = tuple(dict.fromkeys(self.warnings))
-        yield replace(self.pending, warnings=told, landmarks=found if len(found) else None, drawn_doors=self.drawn_doors)
+        warnings = tuple(dict.fromkeys(self.warnings))
+        yield replace(self.pending, warnings=warnings, landmarks=found if len(found) else None, drawn_doors=self.drawn_doors)
 
     def _update_metadata(self, piece: Piece) -> None:
         """Keep what a piece says about the whole file."""
@@ -194,7 +194,7 @@ class Gatherer:
 
 
 Block = TypeVar("Block")
-MOST_FILES_LOOKED_AT = 1000  # in a folder that can't be read
+MOST_FILES_LISTED = 1000  # in a folder that can't be read
 MESSAGE_LETTERS = 500  # of a message beside the path, at most: what it quotes of a damaged file may be long
 log = logging.getLogger(__name__)
 
@@ -410,7 +410,7 @@ def iter_guarded(path: Path, file_format: Format, blocks: Callable[[Any], Iterat
 def _refuse_pointers_in(folder: Path) -> None:
     """Refuse a folder that can't be read since files in it are pointers of Git LFS."""
     if folder.is_dir():
-        for file in itertools.islice(folder.rglob("*"), MOST_FILES_LOOKED_AT):
+        for file in itertools.islice(folder.rglob("*"), MOST_FILES_LISTED):
             if file.is_file():
                 refuse_pointer(file)
 

@@ -142,10 +142,10 @@ def _iter_cells(path: Path) -> Iterator[dict[str, Any]]:
 
 def _read_landmark(state: Any) -> dict[str, Any] | None:
     texts = {_get_name(part): part.text or "" for part in state}
-    facts = dict(re.findall(r'(\w+)="([^"]*)"', texts.get("description", "")))
-    if facts.get("kind") not in LANDMARK_KINDS:
+    fields = dict(re.findall(r'(\w+)="([^"]*)"', texts.get("description", "")))
+    if fields.get("kind") not in LANDMARK_KINDS:
         return None
-    return {**facts, "value": texts.get("name", "").strip(), "position": _find_middle(state)}
+    return {**fields, "value": texts.get("name", "").strip(), "position": _find_middle(state)}
 
 
 def _read_cell(cell: Any, points: Mapping[str, Any]) -> dict[str, Any] | None:

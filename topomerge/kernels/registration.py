@@ -148,7 +148,7 @@ def tally(points, kinds, facing, inner, filled, kind, to_wall, to_any, face, ope
         y = int(np.floor((size * (s * points[i, 0] + c * points[i, 1]) + pose[1] - origin[1]) / cell))
         if x < 1 or y < 1 or x >= kind.shape[0] - 1 or y >= kind.shape[1] - 1:
             continue
-        there = kind[x, y]
+        cell_kind = kind[x, y]
         if what == WALL_STATE:
             if to_wall[x, y] <= near:
                 fx, fy = c * facing[i, 0] - s * facing[i, 1], s * facing[i, 0] + c * facing[i, 1]
@@ -158,16 +158,16 @@ def tally(points, kinds, facing, inner, filled, kind, to_wall, to_any, face, ope
                     out[1] += 1
                 else:
                     out[2] += 1
-            elif there != 0:
+            elif cell_kind != 0:
                 out[0] += 1
-                if there == FREE_STATE and to_any[x, y] >= far:
+                if cell_kind == FREE_STATE and to_any[x, y] >= far:
                     out[3] += 1
             continue
-        if there == 0:
+        if cell_kind == 0:
             continue
         if what == FREE_STATE:
             out[4] += 1
-            out[5] += there == FREE_STATE
+            out[5] += cell_kind == FREE_STATE
         if not inner[i] or not open_[x, y]:
             continue
         close = 0.0

@@ -3,7 +3,7 @@
 Where both maps read something at one place, `likelihood` weighs it. Besides:
 
 - A rare string that both maps read at two places far from each other under the pose speaks for another pose, unless it points
-  there (`POINTS_THERE`).
+  there (`MISPLACED`).
 - A sign that the other map could have seen and did not read says little (`READS`): doors that look alike bear some, too.
 - A tag that one map has and the other one, which saw the place, has not speaks for another place (`score_missed`).
 """
@@ -110,7 +110,7 @@ READS = 0.6  # probability that a map that reads as many signs as the other one 
 MOST_UNREAD = 1.0  # log odds that unread signs may cost in all
 # Shares of the tags in sight that a map may have, alike likely: so a reader that finds most is likelier than one that finds few.
 RATES = np.sqrt((np.arange(10) + 0.5) / 10)
-POINTS_THERE = 0.1  # probability that a rare string far from its place points there, or was put in a wrong place
+MISPLACED = 0.1  # probability that a rare string far from its place points there, or was put in a wrong place
 FAR, MOST_FAR = 6.0, 6.0  # m beyond which two places are two, and log odds that such strings may give in all
 RARE = 0.01  # share of the signs, below which a string names one place
 SEEN_AROUND, SEEN_WITHIN = 1.5, 0.6  # m around a landmark of its own map's cells, and of those of the other map from these
@@ -333,7 +333,7 @@ def score_sightings(scorer: LandmarkScorer, pose: Sim3, bends: Bends, kind: str)
         prefixes = compute_prefix_factors(a, b, met, at)
         factors = {name: v + prefixes[name] for name, v in factors.items()}
     far = find_far_partners(a, b, at, met, kind)
-    factors["elsewhere"] += min(len(far) * float(-np.log(POINTS_THERE)), MOST_FAR)
+    factors["elsewhere"] += min(len(far) * float(-np.log(MISPLACED)), MOST_FAR)
     unread = count_unread(scorer, at, met, pose, (a, b)) if kind == "text" else 0.0
     for name in ("elsewhere", "building", "outside"):
         factors[name] += unread

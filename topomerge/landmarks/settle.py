@@ -127,7 +127,7 @@ def _sample(points: Array) -> Array:
 
 
 def _list_signs(
-    map: TopometricMap, into: Sim3, other: cKDTree, number: int, told: set[int], posterior: Mapping[str, float]
+    map: TopometricMap, into: Sim3, other: cKDTree, number: int, reported: set[int], posterior: Mapping[str, float]
 ) -> list[Observation]:
     """Signs of a map that the other one could show and does not."""
     signs = build_sightings(map, ("text", "name"))
@@ -137,7 +137,7 @@ def _list_signs(
         if (
             signs.share[k] > RARE
             or signs.sigma[k] > 2.0
-            or int(signs.rows[k]) in told
+            or int(signs.rows[k]) in reported
             or not np.isfinite(signs.position[k]).all()
         ):
             continue

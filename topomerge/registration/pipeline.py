@@ -306,8 +306,8 @@ class _Pair:
             return 0.0
         tell_step(0.4, "bend the maps under the best poses and judge them")
         self.looked = build_candidates(self.a, self.b, self.ranked, self.scaled, self.bent, self.scorer)
-        seen, told = [c.features for c in self.looked], [c.landmarks for c in self.looked]
-        self.verdict = compute_verdict(seen, self.looked[0].compute_all_features(), same, told)
+        seen, evidence = [c.features for c in self.looked], [c.landmarks for c in self.looked]
+        self.verdict = compute_verdict(seen, self.looked[0].compute_all_features(), same, evidence)
         self.clock.lap("bend")
         return self.verdict.each[0]
 
@@ -358,8 +358,8 @@ def _build_registration(ranked: Sequence[PoseHypothesis], examined: Sequence[Can
             lag = max(ranked[0].score - h.score, best.odds - last)
             others.append(replace(h, score=best.odds - lag, probability=float(probability * np.exp(-lag))))
     pose, alternatives = best.bend.transform, tuple(others[:ALTERNATIVES])
-    told = {"posterior": verdict.posterior, "landmarks": best.landmarks, "walls": verdict.walls}
-    return Registration(pose, probability, accepted, features, alternatives, reason, places=best.places, **told)  # type: ignore[arg-type]
+    evidence = {"posterior": verdict.posterior, "landmarks": best.landmarks, "walls": verdict.walls}
+    return Registration(pose, probability, accepted, features, alternatives, reason, places=best.places, **evidence)  # type: ignore[arg-type]
 
 
 def refine_by_surfaces(a: Prepared, b: Prepared, start: Sim3, scaled: bool = False) -> tuple[Sim3, float]:
@@ -381,5 +381,5 @@ def _invert_registration(registration: Registration) -> Registration:
     seen = registration.places
     if seen is not None and registration.transform is not None:
         seen = seen.inverse(registration.transform)
-    told = registration.landmarks.inverse()
-    return replace(registration, transform=transform, alternatives=others, bend=bent, places=seen, landmarks=told)
+    evidence = registration.landmarks.inverse()
+    return replace(registration, transform=transform, alternatives=others, bend=bent, places=seen, landmarks=evidence)

@@ -363,12 +363,12 @@ def build_plan_structure(map: TopometricMap) -> PlanStructure:
     look away
     from each other, no more than 0.6 m apart, are a wall; the other faces are walls of which one side was seen.
     """
-    if map not in _MADE:
-        _MADE[map] = _compute_structure(map)
-    return _MADE[map]
+    if map not in _structures:
+        _structures[map] = _compute_structure(map)
+    return _structures[map]
 
 
-_MADE: WeakKeyDictionary[TopometricMap, PlanStructure] = WeakKeyDictionary()  # several formats need it
+_structures: WeakKeyDictionary[TopometricMap, PlanStructure] = WeakKeyDictionary()  # several formats need it
 
 
 def _compute_structure(map: TopometricMap) -> PlanStructure:

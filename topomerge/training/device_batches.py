@@ -67,11 +67,11 @@ def pad_structure(s: Structure, shape: BatchShape) -> Structure:
     Rooms that come again leave the statistics of a batch much as they were; zeros would not.
     """
     rooms, edges = shape.rooms - len(s.room), shape.edges - len(s.edge)
-    again, first = np.arange(rooms) % len(s.room), np.zeros(edges, np.int64)
+    repeated, first = np.arange(rooms) % len(s.room), np.zeros(edges, np.int64)
     edge_index = np.concatenate([s.edge_index, np.full((2, edges), shape.rooms - 1)], axis=1)
-    edge_part = np.full(edges, s.room_part[again[-1]])
+    edge_part = np.full(edges, s.room_part[repeated[-1]])
     return replace(
-        s, room=np.concatenate([s.room, s.room[again]]), room_part=np.concatenate([s.room_part, s.room_part[again]]),
+        s, room=np.concatenate([s.room, s.room[repeated]]), room_part=np.concatenate([s.room_part, s.room_part[repeated]]),
         true=np.concatenate([s.true, np.full(rooms, -1)]), clear=np.concatenate([s.clear, np.zeros(rooms, bool)]),
         edge=np.concatenate([s.edge, first]), edge_part=np.concatenate([s.edge_part, edge_part]), edge_index=edge_index,
     )  # fmt: skip

@@ -41,7 +41,7 @@ from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.numpy_nn import apply_mlp, sigmoid
 from topomerge.training.loop import NetworkJob, State, derive_seed, descend_gradient, run_network
 from topomerge.training.packed_pairs import number_buildings, read_scan_building
-from topomerge.training.processes import let_chief_first
+from topomerge.training.processes import let_main_process_first
 from topomerge.training.scan_settings import DoorClassification
 from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
@@ -58,7 +58,7 @@ def fit(settings: DoorClassification, log_line: LogFn) -> dict[str, float]:
     Raises:
         InputError: no scan to train on or to watch.
     """
-    with let_chief_first(settings):
+    with let_main_process_first(settings):
         x, y, building = build_door_examples(settings.data, settings, log_line)
     watched = building % settings.hold_out == 0
     if len(np.unique(y[~watched])) < 2 or len(np.unique(y[watched])) < 2:

@@ -18,7 +18,7 @@ from topomerge.networks.drawing import DRAWING_CLASSES, DRAWING_FILE, DRAWING_SI
 from topomerge.networks.network import Run, load_network
 from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, prefetch_batches, run_network
 from topomerge.training.plan_segmentation import compute_log_loss
-from topomerge.training.processes import let_chief_first
+from topomerge.training.processes import let_main_process_first
 from topomerge.training.scan_settings import DrawingSegmentation
 from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
@@ -33,7 +33,7 @@ def fit(settings: DrawingSegmentation, log_line: LogFn) -> dict[str, float]:
     Raises:
         InputError: no plan to draw.
     """
-    with let_chief_first(settings):
+    with let_main_process_first(settings):
         stream = PageStream(settings.data, settings.cache, (settings.seed, TRAINED), settings.crop, settings.jobs, log_line)
     try:
         watched = draw_pages(settings.watched, settings, WATCHED, log_line)

@@ -24,7 +24,7 @@ from topomerge.matching.match import match
 from topomerge.numpy_nn import sigmoid
 from topomerge.statistics import measure_calibration
 from topomerge.training.closed_form import FitResult, run_fit
-from topomerge.training.match_odds import STRANGER, build_map_pairs
+from topomerge.training.match_odds import NEGATIVE_OFFSET, build_map_pairs
 from topomerge.training.packed_pairs import name_building
 from topomerge.training.task_settings import MatchBelief
 from topomerge.training.tasks import Task
@@ -53,7 +53,7 @@ def fit(settings: MatchBelief, log_line: LogFn) -> dict[str, float]:
 def fit_belief(settings: MatchBelief, log_line: LogFn) -> FitResult:
     """Fit weights from all pairs, and scores of those that were fitted without each building."""
     rows = build_match_rows(settings.data, settings, log_line)
-    weights = {method: np.round(fit_match_weights(rows, method, settings.pull), 3).tolist() for method in BELIEVED_METHODS}
+    weights = {method: np.round(fit_match_weights(rows, method, settings.l2), 3).tolist() for method in BELIEVED_METHODS}
     guesses = {method: predict_left_out(rows, method, settings) for method in BELIEVED_METHODS}
     origin = {"set": settings.data.name, "split": settings.data.split, "pairs": len(rows)}
     return FitResult({"names": list(BELIEF_NAMES), **weights}, score_beliefs(rows, guesses), origin)
@@ -70,7 +70,7 @@ def build_match_rows(recipe: Recipe, settings: MatchBelief, log_line: LogFn) -> 
     sources = [[path] for path, _ in shared]
     for n, (path, building) in enumerate(shared):
         others = [other for other, name in shared[n:] + shared[:n] if name != building]
-        sources += [[path, others[STRANGER % len(others)]]] if others else []
+        sources += [[path, others[NEGATIVE_OFFSET % len(others)]]] if others else []
     files, _ = derive(f"{recipe.name}_belief", compute_match_rows, sources, settings, log_line=log_line)
     if not files:
         raise InputError(f"{recipe.name}: no pair has rooms that match")
@@ -98,7 +98,7 @@ def compute_match_rows(path: Path, other: Path | None = None) -> dict[str, Array
     return out
 
 
-def fit_match_weights(rows: Sequence[MatchRows], method: str, pull: float) -> Array:
+def fit_match_weights(rows: Sequence[MatchRows], method: str, l2: float) -> Array:
     """Return (6,) weights of the most likely logistic model, pulled to what matching says. None but the constant is below 0: what
     speaks for a match never lowers it.
 
@@ -112,7 +112,7 @@ def fit_match_weights(rows: Sequence[MatchRows], method: str, pull: float) -> Ar
     sign, start = np.where(y, -1.0, 1.0), (np.array(BELIEF_NAMES) == "matching").astype(float)
 
     def loss(w: Array) -> float:
-        return pull * float((w - start)[1:] @ (w - start)[1:]) + float(share @ np.logaddexp(0, sign * (x @ w)))
+        return l2 * float((w - start)[1:] @ (w - start)[1:]) + float(share @ np.logaddexp(0, sign * (x @ w)))
 
     bounds = [(None if name == "constant" else 0.0, None) for name in BELIEF_NAMES]
     weights: Array = minimize(loss, start, method="L-BFGS-B", bounds=bounds).x
@@ -129,9 +129,7 @@ def predict_left_out(rows: Sequence[MatchRows], method: str, settings: MatchBeli
     if len(names) < 2:
         raise InputError("data.pairs: pairs of two buildings are needed")
     fold = dict(zip(names, (np.random.default_rng(0).permutation(len(names)) % settings.folds).tolist(), strict=True))
-    weights = {
-        k: fit_match_weights([r for r in rows if fold[r.building] != k], method, settings.pull) for k in set(fold.values())
-    }
+    weights = {k: fit_match_weights([r for r in rows if fold[r.building] != k], method, settings.l2) for k in set(fold.values())}
     return [_predict_probability(r.features[method], weights[fold[r.building]]) for r in rows]
 
 

@@ -30,7 +30,7 @@ from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn, Sim3
 
 RIGHT_POSE = (0.5, np.radians(5))  # m in the middle of what both maps saw, rad
-STRANGER = 7  # pairs further on is a map of another building, mostly
+NEGATIVE_OFFSET = 7  # pairs further on is a map of another building, mostly
 
 
 class MatchEvidence(NamedTuple):
@@ -68,8 +68,8 @@ def fit_odds(settings: MatchOdds, log_line: LogFn) -> FitResult:
     """Fit weights of both models from all pairs, and scores of those that were fitted without each building."""
     evidence = build_pair_evidence(settings.data, settings, log_line)
     weights = {
-        HYPOTHESIS: np.round(fit_hypotheses(evidence, settings.pull), 2).tolist(),
-        MATCH: np.round(fit_rooms(evidence, settings.pull), 2).tolist(),
+        HYPOTHESIS: np.round(fit_hypotheses(evidence, settings.l2), 2).tolist(),
+        MATCH: np.round(fit_rooms(evidence, settings.l2), 2).tolist(),
     }
     origin = {"set": settings.data.name, "split": settings.data.split, "pairs": len(evidence)}
     return FitResult(weights, score_odds(*predict_left_out(evidence, settings)), origin)
@@ -79,7 +79,7 @@ def build_pair_evidence(recipe: Recipe, settings: MatchOdds, log_line: LogFn) ->
     """Build the evidence of each pair, and of each map with one of another building, cached."""
     paths = [path for path in build_map_pairs(recipe, settings, log_line) if _has_matches(load_evaluation_pair(path))]
     sources = [[path] for path in paths]
-    sources += [[path, paths[(n + STRANGER) % len(paths)]] for n, path in enumerate(paths)]
+    sources += [[path, paths[(n + NEGATIVE_OFFSET) % len(paths)]] for n, path in enumerate(paths)]
     files, _ = derive(f"{recipe.name}_odds", compute_evidence, sources, settings, log_line=log_line)
     if not files:
         raise InputError(f"{recipe.name}: no pair has rooms that match")
@@ -122,11 +122,11 @@ def is_right(pair: EvaluationPair, pose: Sim3) -> bool:
     return bool(off < RIGHT_POSE[0] and abs(turn) < RIGHT_POSE[1])
 
 
-def fit_hypotheses(evidence: Sequence[MatchEvidence], pull: float) -> Array:
+def fit_hypotheses(evidence: Sequence[MatchEvidence], l2: float) -> Array:
     """Fit (4,) weights of the most likely softmax."""
 
     def loss(w: Array) -> float:
-        total = pull * float(w[1:] @ w[1:])
+        total = l2 * float(w[1:] @ w[1:])
         for e in evidence:
             logits = np.append(e.hypotheses @ w, 0.0)
             right = logits[np.append(e.right, not e.right.any())]
@@ -137,12 +137,12 @@ def fit_hypotheses(evidence: Sequence[MatchEvidence], pull: float) -> Array:
     return weights
 
 
-def fit_rooms(evidence: Sequence[MatchEvidence], pull: float) -> Array:
+def fit_rooms(evidence: Sequence[MatchEvidence], l2: float) -> Array:
     """Fit (5,) weights of the logistic model."""
     x, y = np.concatenate([e.rooms for e in evidence]), np.concatenate([e.one for e in evidence])
 
     def loss(w: Array) -> float:
-        return pull * float(w[1:] @ w[1:]) + float(np.logaddexp(0, np.where(y, -1, 1) * (x @ w)).sum())
+        return l2 * float(w[1:] @ w[1:]) + float(np.logaddexp(0, np.where(y, -1, 1) * (x @ w)).sum())
 
     weights: Array = minimize(loss, np.zeros(x.shape[1])).x
     return weights
@@ -157,7 +157,7 @@ def predict_left_out(evidence: Sequence[MatchEvidence], settings: MatchOdds) -> 
         test = {name for name, at in zip(names, fold, strict=True) if at == k}
         rest = [e for e in evidence if e.building not in test]
         if test and rest:
-            weights = fit_hypotheses(rest, settings.pull), fit_rooms(rest, settings.pull)
+            weights = fit_hypotheses(rest, settings.l2), fit_rooms(rest, settings.l2)
             parts.append(predict_probabilities([e for e in evidence if e.building in test], *weights))
     if not parts:
         raise InputError("data.pairs: pairs of two buildings are needed")

@@ -156,11 +156,11 @@ def fit_multinomial(x: Array, truth: Array, weight: Array, strength: float) -> d
     def loss(flat: Array) -> tuple[float, Array]:
         w = flat.reshape(len(KINDS), -1)
         probability = softmax(z @ w.T)
-        pull = np.pad(w[:, :-1], ((0, 0), (0, 1))) / strength
+        penalty = np.pad(w[:, :-1], ((0, 0), (0, 1))) / strength
         value = -(weight * np.log(np.maximum((probability * one).sum(axis=1), 1e-12))).sum() + (w[:, :-1] ** 2).sum() / (
             2 * strength
         )
-        return float(value), ((weight[:, None] * (probability - one)).T @ z + pull).ravel()
+        return float(value), ((weight[:, None] * (probability - one)).T @ z + penalty).ravel()
 
     w = minimize(loss, np.zeros(len(KINDS) * z.shape[1]), jac=True, method="L-BFGS-B").x.reshape(len(KINDS), -1)
     return {"mean": mean.tolist(), "scale": scale.tolist(), "weight": w[:, :-1].tolist(), "bias": w[:, -1].tolist()}

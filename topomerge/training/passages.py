@@ -180,10 +180,10 @@ def fit_passages(settings: Passages, log_line: LogFn) -> FitResult:
     parts = [[scan for scan, at in zip(scans, fold, strict=True) if at == k] for k in range(settings.folds)]
     left_out = []
     for k, part in enumerate(parts):
-        weights = fit_models([scan for j, other in enumerate(parts) if j != k for scan in other], settings.pull)
+        weights = fit_models([scan for j, other in enumerate(parts) if j != k for scan in other], settings.l2)
         left_out += [score(scan, weights) for scan in part]
     origin = {"set": settings.data.name, "split": settings.data.split, "scans": len(scans)}
-    return FitResult(fit_models(scans, settings.pull), compute_figures(left_out), origin)
+    return FitResult(fit_models(scans, settings.l2), compute_figures(left_out), origin)
 
 
 def read_scans(recipe: PlanRecipe, settings: Passages, log_line: LogFn) -> list[PassageExamples]:
@@ -200,7 +200,7 @@ def read_scans(recipe: PlanRecipe, settings: Passages, log_line: LogFn) -> list[
     return scans
 
 
-def fit_models(scans: Sequence[PassageExamples], pull: float) -> dict[str, list[float]]:
+def fit_models(scans: Sequence[PassageExamples], l2: float) -> dict[str, list[float]]:
     """Of each of `KINDS` the weights of `SCORE_INPUTS`; scans with many passages count less than proportionally."""
     models = {}
     for kind in KINDS:
@@ -210,16 +210,16 @@ def fit_models(scans: Sequence[PassageExamples], pull: float) -> dict[str, list[
             x = np.concatenate([compute_inputs(scan.plan, scan.shown) for scan in own])
             y = np.concatenate([scan.parted for scan in own])
             count = np.concatenate([np.full(len(scan.parted), 1 / np.sqrt(len(scan.parted))) for scan in own])
-            weights = minimize(_loss, PRIOR, (x, y, count / count.mean(), pull), jac=True, method="BFGS").x
+            weights = minimize(_loss, PRIOR, (x, y, count / count.mean(), l2), jac=True, method="BFGS").x
         models[kind] = np.round(weights, 3).tolist()
     return models
 
 
-def _loss(weights: Array, x: Array, y: Array, count: Array, pull: float) -> tuple[float, Array]:
+def _loss(weights: Array, x: Array, y: Array, count: Array, l2: float) -> tuple[float, Array]:
     """Negative log likelihood with what pulls the weights to `PRIOR`, and its gradient."""
     z, off = x @ weights, weights - PRIOR
-    loss = float((count * np.logaddexp(0, np.where(y, -z, z))).sum() + pull * (STIFF * off**2).sum() / 2)
-    return loss, x.T @ (count * (sigmoid(z) - y)) + pull * STIFF * off
+    loss = float((count * np.logaddexp(0, np.where(y, -z, z))).sum() + l2 * (STIFF * off**2).sum() / 2)
+    return loss, x.T @ (count * (sigmoid(z) - y)) + l2 * STIFF * off
 
 
 def score(scan: PassageExamples, weights: dict[str, list[float]]) -> tuple[Array, Array, Array]:

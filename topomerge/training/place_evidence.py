@@ -32,7 +32,7 @@ from topomerge.registration.places import (
 from topomerge.training.belief_hypotheses import assign_half, build_hypothesis_files, derive_hypothesis_files, is_distinguishable
 from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, run_network
 from topomerge.training.packed_pairs import name_building
-from topomerge.training.processes import let_chief_first
+from topomerge.training.processes import let_main_process_first
 from topomerge.training.task_settings import PlaceAugment, PlaceEvidence
 from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
@@ -182,7 +182,7 @@ def fit(settings: PlaceEvidence, log_line: LogFn) -> dict[str, float]:
     Raises:
         InputError: too few buildings to train on some and watch others.
     """
-    with let_chief_first(settings):
+    with let_main_process_first(settings):
         paths = build_hypothesis_files(settings.data, settings, log_line)
         if settings.lookalikes:
             alike, _ = build_lookalikes(settings.alike, settings, log_line)

@@ -27,7 +27,7 @@ from topomerge.models.convolutional import PlanProbabilities, PlanUNet
 from topomerge.networks.network import Run
 from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, prefetch_batches, run_network
 from topomerge.training.packed_pairs import mark_watched, read_scan_building
-from topomerge.training.processes import let_chief_first
+from topomerge.training.processes import let_main_process_first
 from topomerge.training.scan_settings import GridSegmentation, PlanAugment, PlanLoss, PlanSegmentation
 from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
@@ -139,7 +139,7 @@ def fit(settings: PlanSegmentation, log_line: LogFn) -> dict[str, float]:
     Raises:
         InputError: no scan to train on or to watch.
     """
-    with let_chief_first(settings):
+    with let_main_process_first(settings):
         paths, _ = build_plans(settings.data, settings, log_line)
     scans = [load_examples(path) for path in paths]
     watches = mark_watched([read_scan_building(path) for path in paths], settings.hold_out)

@@ -43,7 +43,7 @@ def find_precision(settings: Any) -> str:
 
 
 @contextmanager
-def let_chief_first(settings: Any) -> Iterator[None]:
+def let_main_process_first(settings: Any) -> Iterator[None]:
     """Let the first process do something, such as making data that is missing, while the others wait; then they do it, too."""
     if count_processes(settings) == 1:
         yield

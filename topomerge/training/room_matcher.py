@@ -31,7 +31,7 @@ from topomerge.models.weights import read_embedder
 from topomerge.training.batches import add_views, augment_graph, augment_sheet, compute_quarter_turns, mirror_graph
 from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, run_network
 from topomerge.training.packed_pairs import Graph, GraphPair, load_pairs
-from topomerge.training.processes import let_chief_first
+from topomerge.training.processes import let_main_process_first
 from topomerge.training.settings import Augment
 from topomerge.training.task_settings import RoomMatching
 from topomerge.training.tasks import RANKINGS, Task
@@ -244,7 +244,7 @@ def fit(settings: RoomMatching, log_line: LogFn) -> dict[str, float]:
     Raises:
         InputError: no pairs, or the embedder that ships has no rows for turns.
     """
-    with let_chief_first(settings):
+    with let_main_process_first(settings):
         settings = with_own_sets(settings, log_line)
     network, embedder = load_shipped_embedder()
     learned = read_examples(settings, settings.data.name, network, settings.views, log_line)

@@ -228,7 +228,7 @@ def fit_room_odds(settings: RoomOdds, log_line: LogFn) -> FitResult:
         scans = [scan for recipe in sets for scan in build_room_scans(recipe, settings, log_line)]
         origin[key] = {"sets": [recipe.name for recipe in sets], "scans": len(scans)}
         scores |= _score_left_out(family, scans, settings)
-        weights = merge_family_weights(weights, family, fit_family_weights(family, scans, settings.pull))
+        weights = merge_family_weights(weights, family, fit_family_weights(family, scans, settings.l2))
     return FitResult(weights, scores, origin)
 
 
@@ -256,7 +256,7 @@ def _score_left_out(family: Family, scans: Sequence[Rows], settings: RoomOdds) -
     for k in range(settings.folds):
         rest = [scan for scan, at in zip(scans, fold, strict=True) if at != k]
         if len(rest) < len(scans):
-            weights = fit_family_weights(family, rest, settings.pull)
+            weights = fit_family_weights(family, rest, settings.l2)
             _append_predictions(weights, family, [scan for scan, at in zip(scans, fold, strict=True) if at == k], guesses)
     return _score_family(family, guesses)
 
@@ -275,7 +275,7 @@ def build_room_scans(recipe: PlanRecipe, settings: RoomOdds, log_line: LogFn) ->
     return scans
 
 
-def fit_family_weights(family: Family, scans: Sequence[Rows], pull: float) -> dict[str, Any]:
+def fit_family_weights(family: Family, scans: Sequence[Rows], l2: float) -> dict[str, Any]:
     """Fit the weights of a family in `room_odds.json`."""
     x = np.concatenate([scan["x"] for scan in scans])
     low, high = np.quantile(x, CLIPPED, axis=0)
@@ -288,7 +288,7 @@ def fit_family_weights(family: Family, scans: Sequence[Rows], pull: float) -> di
         answers = [answer for scan in scans if len(answer := _build_table(weights, family, scan, name)[1])]
         if not tables:
             raise InputError("data.scans: too few scans: none has poses")
-        weights[name] = np.round(_fit_logistic(tables, answers, pull), 4).tolist()
+        weights[name] = np.round(_fit_logistic(tables, answers, l2), 4).tolist()
     return weights
 
 
@@ -301,7 +301,7 @@ def _build_table(weights: dict[str, Any], family: Family, scan: Rows, name: str)
     return build_model_inputs(weights, family, scan["posed.x"], scan["posed.p"]), scan[ANSWER_OF[name]]
 
 
-def _fit_logistic(tables: Sequence[Array], answers: Sequence[Array], pull: float) -> Array:
+def _fit_logistic(tables: Sequence[Array], answers: Sequence[Array], l2: float) -> Array:
     """Weights of the most likely logistic model, pulled to 0 but for the constant."""
     x, y = np.concatenate(tables), np.concatenate(answers)
     share = np.concatenate([np.full(len(table), 1 / np.sqrt(len(table))) for table in tables])
@@ -311,8 +311,8 @@ def _fit_logistic(tables: Sequence[Array], answers: Sequence[Array], pull: float
     def loss(w: Array) -> tuple[float, Array]:
         odds = sign * (x @ w)
         slope = x.T @ (share * sign * sigmoid(np.clip(odds, -50, 50)))
-        slope[1:] += 2 * pull * w[1:]
-        return float(share @ np.logaddexp(0, odds)) + pull * float(w[1:] @ w[1:]), slope
+        slope[1:] += 2 * l2 * w[1:]
+        return float(share @ np.logaddexp(0, odds)) + l2 * float(w[1:] @ w[1:]), slope
 
     weights: Array = minimize(loss, np.zeros(x.shape[1]), jac=True, method="L-BFGS-B").x
     return weights

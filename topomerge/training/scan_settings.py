@@ -192,7 +192,7 @@ class WallDoors(TaskSettings):
     """Args:
     data, frameless, flat: scans that show walls, those of doors without frames, and slices and grid maps.
     heldout, heldout_frameless, heldout_flat: likewise, of other buildings.
-    pull: to 0, of all weights but the constants.
+    l2: to 0, of all weights but the constants.
     folds: of scans, for the scores.
     """
 
@@ -204,7 +204,7 @@ class WallDoors(TaskSettings):
     heldout: PlanRecipe = field(default_factory=PlanRecipe)
     heldout_frameless: PlanRecipe = field(default_factory=PlanRecipe)
     heldout_flat: PlanRecipe = field(default_factory=PlanRecipe)
-    pull: float = 1.0
+    l2: float = 1.0
     folds: int = 5
     watch: str = "precision"
 
@@ -213,7 +213,7 @@ class WallDoors(TaskSettings):
 class Passages(TaskSettings):
     """Args:
     data: scans; heldout: of other buildings.
-    pull: of the weights to what the plan alone says.
+    l2: of the weights to what the plan alone says.
     folds: of scans, for the scores.
     """
 
@@ -221,7 +221,7 @@ class Passages(TaskSettings):
     name: str = "passages"
     data: PlanRecipe = field(default_factory=PlanRecipe)
     heldout: PlanRecipe = field(default_factory=PlanRecipe)
-    pull: float = 3.0
+    l2: float = 3.0
     folds: int = 5
     watch: str = "log_loss"
 
@@ -253,7 +253,7 @@ class RoomOdds(TaskSettings):
     data: scans; open, closed: scans of buildings with their surroundings and ordinary ones, for what lies outside; grids: robots'
         grids of buildings with their surroundings; heldout, heldout_open, heldout_grids: likewise, of other buildings.
     fit: which of `scans`, `open` and `grids` to fit; the weights of the others stay those in use.
-    pull: to 0, of all weights but the constant.
+    l2: to 0, of all weights but the constant.
     folds: of scans, for the scores.
     """
 
@@ -267,6 +267,6 @@ class RoomOdds(TaskSettings):
     heldout_open: PlanRecipe = field(default_factory=PlanRecipe)
     heldout_grids: PlanRecipe = field(default_factory=PlanRecipe)
     fit: list[str] = field(default_factory=lambda: ["scans", "open", "grids"])
-    pull: float = 1.0
+    l2: float = 1.0
     folds: int = 8
     watch: str = "entered_auc"

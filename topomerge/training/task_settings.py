@@ -165,7 +165,7 @@ class RoomMatching(NetworkTask):
 @dataclass
 class MatchOdds(TaskSettings):
     """Args:
-    pull: to 0, of all weights but the constant.
+    l2: to 0, of all weights but the constant.
     folds: of buildings, for the scores.
     """
 
@@ -173,7 +173,7 @@ class MatchOdds(TaskSettings):
     name: str = "match_odds"
     data: Recipe = field(default_factory=Recipe)
     heldout: Recipe = field(default_factory=Recipe)
-    pull: float = 0.05
+    l2: float = 0.05
     folds: int = 5
     watch: str = "match_accuracy"
 
@@ -181,7 +181,7 @@ class MatchOdds(TaskSettings):
 @dataclass
 class MatchBelief(TaskSettings):
     """Args:
-    pull: of all weights but the constant, to what matching says.
+    l2: of all weights but the constant, to what matching says.
     folds: of buildings, for the scores.
     """
 
@@ -189,7 +189,7 @@ class MatchBelief(TaskSettings):
     name: str = "match_belief"
     data: Recipe = field(default_factory=Recipe)
     heldout: Recipe = field(default_factory=Recipe)
-    pull: float = 0.5
+    l2: float = 0.5
     folds: int = 8
     watch: str = "attention_all_after_accuracy"
 

@@ -57,10 +57,10 @@ def fit_doors(settings: WallDoors, log_line: LogFn) -> FitResult:
     parts = [[scan for scan, at in zip(scans, fold, strict=True) if at == k] for k in range(settings.folds)]
     left_out = []
     for k, part in enumerate(parts):
-        weights = fit_doors_model([scan for j, other in enumerate(parts) if j != k for scan in other], settings.pull)
+        weights = fit_doors_model([scan for j, other in enumerate(parts) if j != k for scan in other], settings.l2)
         left_out += [(compute_door_probability(c, weights), y) for c, y in part]
     origin = {"set": settings.data.name, "split": settings.data.split, "scans": len(scans)}
-    return FitResult(fit_doors_model(scans, settings.pull), score_doors(left_out), origin)
+    return FitResult(fit_doors_model(scans, settings.l2), score_doors(left_out), origin)
 
 
 def build_candidates(recipe: PlanRecipe, settings: WallDoors, log_line: LogFn) -> list[tuple[str, Candidates]]:
@@ -101,7 +101,7 @@ def find_candidates_of_map(
     return build_door_candidates(level, map.rooms["completeness"], storeys, walls)
 
 
-def fit_doors_model(scans: Sequence[Candidates], pull: float) -> dict[str, list[float]]:
+def fit_doors_model(scans: Sequence[Candidates], l2: float) -> dict[str, list[float]]:
     """Fit for each of `SOURCES` a constant and `WALL_DOOR_FEATURES` weights; where hardly any candidate is a door, those that
     ship stay: a constant of two doors would be chance."""
     x = np.concatenate([c.features for c, _ in scans])
@@ -114,7 +114,7 @@ def fit_doors_model(scans: Sequence[Candidates], pull: float) -> dict[str, list[
         share = float(np.clip(y[own].mean(), 0.01, 0.99)) if own.any() else 0.5
         row = [float(np.log(share / (1 - share))), *[0.0] * len(WALL_DOOR_FEATURES)]
         if 0 < y[own].sum() < own.sum():
-            model = LogisticRegression(C=1 / pull, max_iter=5000).fit(x[own], y[own])
+            model = LogisticRegression(C=1 / l2, max_iter=5000).fit(x[own], y[own])
             row = [float(model.intercept_[0]), *model.coef_[0].tolist()]
         weights[name] = np.round(row, 3).tolist()
     return weights

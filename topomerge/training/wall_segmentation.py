@@ -31,7 +31,7 @@ from topomerge.networks.network import Run
 from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, run_network
 from topomerge.training.packed_pairs import mark_watched, read_scan_building
 from topomerge.training.plan_segmentation import compute_log_loss
-from topomerge.training.processes import let_chief_first
+from topomerge.training.processes import let_main_process_first
 from topomerge.training.scan_settings import WallAugment, WallSegmentation
 from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
@@ -49,7 +49,7 @@ def fit(settings: WallSegmentation, log_line: LogFn) -> dict[str, float]:
     Raises:
         InputError: no scan to train on or to watch.
     """
-    with let_chief_first(settings):
+    with let_main_process_first(settings):
         paths, _ = build_walls(settings.data, settings, log_line)
     scans = [load_walls(path) for path in paths]
     learned, watched = split_train_val(scans, [read_scan_building(path) for path in paths], settings)

@@ -17,7 +17,7 @@ from topomerge.types import Array, TopometricMap
 
 CUT = (1.0, 1.9)  # m above the floor: what fills this band is drawn as wall, as architects cut a plan
 WALL_SHARE = 0.5  # share of the band that must be occupied
-DRAWN_AGAIN = 8  # plans of which is kept what is drawn: a report draws those of two maps several times
+KEPT_DRAWINGS = 8  # plans of which is kept what is drawn: a report draws those of two maps several times
 MAX_PIXELS = 1500  # along an axis; cells of larger buildings are drawn together
 
 
@@ -148,7 +148,7 @@ class Place:
     clear: float  # m to the nearest edge of the room's area
 
 
-@lru_cache(maxsize=DRAWN_AGAIN)
+@lru_cache(maxsize=KEPT_DRAWINGS)
 def find_label_places(plan: StoreyView, frame: Frame) -> dict[int, Place]:
     """Room -> the point of its area with most space around it; of nearly equal ones the nearest to the middle."""
     boxes = enumerate(ndimage.find_objects(plan.room + 1))

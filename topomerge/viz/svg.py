@@ -15,7 +15,7 @@ from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.structure.lines import estimate_wall_directions
 from topomerge.types import LANDMARK_KINDS, Array, TopometricMap, find_room_names
 from topomerge.viz.plan import (
-    DRAWN_AGAIN,
+    KEPT_DRAWINGS,
     Frame,
     Place,
     StoreyView,
@@ -133,7 +133,7 @@ WALL_TRACE = (0.6, 0.36)  # blur and level for walls: lines of one pixel stay wh
 SPECK = 0.3  # m2: smaller patches of what was seen outside rooms are left out
 
 
-@lru_cache(maxsize=DRAWN_AGAIN)
+@lru_cache(maxsize=KEPT_DRAWINGS)
 def fill_rooms(plan: StoreyView, frame: Frame) -> Array:
     """Return (nx, ny) int32 room of each pixel, -1 none, with small gaps and holes filled; no pixel changes from room to room."""
     reach = max(round(CLOSED / frame.size), 1)
@@ -158,7 +158,7 @@ def _fill_small_holes(mask: Array, most: float) -> Array:
     return mask | small[holes]
 
 
-@lru_cache(maxsize=DRAWN_AGAIN)
+@lru_cache(maxsize=KEPT_DRAWINGS)
 def trace_rooms(plan: StoreyView, sheet: Sheet) -> dict[int, str]:
     """Trace each room: room -> its outline as the `d` of an SVG path."""
     room = fill_rooms(plan, sheet.frame)
@@ -171,7 +171,7 @@ def trace_room(mask: Array, sheet: Sheet, box: tuple[slice, slice]) -> str:
     return trace(share, sheet, start) or trace(share, sheet, start, blur=0.0)
 
 
-@lru_cache(maxsize=DRAWN_AGAIN)
+@lru_cache(maxsize=KEPT_DRAWINGS)
 def trace_walls(plan: StoreyView, sheet: Sheet) -> str:
     """Trace walls as the `d` of an SVG path; the two faces of a thin wall are drawn as one."""
     near = round(0.1 / sheet.frame.size)

@@ -86,7 +86,7 @@ def test_the_map_on_which_it_lies_best_comes_first(house: Path, monkeypatch: pyt
     assert first.fit is not None and second.fit is not None and first.fit > 3 > second.fit
     turned = (replace(second, fit=None), replace(first, fit=None))
     assert register_sightings(read_atlas(house), office_map(0), turned) == (first, second)
-    monkeypatch.setattr(finding, "LAID_COARSELY", 1)
+    monkeypatch.setattr(finding, "COARSE_CANDIDATES", 1)
     assert register_sightings(read_atlas(house), office_map(0), turned) == (second, turned[1])
 
 

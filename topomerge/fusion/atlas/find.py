@@ -4,7 +4,7 @@ that show most of them; nothing is registered.
 Each room of the new map has one vote. It goes to the rooms of the atlas that look most like it, shared by how alike they are, and
 by whether they lie where all of it is most alike; both are means over the turns of a map. A map's share is that of the
 votes that its rooms got: it says where to look first, not whether the place is there at all. That is what `merge` is for.
-The first `LAID_COARSELY` are ordered by how well their walls fit: rooms of small maps look like those of many others.
+The first `COARSE_CANDIDATES` are ordered by how well their walls fit: rooms of small maps look like those of many others.
 
 Of an atlas of more than `SHORTLIST` maps only so many are compared that closely: those for which the nearest neighbours of the
 new map's rooms speak, by exact search or an index (`prepare_rooms_index`), and those that hold rare strings or access points of
@@ -41,7 +41,7 @@ from topomerge.matching.match import embed_rooms
 from topomerge.types import Array, TopometricMap
 
 SHORTLIST = 50  # maps that are compared room by room
-LAID_COARSELY = 10  # maps with the largest shares, that the new one is laid on
+COARSE_CANDIDATES = 10  # maps with the largest shares, that the new one is laid on
 STRING_ODDS = float(np.log(KINDS["text"].most))  # log odds of a map that holds a rare string of the new one
 ELSEWHERE = 0.1  # of a room's vote counts for a room that does not lie where those of most rooms do
 
@@ -98,7 +98,7 @@ def find(folder: str | Path, map: TopometricMap, number: int = 5) -> tuple[Sight
     maps += sorted(worth.keys() - set(maps))
     names = {stored.entries[k].name: worth.get(k, 0.0) for k in maps}
     ranked = [replace(s, landmarks=names[s.name]) for s in rank_sightings(list(names), rows.get_rows(maps), new, len(maps))]
-    sightings = sorted(ranked, key=lambda s: -s.landmarks)[: max(number, LAID_COARSELY)]
+    sightings = sorted(ranked, key=lambda s: -s.landmarks)[: max(number, COARSE_CANDIDATES)]
     return register_sightings(stored, map, sightings)[:number]
 
 
@@ -114,12 +114,12 @@ def rank_by_landmarks(stored: StoredAtlas, map: TopometricMap) -> dict[int, floa
 def register_sightings(stored: StoredAtlas, map: TopometricMap, sightings: Sequence[Sighting]) -> tuple[Sighting, ...]:
     """Return the first of the sightings with how well the map fits there, in that order, then the others as they were."""
     files = {e.name: stored.folder / e.file for e in stored.entries}
-    first = sightings[:LAID_COARSELY]
+    first = sightings[:COARSE_CANDIDATES]
     both = Maps([map, *(files[s.name] for s in first)])
     scale = str(stored.settings.get("scale") or "fixed")
     fitted = [replace(s, fit=compute_coarse_log_odds(both, 0, k, scale)) for k, s in enumerate(first, 1)]
     fitted.sort(key=lambda s: -((s.fit or 0.0) + STRING_ODDS * s.landmarks))
-    return *fitted, *sightings[LAID_COARSELY:]
+    return *fitted, *sightings[COARSE_CANDIDATES:]
 
 
 def _score_maps(stored: StoredAtlas, rows: RoomRows, signature: str, new: Rows) -> Array:

@@ -250,8 +250,8 @@ class StoredAtlas:
         """
         poses = self.get_poses()
         pairs = ((self.entries[i], self.entries[j]) for i, j in self.list_linked_pairs())
-        there = ((a, b) for a, b in pairs if a.name in poses and b.name in poses)
-        return {(a.key, b.key): poses[a.name][1].inverse() @ poses[b.name][1] for a, b in there}
+        is_occupied = ((a, b) for a, b in pairs if a.name in poses and b.name in poses)
+        return {(a.key, b.key): poses[a.name][1].inverse() @ poses[b.name][1] for a, b in is_occupied}
 
     def _build_error(self) -> InputError:
         return InputError(f"{self.folder / 'atlas.json'}: damaged; make the atlas again from its maps")
@@ -354,5 +354,5 @@ def read_finished_folder(folder: Path) -> StoredAtlas:
     Raises:
         InputError: a folder with other things in it.
     """
-    there = folder.is_dir() and any(not p.name.startswith(".") for p in folder.iterdir())
-    return read_finished(folder) if there else StoredAtlas(folder)
+    is_occupied = folder.is_dir() and any(not p.name.startswith(".") for p in folder.iterdir())
+    return read_finished(folder) if is_occupied else StoredAtlas(folder)

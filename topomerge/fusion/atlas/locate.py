@@ -325,13 +325,13 @@ def decide(index: PlaceIndex, query: Query, judged: Sequence[JudgedPose], settin
     places: list[tuple[Place, Array]] = []
     for pose, p in zip(judged, chances.tolist(), strict=True):
         own = index.maps[index.storeys[pose.storey].map]
-        there = _place_in_building(own, pose.pose, query.place)
-        same = [k for k, (q, at) in enumerate(places) if q.building == own.building and _is_same(at, there)]
+        position = _place_in_building(own, pose.pose, query.place)
+        same = [k for k, (q, at) in enumerate(places) if q.building == own.building and _is_same(at, position)]
         if same:  # another map of the same building shows the place, too, or a pose next to it
             first, at = places[same[0]]
             places[same[0]] = replace(first, probability=first.probability + p), at
         else:
-            places.append((_build_place(index, pose, query, p), there))
+            places.append((_build_place(index, pose, query, p), position))
     ranked = sorted((p for p, _ in places), key=lambda p: -p.probability)
     shown = tuple(ranked[: settings.alike + settings.shown])
     return _word(shown, nowhere, settings, len(query.fields.walls) >= TELLING)

@@ -94,7 +94,7 @@ class LocateServer:
                 elif isinstance(key.fileobj, socket.socket):
                     self._hear(key.fileobj)
             now = time.monotonic()
-            for client in [c for c, (_, heard) in self._clients.items() if now - heard > IDLE_SECONDS]:
+            for client in [c for c, (_, last) in self._clients.items() if now - last > IDLE_SECONDS]:
                 self._drop(client)
 
     def _accept(self) -> None:

@@ -357,8 +357,8 @@ def change(
         atlas = atlas.transform_components({k: e.frame for k, e in enumerate(stored.entries) if e.frame != Sim3()})
         components = [serialise_component(atlas, stored, n) for n in range(len(atlas.components))]
         joined = _write_joined_maps(atlas, components, before, place)
-        told = [describe_listed(c[LANDMARK_PARAMETER], c["names"]) for c in components if LANDMARK_PARAMETER in c]
-        atlas = replace(atlas, warnings=(*atlas.warnings, *filter(None, told)))
+        warnings = [describe_listed(c[LANDMARK_PARAMETER], c["names"]) for c in components if LANDMARK_PARAMETER in c]
+        atlas = replace(atlas, warnings=(*atlas.warnings, *filter(None, warnings)))
         title = folder.resolve().name
         pages = _write_pages(atlas, components, before, place, title, partial(report, atlas, joined, title))
         listing = serialise_atlas(atlas, stored, components)

@@ -88,10 +88,10 @@ def _add_link(parent: Any, name: str, id: str) -> None:
     xml.SubElement(parent, _qualify_core(name), {f"{{{LINK}}}href": f"#{id}"})
 
 
-def _add_description(parent: Any, name: str, **facts: Any) -> None:
+def _add_description(parent: Any, name: str, **fields: Any) -> None:
     """Description and name. Viewers read the first as key="value" pairs."""
-    if facts:
-        _add_element(parent, "description", space=GML).text = ":".join(f'{key}="{value}"' for key, value in facts.items())
+    if fields:
+        _add_element(parent, "description", space=GML).text = ":".join(f'{key}="{value}"' for key, value in fields.items())
     _add_element(parent, "name", space=GML).text = replace_forbidden(name)
 
 

@@ -23,7 +23,7 @@ from topomerge.types import Array, TopometricMap, find_room_names
 
 FRAME = "map"
 BAG_VERSION: Literal[8] = 8  # of rosbag2's metadata: Iron and later, read by Humble
-TOLD_AT = 10**9  # ns, when all is told
+LAST_TIME = 10**9  # ns, when all is told
 CELL_HEIGHT = 0.02  # m, height of a cell of a floor
 LETTERS = 0.4  # m
 LINE = 0.06  # m
@@ -48,7 +48,7 @@ def save(map: TopometricMap, path: Path) -> None:
                 to = bag.add_connection(
                     f"/topomerge/{topic}", ARRAY, typestore=markers.store, offered_qos_profiles=[_build_latched_qos()]
                 )
-                bag.write(to, TOLD_AT, markers.store.serialize_cdr(markers.build_array(listed), ARRAY))
+                bag.write(to, LAST_TIME, markers.store.serialize_cdr(markers.build_array(listed), ARRAY))
         (file,) = (Path(temporary) / "bag").glob("*.mcap")
         with replace_on_success(path) as temporary_path:
             temporary_path.write_bytes(file.read_bytes())

@@ -100,10 +100,10 @@ def join(sources: Sequence[Source], target: Path, doubt: Doubt) -> Tally:
         stamp = max(session.stamp for session in sessions) or NO_STAMP
         for session in sessions:
             try:
-                told, fresh = _copy_session(base, session, stamp, joined, before)
+                session_warnings, fresh = _copy_session(base, session, stamp, joined, before)
             except (sqlite3.Error, UnicodeError) as error:
                 raise build_damage_error(session.source.path, RTABMAP_KIND, error) from error
-            warnings += told
+            warnings += session_warnings
             nodes.append(sorted(k for k in fresh if k > 0))
             joined = fresh | joined
         between = _link_sessions(base, newest, nodes, joined, doubt)
@@ -216,7 +216,7 @@ def _copy_session(
             f"{session.source.path}: comes to lie {far:,.0f} m from the origin, where RTAB-Map's floats keep no "
             "millimetres; merge with the database first"
         )
-    tags, told = _renumber_tags(session, placed, joined)
+    tags, session_warnings = _renumber_tags(session, placed, joined)
     first = not _count(base, "main", "Admin")
     for name in TABLES:
         if name in session.tables and (name != "Info" or first) and name != "Admin":
@@ -225,7 +225,7 @@ def _copy_session(
         _copy_admin(base, session)
     base.execute("COMMIT")
     base.execute("DETACH source")
-    return told, {k + steps[NODE] if k > 0 else tags.get(k, k): pose for k, pose in placed.items()}
+    return session_warnings, {k + steps[NODE] if k > 0 else tags.get(k, k): pose for k, pose in placed.items()}
 
 
 def _count(base: sqlite3.Connection, schema: str, table: str) -> int:

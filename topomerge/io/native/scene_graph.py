@@ -314,8 +314,8 @@ def _unite(joined: _Graph, graph: _Graph, pairs: Mapping[int, int], name: str) -
             about[listed] = [*(about.get(listed) or ()), *other[listed]]
         if not about.get("name") and other.get("name"):
             about["name"] = other["name"]
-        told = dict((about.get("metadata") or {}).get(MERGED) or {})
-        about["metadata"] = {**(about.get("metadata") or {}), MERGED: {**told, name: [*told.get(name, ()), k]}}
+        merged = dict((about.get("metadata") or {}).get(MERGED) or {})
+        about["metadata"] = {**(about.get("metadata") or {}), MERGED: {**merged, name: [*merged.get(name, ()), k]}}
         nodes[pairs[k]] = {**kept, "attributes": about}
     parents = set(joined.find_parents())
     edges = dict(joined.edges)

@@ -25,7 +25,7 @@ from topomerge.types import Array
 EUROC_NUMBERS = (8, 11, 17)  # time (ns), place, quaternion w x y z; with velocity; with the biases of gyroscope and accelerometer
 LEAST_DECIMALS = 9  # of a moved number: 1e-9 m; more where the file has more
 LARGEST_TRAJECTORY = 1 << 28  # bytes
-LOOKED_AT = 1 << 14  # letters that tell the format
+HEADER_LENGTH = 1 << 14  # letters that tell the format
 
 
 def is_native(path: Path) -> bool:
@@ -58,7 +58,7 @@ def join(sources: Sequence[Source], target: Path, doubt: Doubt) -> Tally:
 def _detect_layout(path: Path) -> str | None:
     """KITTI, TUM or EuRoC, by how many numbers stand in a line and by which of them are a rotation; None: neither."""
     with path.open(encoding="utf-8-sig", errors="replace") as stream:
-        lines = stream.read(LOOKED_AT).splitlines(keepends=True)
+        lines = stream.read(HEADER_LENGTH).splitlines(keepends=True)
     lines = lines[:-1] if len(lines) > 1 and not lines[-1].endswith("\n") else lines
     rows = []
     for line in lines:
