@@ -15,7 +15,7 @@ from topomerge.models.losses import LossSettings, Objective
 from tests.graphs import pair
 from topomerge.embedding.network import Geometry, Network, Node, list_tensors
 from topomerge.embedding.surroundings import CROP_SHAPES
-from topomerge.training.captured_step import STEP_UP, BatchShape, BatchShapes, CapturedStep, can_capture
+from topomerge.training.captured_step import STEP_UP, BatchShape, CapturedStep, can_capture
 from topomerge.training.descent import build_optimizer, set_rate
 from topomerge.training.device_batches import DevicePairs
 from topomerge.training.embedding import EmbeddingJob
@@ -46,11 +46,11 @@ for augment in (None, Augment()):
 
 
 def test_a_shape_holds_the_batch_and_padding_and_there_are_few():
-    shapes = BatchShapes(BatchShape(500, 5000, 0))
+    mean = BatchShape(500, 5000, 0)
     rng = np.random.default_rng(0)
     chosen = set()
     for rooms in rng.integers(400, 600, 200).tolist():
-        shape = shapes.choose(rooms, 10 * rooms, 0)
+        shape = BatchShape(rooms, 10 * rooms, 0).pad_to_few(mean)
         assert shape.rooms > rooms and shape.edges >= 10 * rooms and shape.rooms < STEP_UP * rooms + 65
         chosen.add(shape)
     assert 3 < len(chosen) < 8
@@ -62,7 +62,7 @@ def test_padding_changes_neither_losses_nor_gradients():
     torch.manual_seed(0)
     objective = Objective(Embedder(NETWORK), LossSettings()).eval()  # in training padding counts in the statistics of norms
     plain = device.make_batch([3, 1], int)
-    device.shapes = BatchShapes(device.measure_mean(2))
+    device.mean_shape = device.measure_mean(2)
     padded = device.make_batch([3, 1], int)
     assert len(padded.x) > len(plain.x) and padded.rooms == plain.rooms
     assert int(padded.edge_index.max()) == len(padded.x) - 1 and (padded["batch"][len(plain.x) :] == -1).all()

@@ -1,6 +1,6 @@
 """Steps of a training as CUDA graphs: hundreds of small kernels are launched as one.
 
-A graph runs on tensors of one shape and at one place. Batches are therefore padded to a few shapes (`BatchShapes`), and copied to
+A graph runs on tensors of one shape and at one place. Batches are therefore padded to a few shapes (`BatchShape`), and copied to
 where their shape's graph reads them.
 """
 
@@ -25,29 +25,23 @@ Step = Callable[[Mapping[str, Tensor], Truth], dict[str, Tensor]]
 
 
 class BatchShape(NamedTuple):
-    """How many rooms, edges and doors a batch is padded to."""
+    """How many rooms, edges and doors a batch holds, or is padded to."""
 
     rooms: int
     edges: int
     doors: int
 
+    def pad_to_few(self, mean: BatchShape) -> BatchShape:
+        """Return the smallest of a few shapes that holds this one, and one room more, where padding goes.
 
-@dataclass(frozen=True)
-class BatchShapes:
-    """Shapes of batches, each larger than the one before by `STEP_UP` in all.
-
-    Args:
-        mean: what a batch holds on average, before anything is lost.
-    """
-
-    mean: BatchShape
-
-    def choose(self, rooms: int, edges: int, doors: int) -> BatchShape:
-        """Return the smallest shape that holds so many, and one room more, where padding goes."""
-        counts = (rooms + 1, edges, doors)
-        most = max(count / max(mean, 1) for count, mean in zip(counts, self.mean, strict=True))
+        Args:
+            mean: what a batch holds on average, before anything is lost: shapes are so many times that, each larger than the one
+                before by `STEP_UP` in all.
+        """
+        counts = (self.rooms + 1, self.edges, self.doors)
+        most = max(count / max(usual, 1) for count, usual in zip(counts, mean, strict=True))
         factor = STEP_UP ** math.ceil(math.log(most) / math.log(STEP_UP))
-        return BatchShape(*(_round_up(factor * mean) for mean in self.mean))
+        return BatchShape(*(_round_up(factor * usual) for usual in mean))
 
 
 def _round_up(count: float) -> int:

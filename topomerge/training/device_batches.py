@@ -42,7 +42,7 @@ from topomerge.training.batches import (
     compute_quarter_turns,
     compute_relative_positions,
 )
-from topomerge.training.captured_step import BatchShape, BatchShapes
+from topomerge.training.captured_step import BatchShape
 from topomerge.training.crop_sampling import Crops, Storeys, Views, build_turns, place_crops, sample_by_torch
 from topomerge.training.hashed_random import draw_normal, draw_uniform, draw_uniforms, hash_numbers
 from topomerge.training.packed_pairs import GraphPair
@@ -134,7 +134,7 @@ class DevicePairs:
         augment: how maps are changed; None: not at all.
         device: that the network is on.
 
-    `shapes` are set where batches are filled up to a few shapes.
+    `mean_shape` is set where batches are filled up to a few shapes.
     """
 
     def __init__(self, pairs: Sequence[GraphPair], names: Sequence[str], augment: Augment | None, device: torch.device) -> None:
@@ -168,7 +168,7 @@ class DevicePairs:
         bytes_of = [~sum(255 << (8 * SHEET_PLANES.index(name)) for name in names) for names, _ in SEEN_AS]
         self.gap_masks = torch.tensor(bytes_of, device=device)
         self.gap_shares = torch.tensor(np.cumsum([share for _, share in SEEN_AS])[:-1], device=device, dtype=torch.float32)
-        self.shapes: BatchShapes | None = None
+        self.mean_shape: BatchShape | None = None
         self.sample = choose_sampler(device)
         self._load_sheets([(graph["sheet"], graph["sheet_room"]) for graph in graphs])
 
@@ -196,9 +196,9 @@ class DevicePairs:
         """Return pairs of these numbers as a batch on the device, changed by the seeds of their numbers."""
         structure = self.decide(np.asarray(numbers, np.int64), np.array([seed_of(number) for number in numbers], np.uint64))
         door = np.flatnonzero(self.has_door[structure.room])
-        if self.shapes is None:
+        if self.mean_shape is None:
             return self.fill(structure, door)
-        shape = self.shapes.choose(len(structure.room), len(structure.edge), len(door))
+        shape = BatchShape(len(structure.room), len(structure.edge), len(door)).pad_to_few(self.mean_shape)
         return self.fill(pad_structure(structure, shape), np.resize(door, shape.doors), len(door))
 
     def measure_mean(self, batch: int) -> BatchShape:

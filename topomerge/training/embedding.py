@@ -25,7 +25,7 @@ from topomerge.models.weights import read_embedder, read_state, save_state
 from topomerge.networks.network import WEIGHTS_PACKAGE
 from topomerge.registry import SCHEDULES
 from topomerge.training.batches import AugmentedPairs, MapPair, add_invented_signs
-from topomerge.training.captured_step import BatchShapes, CapturedStep, Step, can_capture
+from topomerge.training.captured_step import CapturedStep, Step, can_capture
 from topomerge.training.descent import build_optimizer, set_rate
 from topomerge.training.device_batches import DevicePairs, supports_device_batches
 from topomerge.training.loop import (
@@ -166,7 +166,7 @@ class EmbeddingJob:
         self.state = State()  # that the step under way is of
         # Without an edge in the set there is none to fill batches up with.
         if isinstance(self.pairs, DevicePairs) and self.pairs.edges.any() and can_capture(settings, fabric, self.get_optimizer()):
-            self.pairs.shapes = BatchShapes(self.pairs.measure_mean(settings.batch))
+            self.pairs.mean_shape = self.pairs.measure_mean(settings.batch)
             for group in self.get_optimizer().param_groups:  # that graphs read it where it is
                 group["lr"] = torch.tensor(settings.rate, device=fabric.device)
             self.take_step = CapturedStep(self._descend)
