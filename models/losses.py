@@ -139,7 +139,7 @@ def compute_matching_loss(
     truth: Truth,
     processes: Processes | None = None,
 ) -> dict[str, Tensor]:
-    """Losses by name; `loss` is their weighted sum. Each is the mean over rooms, the faint ones weighing less.
+    """Compute the losses by name; `loss` is their weighted sum. Each is the mean over rooms, the faint ones weighing less.
 
     The mean of the losses of several processes, and of their gradients, is that of one process with all their pairs.
 
@@ -169,18 +169,18 @@ def _compute_weighted_mean(values: Tensor, weight: Tensor, processes: Processes 
 
 
 def score_info_nce(settings: LossSettings, batch: RoomBatch) -> RoomLosses:
-    """InfoNCE at the learned temperature."""
+    """Compute InfoNCE at the learned temperature."""
     return RoomLosses(*compute_info_nce(batch.embedding, batch.temperature, batch.truth, settings.easy, batch.gather()), True)
 
 
 def score_nt_xent(settings: LossSettings, batch: RoomBatch) -> RoomLosses:
-    """NT-Xent: at a temperature that stays, and all negatives count alike."""
+    """Compute NT-Xent: at a temperature that stays, and all negatives count alike."""
     temperature = batch.embedding.new_tensor(settings.temperature)
     return RoomLosses(*compute_info_nce(batch.embedding, temperature, batch.truth, 1.0, batch.gather()))
 
 
 def score_triplets(settings: LossSettings, batch: RoomBatch) -> RoomLosses:
-    """Triplets, whose negatives are of the same pair."""
+    """Compute the triplet loss, whose negatives are of the same pair."""
     return RoomLosses(*compute_triplet_loss(batch.embedding, batch.truth, settings.margin))
 
 

@@ -329,7 +329,7 @@ class LiveMerger:
         return out
 
     def _name_frames(self) -> dict[str, str]:
-        """Names of the robots' frames, no two alike."""
+        """Return the names of the robots' frames, no two alike."""
         number = Counter(robot.frame for robot in self.robots.values())
         alike = {name: f"{name}/{robot.frame}" for name, robot in self.robots.items() if number[robot.frame] > 1}
         if alike and self.links and not self._warned:

@@ -343,14 +343,14 @@ def check(settings: Training) -> None:
 
 
 def build_recipe_schema() -> type[Training]:
-    """`Training` with all of `configs/data/<name>.yaml` in the place of its name, as Hydra composes it."""
+    """Return `Training` with all of `configs/data/<name>.yaml` in the place of its name, as Hydra composes it."""
     from topomerge.datasets.pairs.items import Recipe
 
     return make_dataclass("Training", [("data", Recipe, field(default_factory=Recipe))], bases=(Training,))
 
 
 def convert_composed(given: Any) -> Training:
-    """`Training` out of what `build_recipe_schema` says: of the data only the name is needed."""
+    """Make `Training` out of what `build_recipe_schema` says: of the data only the name is needed."""
     from topomerge.datasets.pairs.own_pairs import check_own_path
 
     check_own_path(given.data.name, given.path)
