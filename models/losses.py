@@ -24,14 +24,16 @@ NEVER_LOGIT = -1e4  # a logit that is never chosen; minus infinity would make gr
 
 @dataclass
 class LossSettings:
-    """Args:
-    kind: of `topomerge.registry.LOSSES`.
-    easy: weight of the other buildings' rooms among the negatives.
-    dustbin: weight of the choice between the other map's rooms and no partner at all.
-    margin: of the triplets, in distances between unit vectors.
-    temperature: of NT-Xent; that of InfoNCE is learned.
-    faint: weight of rooms of which one of the maps has a part only (not `Truth.clear`).
-    options: numbers that a loss of one's own takes, by name.
+    """Settings of the loss of matching rooms.
+
+    Args:
+        kind: of `topomerge.registry.LOSSES`.
+        easy: weight of the other buildings' rooms among the negatives.
+        dustbin: weight of the choice between the other map's rooms and no partner at all.
+        margin: of the triplets, in distances between unit vectors.
+        temperature: of NT-Xent; that of InfoNCE is learned.
+        faint: weight of rooms of which one of the maps has a part only (not `Truth.clear`).
+        options: numbers that a loss of one's own takes, by name.
     """
 
     kind: str = "infonce"

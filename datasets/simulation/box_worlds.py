@@ -34,10 +34,12 @@ Sequence3 = tuple[float, float, float]
 
 @dataclass
 class World:
-    """Args:
-    rooms: (n, 4) x0, y0, x1, y1 between the faces of the walls, m; the first one is the corridor.
-    doors: (d, 3) x, y, room: from the corridor into each room.
-    things: of each room, boxes (k, 5) x0, y0, x1, y1, height.
+    """A corridor and the rooms beside it, in which boxes stand.
+
+    Args:
+        rooms: (n, 4) x0, y0, x1, y1 between the faces of the walls, m; the first one is the corridor.
+        doors: (d, 3) x, y, room: from the corridor into each room.
+        things: of each room, boxes (k, 5) x0, y0, x1, y1, height.
     """
 
     rooms: Array

@@ -39,16 +39,18 @@ LONGEST_NAME = 60
 
 @dataclass(frozen=True)
 class LiveSettings:
-    """Args:
-    cell: m, of which one point is held.
-    most_points: of a robot; what comes later is left out, and told.
-    most_robots: at most.
-    step, turn: m and rad that a robot moves on between scans that are taken.
-    reach: m; what a scan shows farther away is left out.
-    least_points: of a robot, before its map is made.
-    join: probability from which on two maps are joined; `keep`: below which they are parted again.
-    open: … above which the next observation is named that would settle it.
-    moved: m; a join whose pose moves by more is another one.
+    """Settings of joining maps while robots drive.
+
+    Args:
+        cell: m, of which one point is held.
+        most_points: of a robot; what comes later is left out, and told.
+        most_robots: at most.
+        step, turn: m and rad that a robot moves on between scans that are taken.
+        reach: m; what a scan shows farther away is left out.
+        least_points: of a robot, before its map is made.
+        join: probability from which on two maps are joined; `keep`: below which they are parted again.
+        open: … above which the next observation is named that would settle it.
+        moved: m; a join whose pose moves by more is another one.
     """
 
     cell: float = 0.05

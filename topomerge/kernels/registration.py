@@ -349,7 +349,7 @@ def sum_votes(way, rise, room, probability, voted, voters, widths, level_gap):  
     Args:
         way: (n, 2) float64 m from one map to the other by each pair of rooms; rise: (n,) float64 m, likewise upwards.
         room: (n, 2) int64 the two rooms of each pair.
-        chance: (n,) float64 how likely each pair is.
+        probability: (n,) float64 how likely each pair is.
         voted, voters: int64 pairs that are voted for, and those that vote.
         widths: float64 m.
         level_gap: m, from which on two ways lead to different storeys.

@@ -238,18 +238,20 @@ SAME_MATCHING = PoseTolerance(0.5, float(np.radians(5)), 0.05)
 
 @dataclass(frozen=True)
 class ConsistencySettings:
-    """Args:
-    partners: of a room, that are tried.
-    samples: of walls and of floor, of the first look at a pose and of the last.
-    sigmas: m, of the agreement of walls, likewise.
-    refined: poses that are moved until walls meet.
-    voters: poses; votes of neighbours are not counted among more.
-    overlaid: columns of floor, laid over each other to tell the rooms in common.
-    storey_gap: m by which floors of one storey may differ.
-    same: poses closer than this are one.
-    vote_reach: m by which votes of matches by attention for one pose differ.
-    least_voter: certainty of a match by attention, from which on it votes for a pose.
-    shortlist: share of the best agreement, below which a hypothesis ranks after all others.
+    """Settings of finding matches that one transform explains.
+
+    Args:
+        partners: of a room, that are tried.
+        samples: of walls and of floor, of the first look at a pose and of the last.
+        sigmas: m, of the agreement of walls, likewise.
+        refined: poses that are moved until walls meet.
+        voters: poses; votes of neighbours are not counted among more.
+        overlaid: columns of floor, laid over each other to tell the rooms in common.
+        storey_gap: m by which floors of one storey may differ.
+        same: poses closer than this are one.
+        vote_reach: m by which votes of matches by attention for one pose differ.
+        least_voter: certainty of a match by attention, from which on it votes for a pose.
+        shortlist: share of the best agreement, below which a hypothesis ranks after all others.
     """
 
     partners: int = 5

@@ -286,13 +286,15 @@ SAME_POSE = PoseTolerance(0.4, float(np.radians(2.0)), 0.03)
 
 @dataclass(frozen=True)
 class RefineSettings:
-    """Args:
-    sigmas: m, of the weights of walls by their distance, round by round.
-    rounds: of each sigma.
-    sample: wall columns that a pose is refined by, at most.
-    same_level: m by which floors of one storey may differ.
-    unseen_level: m, likewise where a floor was not seen: its guess may be off by more.
-    same_pose: refined poses that are nearer are one.
+    """Settings of refining poses by walls.
+
+    Args:
+        sigmas: m, of the weights of walls by their distance, round by round.
+        rounds: of each sigma.
+        sample: wall columns that a pose is refined by, at most.
+        same_level: m by which floors of one storey may differ.
+        unseen_level: m, likewise where a floor was not seen: its guess may be off by more.
+        same_pose: refined poses that are nearer are one.
     """
 
     sigmas: tuple[float, ...] = (0.3, 0.15, 0.08)

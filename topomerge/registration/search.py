@@ -65,15 +65,17 @@ def select_distinct_yaws(yaws: Iterable[float]) -> list[float]:
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """Args:
-    cell: m, of the correlated images; wider where maps are large.
-    largest_image: cells along a side of them.
-    conflict_weight: of a wall on free ground, against one on a wall.
-    least_walls: columns of walls; storeys with fewer are not searched.
-    height_gap: m by which offsets of heights differ at least.
-    per_yaw: peaks of each yaw.
-    peak_distance: m between these.
-    hypotheses: that are refined, beside those of matched rooms.
+    """Settings of searching poses of one map in another.
+
+    Args:
+        cell: m, of the correlated images; wider where maps are large.
+        largest_image: cells along a side of them.
+        conflict_weight: of a wall on free ground, against one on a wall.
+        least_walls: columns of walls; storeys with fewer are not searched.
+        height_gap: m by which offsets of heights differ at least.
+        per_yaw: peaks of each yaw.
+        peak_distance: m between these.
+        hypotheses: that are refined, beside those of matched rooms.
     """
 
     cell: float = 0.2

@@ -122,11 +122,13 @@ def compute_lead(scores: Array, vectors: Array, weights: Array, scales: Array) -
 
 @dataclass(frozen=True)
 class Verdict:
-    """Args:
-    posterior: probability of each of `posterior.POSTERIOR`; they sum to 1.
-    each: probability of each of the ranked poses, the first one that of this place (``here``).
-    features: of the first pose, all that it was judged by.
-    walls: probability of this place without landmarks.
+    """Probabilities of ranked poses and of their alternatives.
+
+    Args:
+        posterior: probability of each of `posterior.POSTERIOR`; they sum to 1.
+        each: probability of each of the ranked poses, the first one that of this place (``here``).
+        features: of the first pose, all that it was judged by.
+        walls: probability of this place without landmarks.
     """
 
     posterior: dict[str, float]

@@ -76,11 +76,11 @@ class State:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Args:
-    settings: of the run.
-    steps: of each epoch.
-    perfect: value of the score at which nothing is left to learn.
-    lower: less of the score is better.
+    """Steps of a run, and the score by which it is watched.
+
+    Args:
+        settings: of the run; steps: of each epoch.
+        perfect: value of the score at which nothing is left to learn; lower: less of the score is better.
     """
 
     settings: NetworkSettings
@@ -417,8 +417,7 @@ class NetworkJob(ABC):
         return tuple(tensor.to(self.device, non_blocking=True) for tensor in batch)
 
     def optimize(self, loss: torch.Tensor, options: Any, state: State) -> dict[str, float]:
-        """Take one step of the optimizer at the rate of its place in the run: it rises over `options.warmup` steps, then
-        falls."""
+        """Take a step of the optimizer at the rate of its place in the run: it rises over `options.warmup` steps, then falls."""
         total, done = options.epochs * options.steps, state.epoch * options.steps + state.step
         for group in self.optimizer.param_groups:
             factor = SCHEDULES[self.settings.schedule](done / total, min(options.warmup / total, 0.5))

@@ -1,4 +1,4 @@
-"""Task `compute_room_odds`: is a room of a map one, whole, entered, outside (`extraction.room_odds`)?
+"""Task `room_odds`: is a room of a map one, whole, entered, outside (`extraction.room_odds`)?
 
 Simulated scans are extracted with and without the sensor's places, robots' grids and scans of buildings with their surroundings
 without; what is true about their rooms answers. Each scan counts alike per root of its rooms, so that hospitals do not outweigh

@@ -53,15 +53,17 @@ LOOSE = 5.0  # m: how far a pose may slide where no wall holds it
 
 @dataclass(frozen=True)
 class LocateSettings:
-    """Args:
-    sure: probability from which on a place, or a few places together, is told.
-    absent: probability, against the likeliest place alone, from which on "not here" is told.
-    coarse: poses that are refined.
-    coarse_of_storey: … of one storey.
-    sample: columns of the scan by which these are refined and ranked.
-    judged: poses that are judged closely.
-    shown: runners-up that are told.
-    alike: places between which it "cannot tell", at most.
+    """Settings of `locate`.
+
+    Args:
+        sure: probability from which on a place, or a few places together, is told.
+        absent: probability, against the likeliest place alone, from which on "not here" is told.
+        coarse: poses that are refined.
+        coarse_of_storey: … of one storey.
+        sample: columns of the scan by which these are refined and ranked.
+        judged: poses that are judged closely.
+        shown: runners-up that are told.
+        alike: places between which it "cannot tell", at most.
     """
 
     sure: float = 0.9
