@@ -39,12 +39,12 @@ TINY = ["data.scans=4", "data.seed=0", "data.folder=", "steps=6", "batch=2", "cr
 
 
 def measure_peak() -> int:
-    """MB that this process held at most."""
+    """Return how many MB this process held at most."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
 
 
 def measure_held() -> int:
-    """MB that this process holds now."""
+    """Return how many MB this process holds now."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") // 2**20
 
 
@@ -94,7 +94,7 @@ def rooms(most: int = 320) -> None:
 
 
 def simulate_partial_clouds(count: int, rooms: int = 4) -> list[PointCloud]:
-    """Scans of a few rooms each of one office, each in a frame of its own."""
+    """Simulate scans of a few rooms each of one office, each in a frame of its own."""
     building = make_building("office", SEED)
     out = []
     for k in range(count):
@@ -199,7 +199,7 @@ def kills(count: int = 8) -> None:
 
 
 def count_lines(path: Path) -> int:
-    """Lines of a file; 0 where there is none."""
+    """Count the lines of a file; 0 where there is none."""
     return path.read_bytes().count(b"\n") if path.exists() else 0
 
 

@@ -130,7 +130,7 @@ class PlaceNetwork(nn.Module):
         self.out = nn.Linear(widths[-1], 1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Log odds."""
+        """Compute the log odds."""
         for layer in self.layers.values():
             x = layer(x)
         pooled = torch.cat([x.mean(dim=(2, 3)), x.amax(dim=(2, 3))], dim=1)

@@ -129,8 +129,8 @@ class Embedder(nn.Module):
         return nn.functional.normalize(self.project(rooms), dim=1), self.dustbin(rooms)[:, 0]
 
     def embed_rotations(self, tensors: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Embeddings (R, D), or, of a network that tells turns apart, (R, 4, D): of the map turned by 0 to 3 quarter turns; and
-        the mean of the dustbins (R,)."""
+        """Return embeddings (R, D), or, of a network that tells turns apart, (R, 4, D): of the map turned by 0 to 3 quarter
+        turns; and the mean of the dustbins (R,)."""
         if self.network.turns == 1:
             return self(tensors)
         rows, bins = zip(*(self(rotate_quarter_turns(tensors, k)) for k in range(self.network.turns)), strict=True)
@@ -162,7 +162,8 @@ def rotate_quarter_turns(tensors: Mapping[str, Tensor], turns: int) -> dict[str,
 
 
 def match_scores(a: Tensor, b: Tensor, bin_a: Tensor, bin_b: Tensor, temperature: Tensor | float) -> tuple[Tensor, Tensor]:
-    """Logarithms of the probabilities that row i's partner is column j, or, in the last place, that it has none; and vice versa.
+    """Return the logarithms of the probabilities that row i's partner is column j, or, in the last place, that it has none; and
+    vice versa.
 
     Args:
         a, b: (n, D), (m, D) embeddings of two maps.

@@ -95,7 +95,8 @@ class GraphRewriter:
         return node if node is not None and node.op_type == kind and len(self.users[name]) == 1 else None
 
     def fold_normalisation(self, node: Any) -> bool:
-        """Weights and bias of the convolution before a normalisation, times and less what this is of each channel."""
+        """Fold a normalisation into the weights and the bias of the convolution before it, times and less what this is of each
+        channel."""
         conv = self._find_source(node.input[0], "Conv") if node.op_type == "BatchNormalization" else None
         if conv is None or conv.input[1] not in self.shapes or len(conv.input) < 3 or conv.input[2] in self.shapes:
             return False  # a bias of the convolution's own would have to be weighed, too
@@ -114,7 +115,8 @@ class GraphRewriter:
         return True
 
     def split_enlarged(self, node: Any) -> bool:
-        """The convolution of 3 x 3 of what was enlarged beside something else, and what only each element decides after it."""
+        """Split the convolution of 3 x 3 of what was enlarged beside something else, and what only each element decides after
+        it."""
         joined = self._find_source(node.input[0], "Concat") if node.op_type == "Conv" else None
         if joined is None or len(joined.input) != 2:
             return False
@@ -154,7 +156,7 @@ class GraphRewriter:
         return True
 
     def _count_channels(self, name: str) -> int:
-        """Of what a convolution, possibly followed by a `Relu`, gives, or one that was split already."""
+        """Count the channels of what a convolution, possibly followed by a `Relu`, gives, or one that was split already."""
         while (node := self.producer[name]).op_type != "Conv":
             name = node.input[0]
         return self.shapes[node.input[1]][0]
@@ -167,7 +169,7 @@ class GraphRewriter:
         return users[0]
 
     def write_exponentials(self, node: Any) -> bool:
-        """Softmax over channels: the runtime's own turns the tensor for it, and back."""
+        """Write the softmax over channels by exponentials: the runtime's own turns the tensor for it, and back."""
         if node.op_type != "Softmax" or [a.i for a in node.attribute if a.name == "axis"] != [1]:
             return False
         (x,), out = node.input, node.output[0]
@@ -243,7 +245,7 @@ def check_exporter() -> None:
 
 
 def _traced(module: nn.Module, signature: Signature, sample: Sequence[Tensor], start: int = 0) -> Any:
-    """The model of ONNX of a network whose inputs are those of the signature from `start` on."""
+    """Return the ONNX model of a network whose inputs are those of the signature from `start` on."""
     inputs = dict(list(signature.inputs.items())[start:])
     shapes = tuple(
         {axis: torch.export.Dim.DYNAMIC for axis, size in enumerate(tensor.shape) if isinstance(size, str)}
@@ -322,7 +324,7 @@ def _strip(graph: Any) -> None:
 
 
 def build_sample(signature: Signature) -> list[Tensor]:
-    """Random inputs of a signature, in which sizes of different names differ."""
+    """Build random inputs of a signature, in which sizes of different names differ."""
     names = sorted({size for tensor in signature.inputs.values() for size in tensor.shape if isinstance(size, str)})
     sizes = {name: 5 + 2 * k for k, name in enumerate(names)}
     shapes = [[sizes[n] if isinstance(n, str) else n for n in t.shape] for t in signature.inputs.values()]
@@ -333,7 +335,7 @@ def build_sample(signature: Signature) -> list[Tensor]:
 def build_embedder_sample(
     network: Embedder, rooms: int = 6, edges: int = 10, pairs: int = 12, seed: int = 0
 ) -> dict[str, Tensor]:
-    """Random tensors of a map, of the shapes that an embedder reads."""
+    """Build random tensors of a map, of the shapes that an embedder reads."""
     generator, sizes = torch.Generator().manual_seed(seed), {"rooms": rooms, "edges": edges, "pairs": pairs}
     sample = {}
     for name, tensor in build_embedder_signature(network.network).inputs.items():

@@ -24,14 +24,16 @@ NEVER_LOGIT = -1e4  # a logit that is never chosen; minus infinity would make gr
 
 @dataclass
 class LossSettings:
-    """Args:
-    kind: of `topomerge.registry.LOSSES`.
-    easy: weight of the other buildings' rooms among the negatives.
-    dustbin: weight of the choice between the other map's rooms and no partner at all.
-    margin: of the triplets, in distances between unit vectors.
-    temperature: of NT-Xent; that of InfoNCE is learned.
-    faint: weight of rooms of which one of the maps has a part only (not `Truth.clear`).
-    options: numbers that a loss of one's own takes, by name.
+    """Settings of the loss of matching rooms.
+
+    Args:
+        kind: of `topomerge.registry.LOSSES`.
+        easy: weight of the other buildings' rooms among the negatives.
+        dustbin: weight of the choice between the other map's rooms and no partner at all.
+        margin: of the triplets, in distances between unit vectors.
+        temperature: of NT-Xent; that of InfoNCE is learned.
+        faint: weight of rooms of which one of the maps has a part only (not `Truth.clear`).
+        options: numbers that a loss of one's own takes, by name.
     """
 
     kind: str = "infonce"
@@ -139,7 +141,7 @@ def compute_matching_loss(
     truth: Truth,
     processes: Processes | None = None,
 ) -> dict[str, Tensor]:
-    """Losses by name; `loss` is their weighted sum. Each is the mean over rooms, the faint ones weighing less.
+    """Compute the losses by name; `loss` is their weighted sum. Each is the mean over rooms, the faint ones weighing less.
 
     The mean of the losses of several processes, and of their gradients, is that of one process with all their pairs.
 
@@ -169,18 +171,18 @@ def _compute_weighted_mean(values: Tensor, weight: Tensor, processes: Processes 
 
 
 def score_info_nce(settings: LossSettings, batch: RoomBatch) -> RoomLosses:
-    """InfoNCE at the learned temperature."""
+    """Compute InfoNCE at the learned temperature."""
     return RoomLosses(*compute_info_nce(batch.embedding, batch.temperature, batch.truth, settings.easy, batch.gather()), True)
 
 
 def score_nt_xent(settings: LossSettings, batch: RoomBatch) -> RoomLosses:
-    """NT-Xent: at a temperature that stays, and all negatives count alike."""
+    """Compute NT-Xent: at a temperature that stays, and all negatives count alike."""
     temperature = batch.embedding.new_tensor(settings.temperature)
     return RoomLosses(*compute_info_nce(batch.embedding, temperature, batch.truth, 1.0, batch.gather()))
 
 
 def score_triplets(settings: LossSettings, batch: RoomBatch) -> RoomLosses:
-    """Triplets, whose negatives are of the same pair."""
+    """Compute the triplet loss, whose negatives are of the same pair."""
     return RoomLosses(*compute_triplet_loss(batch.embedding, batch.truth, settings.margin))
 
 

@@ -152,13 +152,14 @@ class RoomMatcher(nn.Module):
         return partners
 
     def compute_first_guess(self, maps: Sequence[Rooms]) -> Tensor:
-        """How likely each pair of rooms is by their rows alone: what votes in the first stage."""
+        """Return how likely each pair of rooms is by their rows alone: what votes in the first stage."""
         cosine = FIRST_SHARPNESS * (maps[0].rows @ maps[1].rows.T)
         likely: Tensor = (cosine.softmax(dim=1) * cosine.softmax(dim=0)).sqrt()
         return likely
 
     def stage(self, k: int, maps: Sequence[Rooms], states: Sequence[Tensor], votes: Tensor) -> tuple[list[Tensor], Partners]:
-        """States of the rooms of both maps after a stage, and their partners by them. The first stage reads no states."""
+        """Return the states of the rooms of both maps after a stage, and their partners by them. The first stage reads no
+        states."""
         if k:
             after: list[Tensor] = self.layers[k - 1](
                 states, [compute_relative_positions(m.places, m.heights) for m in maps], votes
@@ -184,7 +185,7 @@ class MatcherStage(nn.Module):
         self.network, self.k = network, k
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """States of the rooms after the stage, and probabilities of their partners."""
+        """Return the states of the rooms after the stage, and probabilities of their partners."""
         (*a, state_a), (*b, state_b), votes = inputs[:5], inputs[5:10], inputs[10]
         states, partners = self.network.stage(self.k, [Rooms(*a), Rooms(*b)], [state_a, state_b], votes)
         return *states, partners.rows.exp(), partners.columns.exp()

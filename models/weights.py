@@ -119,7 +119,7 @@ def read_state(folder: Path) -> tuple[Embedder, dict[str, Any]]:
 
 
 def _filled(network: Embedder, weights: Mapping[str, Tensor], path: str | Path | None) -> Embedder:
-    """The network with weights, ready to use."""
+    """Return the network with weights, ready to use."""
     try:
         network.load_state_dict(weights)
     except RuntimeError as error:

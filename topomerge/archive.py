@@ -230,7 +230,7 @@ def _apply_to_archive(path: str | Path, kind: str, use: Callable[[zipfile.ZipFil
 
 
 def _list_entries(archive: zipfile.ZipFile, size: int, only: Collection[str] | None = None) -> list[tuple[str, zipfile.ZipInfo]]:
-    """Names and places of the arrays in a file of so many bytes; what they declare is checked before any is read."""
+    """List the names and places of the arrays in a file of so many bytes; what they declare is checked before any is read."""
     entries = [entry for entry in archive.infolist() if entry.filename.endswith(".npy")]
     if entries and len({entry.filename for entry in entries}) < len(archive.infolist()):
         raise ValueError("something is in it twice, or is no array")
@@ -267,7 +267,7 @@ def _parse_header(entry: zipfile.ZipInfo, stream: IO[bytes]) -> tuple[ArrayHeade
 
 
 def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Array:
-    """One array, unpacked into the memory that it stays in."""
+    """Unpack one array into the memory that it stays in."""
     with archive.open(entry) as stream:
         head, start = _parse_header(entry, stream)
         body = bytearray(head.size * head.dtype.itemsize)

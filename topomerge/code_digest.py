@@ -66,7 +66,7 @@ def compute_data_digest(*modules: str, package: Path = HERE) -> str:
 
 @cache
 def find_reached_modules(*modules: str, package: Path = HERE) -> dict[str, Path]:
-    """Name -> file of modules and of all that they import within the house, sorted by name."""
+    """Map the names to the files of modules and of all that they import within the house, sorted by name."""
     files: dict[str, Path] = {}
     waiting = list(modules)
     for module in modules:
@@ -85,7 +85,7 @@ def find_reached_modules(*modules: str, package: Path = HERE) -> dict[str, Path]
 
 @cache
 def find_data_files(path: Path, package: Path = HERE) -> list[Path]:
-    """Data files that a module names, beside it, in a folder beside it, or among the networks; sorted."""
+    """Find the data files that a module names, beside it, in a folder beside it, or among the networks; sorted."""
     texts = _read_source(path).texts
     files = []
     for entry in path.parent.iterdir():
@@ -119,7 +119,7 @@ def _compute_hash(text: str) -> str:
 
 @cache
 def _find_module_file(module: str, package: Path) -> Path | None:
-    """File of a module of the house; None of anything else, such as a function's name behind its module's."""
+    """Return the file of a module of the house; None of anything else, such as a function's name behind its module's."""
     top, *parts = module.split(".")
     if top != TOP:
         return None
@@ -149,7 +149,7 @@ def _read_source(path: Path) -> _Source:
 
 @cache
 def _parse_source(text: str) -> _Source:
-    """Of a file's text: the same file of another copy of the package is not read a second time."""
+    """Parse a file's text: the same file of another copy of the package is not read a second time."""
     reading = _SourceReader()
     reading.read(ast.parse(text))
     description = hashlib.sha256("\n".join(reading.tokens).encode())
@@ -207,7 +207,7 @@ def _iter_imported_names(node: ast.AST) -> Iterator[str]:
 
 
 def _iter_imports(path: Path, package: Path) -> Iterator[str]:
-    """Names in the house that a file imports; those behind a module's name may be functions or classes of it."""
+    """Yield the names in the house that a file imports; those behind a module's name may be functions or classes of it."""
     homes = _read_homes(package)
     for name in _read_source(path).names:
         name = homes.get(name, name)
@@ -223,7 +223,7 @@ def _iter_imports(path: Path, package: Path) -> Iterator[str]:
 
 @cache
 def _read_homes(package: Path) -> dict[str, str]:
-    """``topomerge.extract`` -> the module that it comes from: `_HOMES` of the face."""
+    """Map names such as ``topomerge.extract`` to the module that each comes from: `_HOMES` of the face."""
     for node in ast.parse((package / "__init__.py").read_text(encoding="utf-8")).body:
         if isinstance(node, ast.Assign) and [ast.unparse(t) for t in node.targets] == ["_HOMES"]:
             homes: dict[str, str] = ast.literal_eval(node.value)

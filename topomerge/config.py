@@ -128,7 +128,7 @@ def _shorten_error(error: Exception) -> str:
 
 
 def name_by_sweep(arguments: Sequence[str]) -> list[str]:
-    """Words of `train.py`; of a sweep with one more, by which names of runs hold what differs between them only."""
+    """Return the words of `train.py`; of a sweep with one more, by which names of runs hold what differs between them only."""
     if not {"-m", "--multirun"} & set(arguments):
         return list(arguments)
     from hydra.core.override_parser.overrides_parser import OverridesParser

@@ -67,7 +67,8 @@ def count_contingency(true: Array, extracted: Array, trues: int, extracted_rooms
 
 
 def compute_overlaps(true: Array, extracted: Array, trues: int, extracted_rooms: int) -> tuple[Array, Array]:
-    """IoU and Matthews correlation (trues, extracted_rooms) of the mask of each true room against the mask of each found one.
+    """Compute the IoU and Matthews correlation (trues, extracted_rooms) of the mask of each true room against the mask of each
+    found one.
 
     The correlation is over all places given, 0 where one of the masks is empty or full.
     """
@@ -162,7 +163,7 @@ def score_doors(true: Array, extracted: Array, counted: Array, others: Array | N
 
 
 def score_edges(true: Iterable[Iterable[int]], extracted: Array, assigned: Array, counted: Array) -> Scores:
-    """Connected pairs of rooms found against the true ones, each pair once however many doors it has.
+    """Score connected pairs of rooms found against the true ones, each pair once however many doors it has.
 
     Args:
         true: pairs of true rooms.

@@ -36,7 +36,7 @@ def tell_step(share: float, text: str) -> None:
 
 
 def is_progress_asked() -> bool:
-    """Was this process started by one that wants to be told?"""
+    """Return whether this process was started by one that wants to be told."""
     return os.environ.get(PROGRESS_VARIABLE) == "lines"
 
 
@@ -67,14 +67,14 @@ class Stopwatch:
         self._started = self._lap = self._began = time.perf_counter()
 
     def begin(self, step: str, done: float) -> None:
-        """A step begins, at which this share of all work is done."""
+        """Begin a step, at which this share of all work is done."""
         self.end()
         if self.progress is not None:
             self.progress(done, step)
         self._step, self._began = step, time.perf_counter()
 
     def end(self) -> dict[str, float]:
-        """End the last step; returns step -> s."""
+        """End the last step; return step -> s."""
         if self._step is not None:
             self.seconds[self._step] = round(time.perf_counter() - self._began, 4)
         self._step = None
@@ -99,7 +99,7 @@ class Stopwatch:
         self.seconds[step] = self.seconds.get(step, 0.0) + time.perf_counter() - began
 
     def build_part_progress(self, begin: float, end: float) -> Progress | None:
-        """News from within a step that takes the work from one share done to another."""
+        """Build the progress for news from within a step that takes the work from one share done to another."""
         if self.progress is None:
             return None
         progress = self.progress

@@ -21,8 +21,8 @@ CHANCE_ROUNDS = 500
 
 
 def compute_exact_interval(hits: int, n: int) -> tuple[float, float]:
-    """Ends of the 95 % interval of a share of which `hits` of `n` were seen (Clopper & Pearson, Biometrika 1934); 0 and 1 where
-    n is 0.
+    """Compute the ends of the 95 % interval of a share of which `hits` of `n` were seen (Clopper & Pearson, Biometrika 1934); 0
+    and 1 where n is 0.
 
     Raises:
         ValueError: hits below 0 or above n.
@@ -35,8 +35,8 @@ def compute_exact_interval(hits: int, n: int) -> tuple[float, float]:
 
 
 def estimate_mean(values: Array) -> tuple[float, float, float]:
-    """Mean of a few independent values (n,), such as scores of seeds, and the ends of its 95 % confidence interval by Student's
-    t, which are nan where there is one value only."""
+    """Estimate the mean of a few independent values (n,), such as scores of seeds, and the ends of its 95 % confidence interval
+    by Student's t, which are nan where there is one value only."""
     values = np.asarray(values, float)
     mean = float(values.mean())
     if len(values) < 2:
@@ -88,7 +88,7 @@ def format_interval(values: Array, groups: Array, digits: int = 2, unit: float =
 
 
 def _sum_groups(values: Array, groups: Array) -> tuple[Array, Array]:
-    """Sum and number of the finite values of each group that has any."""
+    """Return the sum and number of the finite values of each group that has any."""
     values, groups = np.asarray(values, float), np.asarray(groups)
     finite = np.isfinite(values)
     _, group = np.unique(groups[finite], return_inverse=True)

@@ -39,7 +39,8 @@ Problem = tuple[Array, Joints, Measurements, Array]
 
 
 def storey(rooms: int, seed: int = 0) -> tuple[Array, Array]:
-    """Points (n, 3) of the walls and of the floor of a storey: rows of rooms of random widths, each with a door to a corridor."""
+    """Simulate points (n, 3) of the walls and of the floor of a storey: rows of rooms of random widths, each with a door to a
+    corridor."""
     rng = np.random.default_rng(seed)
     long = max(round(np.sqrt(rooms * 1.5)), 2)
     walls: list[Array] = []
@@ -64,13 +65,13 @@ def storey(rooms: int, seed: int = 0) -> tuple[Array, Array]:
 
 
 def _line(start: tuple[float, float], end: tuple[float, float]) -> Array:
-    """Points (n, 2) on a wall, two a cell."""
+    """Return points (n, 2) on a wall, two a cell."""
     count = max(int(np.hypot(end[0] - start[0], end[1] - start[1]) / EDGE * 2), 2)
     return np.linspace(start, end, count)
 
 
 def wave_points(points: Array) -> Array:
-    """The points moved by waves that are long and low: drift without a jump."""
+    """Return the points moved by waves that are long and low: drift without a jump."""
     out = points.copy()
     for k, turn in enumerate((1.0, 0.6)):
         phase = points[:, :2] @ (np.cos(turn + k), np.sin(turn + k)) * 2 * np.pi / (BEND_LENGTH * (1 + k))
@@ -79,7 +80,7 @@ def wave_points(points: Array) -> Array:
 
 
 def build_cells(points: Array) -> VoxelGrid:
-    """Occupied cells of points."""
+    """Build the occupied cells of points."""
     low = points.min(axis=0) - EDGE
     return VoxelGrid.from_cells(np.unique(np.floor((points - low) / EDGE).astype(np.int32), axis=0), low, EDGE)
 
@@ -155,7 +156,7 @@ def time_bending(solve: Callable[[], Array]) -> tuple[Array, float]:
 
 
 def main(*rooms: str) -> None:
-    """A line for each number of rooms."""
+    """Print a line for each number of rooms."""
     try:
         import gtsam
     except ImportError as error:

@@ -56,7 +56,7 @@ class PeerAnswer:
 
 
 def run_kiss(b: Array, a: Array, voxel: float) -> Iterator[tuple[str, PeerAnswer]]:
-    """KISS-Matcher with rotations in space and, as ``…q``, with Quatro's yaw; clouds (n, 3) m."""
+    """Run KISS-Matcher with rotations in space and, as ``…q``, with Quatro's yaw; clouds (n, 3) m."""
     import kiss_matcher
 
     name, begun = f"kiss{round(10 * voxel):02d}", time.process_time()
@@ -78,7 +78,7 @@ def run_kiss(b: Array, a: Array, voxel: float) -> Iterator[tuple[str, PeerAnswer
 
 
 def run_open3d(b: Array, a: Array) -> Iterator[tuple[str, PeerAnswer]]:
-    """RANSAC and FGR with one set of features, whose time counts for both; clouds (n, 3) m."""
+    """Run RANSAC and FGR with one set of features, whose time counts for both; clouds (n, 3) m."""
     import open3d as o3d
 
     o3d.utility.random.seed(0)
@@ -118,7 +118,7 @@ class Refinement:
         self.prepared = time.process_time() - begun
 
     def refine_answer(self, pose: Array, scores: dict[str, float], seconds: float) -> PeerAnswer:
-        """The answer of a solver with its refined pose and the scores of that."""
+        """Return the answer of a solver with its refined pose and the scores of that."""
         import open3d as o3d
 
         reg = o3d.pipelines.registration
@@ -160,7 +160,8 @@ class GuardedWork:
         self.pipe: Any = None
 
     def __call__(self, *args: Any) -> tuple[dict[str, Any], str, float]:
-        """The answers; why there are no more (empty, `TOO_LONG` or `CALL_FAILED`); the seconds of processor that it took."""
+        """Return the answers; why there are no more (empty, `TOO_LONG` or `CALL_FAILED`); the seconds of processor that it
+        took."""
         if self.process is None:
             context = multiprocessing.get_context("spawn")
             self.pipe, theirs = context.Pipe()
@@ -192,7 +193,7 @@ class GuardedWork:
 
 
 def _answer_calls(pipe: Connection, work: Work, seconds: float) -> None:
-    """In the process: the answers of each call, each under its cap; then why there are no more, None if that was all."""
+    """Send, in the process, the answers of each call, each under its cap; then why there are no more, None if that was all."""
     resource.setrlimit(resource.RLIMIT_AS, (CALL_BYTES, CALL_BYTES))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     while True:
@@ -209,6 +210,6 @@ def _answer_calls(pipe: Connection, work: Work, seconds: float) -> None:
 
 
 def _cap(seconds: float) -> None:
-    """From now on so many seconds of processor, rounded up, before the system ends the process."""
+    """Allow so many seconds of processor from now on, rounded up, before the system ends the process."""
     hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
     resource.setrlimit(resource.RLIMIT_CPU, (int(time.process_time() + seconds) + 1, hard))

@@ -46,7 +46,7 @@ class PeerPair:
 
 
 def list_pair_files(split: str) -> list[Path]:
-    """Files of a split, made where they are missing."""
+    """List the files of a split, made where they are missing."""
     return make_pair_files(split, "cache", 1, print)
 
 
@@ -56,7 +56,7 @@ def find_bin(value: float, bins: Mapping[str, tuple[float, float]] = AREA_BINS) 
 
 
 def find_cell(about: Mapping[str, Any]) -> tuple[str, str]:
-    """Class of sensors, and the area in common or, of pairs that must not merge, their kind."""
+    """Return the class of sensors, and the area in common or, of pairs that must not merge, their kind."""
     alike = about["kind"] == "overlap"
     shared = "nothing in common" if alike and about["common"] < 1 else ""
     return modality(about), shared or (find_bin(about["common"]) if alike else about["kind"])
@@ -69,7 +69,7 @@ def described(pair: GridPair) -> dict[str, Any]:
 
 
 def iter_in_turn(groups: Mapping[tuple[str, str], Sequence[Path]], many: Callable[[tuple[str, str]], int]) -> Iterator[Path]:
-    """`many` of each group in each turn, until all have had theirs."""
+    """Yield `many` of each group in each turn, until all have had theirs."""
     turns = max((-(-len(paths) // many(key)) for key, paths in groups.items()), default=0)
     for k in range(turns):
         for key, paths in sorted(groups.items()):
@@ -77,7 +77,7 @@ def iter_in_turn(groups: Mapping[tuple[str, str], Sequence[Path]], many: Callabl
 
 
 def group_by_cell(paths: Sequence[Path]) -> dict[tuple[str, str], list[Path]]:
-    """Files by `find_cell`; drawings of unknown scale are left out, as the peers have no scale to find."""
+    """Group files by `find_cell`; drawings of unknown scale are left out, as the peers have no scale to find."""
     groups: dict[tuple[str, str], list[Path]] = {}
     for path in paths:
         with np.load(path) as arrays:
@@ -88,7 +88,7 @@ def group_by_cell(paths: Sequence[Path]) -> dict[tuple[str, str], list[Path]]:
 
 
 def list_cached_order(what: str) -> list[Path]:
-    """Files of ``train``, ``test``, ``raw`` or ``thinned`` in their order; of a manifest of such pairs, cells in turn.
+    """List the files of ``train``, ``test``, ``raw`` or ``thinned`` in their order; of a manifest of such pairs, cells in turn.
 
     Ordinary scans that share most are four in each turn; in the test set thirty of them come first.
     """
@@ -117,7 +117,7 @@ def _list_drawings(split: str) -> list[Path]:
 
 
 def iter_peer_pairs(what: str, done: set[str]) -> Iterator[PeerPair]:
-    """The pairs that are not done: of `list_cached_order`, or ``real``, or ``heldout`` (maps that `evaluate.py` kept).
+    """Yield the pairs that are not done: of `list_cached_order`, or ``real``, or ``heldout`` (maps that `evaluate.py` kept).
 
     Raises:
         InputError: the cached pairs of ``raw`` were made by another version.
@@ -139,7 +139,7 @@ def iter_peer_pairs(what: str, done: set[str]) -> Iterator[PeerPair]:
 
 
 def thin_pair(pair: GridPair) -> PeerPair:
-    """The means of the points of 0.1 m cells; b at the scale of a."""
+    """Return the means of the points of 0.1 m cells; b at the scale of a."""
     size = pair.truth.scale if pair.truth is not None else 1.0
     return PeerPair(pair, compute_cell_means(pair.b).astype(float) * size, compute_cell_means(pair.a).astype(float))
 
@@ -151,7 +151,7 @@ def load_raw_items(names: set[str]) -> dict[str, tuple[GridItem, Library]]:
 
 
 def simulate_raw_pair(pair: GridPair, item: GridItem, plans: Library) -> PeerPair:
-    """All simulated points of a cached pair; its cells are what they were.
+    """Return all simulated points of a cached pair; its cells are what they were.
 
     Raises:
         ValueError: the generator gives another pair by now.
@@ -165,7 +165,7 @@ def simulate_raw_pair(pair: GridPair, item: GridItem, plans: Library) -> PeerPai
 
 
 def iter_heldout_pairs() -> Iterator[GridPair]:
-    """Held-out pairs of extracted maps that show something in common, as cells."""
+    """Yield held-out pairs of extracted maps that show something in common, as cells."""
     for evaluation_pair in load_set(HELDOUT):
         if evaluation_pair.transform is None or evaluation_pair.about["common"] < 1 or evaluation_pair.about["scale_free"]:
             continue

@@ -101,14 +101,14 @@ def build_floor_grids(scan: Scan) -> list[FloorGrid | None]:
 
 
 def _close_gaps(mask: Array) -> Array:
-    """The mask with gaps closed."""
+    """Return the mask with gaps closed."""
     reach = round(CLOSED_GAPS / CELL / 2)
     size = 2 * reach + 1
     return mask | ndimage.binary_closing(np.pad(mask, size), np.ones((size, size)))[size:-size, size:-size]
 
 
 def _remove_pieces(mask: Array, least: float) -> Array:
-    """Without connected pieces of less than an area (m2)."""
+    """Remove connected pieces of less than an area (m2)."""
     pieces, _ = ndimage.label(mask, np.ones((3, 3)))
     large = np.bincount(pieces.ravel()) * CELL**2 >= least
     large[0] = False
@@ -116,7 +116,7 @@ def _remove_pieces(mask: Array, least: float) -> Array:
 
 
 def segment_scan(scan: Scan, method: str, grids: list[FloorGrid | None]) -> tuple[Array, int]:
-    """The room of each column of the truth's raster by a classic method, -1 none, and how many rooms there are.
+    """Return the room of each column of the truth's raster by a classic method, -1 none, and how many rooms there are.
 
     Words are spread as those of our maps are (`floor_truth.predict_columns`): furniture has the room that is the nearest.
     """
@@ -148,7 +148,8 @@ def _rasterise_labels(truth: FloorTruth, grid: FloorGrid, labels: Array) -> Arra
 
 
 def score_map(truth: FloorTruth, columns: Array, count: int) -> FloorScores:
-    """The scores of rooms alone. Rooms that lie mostly in true ones that were not visited are not held against the method."""
+    """Compute the scores of rooms alone. Rooms that lie mostly in true ones that were not visited are not held against the
+    method."""
     foreign = (truth.raster >= 0) & ~np.append(truth.visited, False)[truth.raster] & (columns >= 0)
     every = (truth.raster != NOT_JUDGED) & (columns >= 0)
     glimpsed = 2 * np.bincount(columns[foreign], minlength=count) > np.bincount(columns[every], minlength=count)
@@ -160,9 +161,9 @@ def score_map(truth: FloorTruth, columns: Array, count: int) -> FloorScores:
 
 
 def compute_survey_scores(truth: FloorTruth, columns: Array) -> tuple[float, float]:
-    """Precision and recall as the survey has them, by area: the mean over the rooms of a map of the largest share of one that
-    lies in one true room, and the mean over the true rooms of the largest share of one that lies in one room of the map. Cutting
-    a room costs recall alone, and uniting two costs precision alone. Only what is of visited rooms counts.
+    """Compute precision and recall as the survey has them, by area: the mean over the rooms of a map of the largest share of one
+    that lies in one true room, and the mean over the true rooms of the largest share of one that lies in one room of the map.
+    Cutting a room costs recall alone, and uniting two costs precision alone. Only what is of visited rooms counts.
     """
     visited = (truth.raster >= 0) & np.append(truth.visited, False)[truth.raster]
     count = int(columns.max()) + 1

@@ -59,18 +59,18 @@ Outcome = dict[str, Any]  # status (empty: answered), err, err_icp, scores, seco
 
 
 def get_target(what: str) -> Path:
-    """Where the lines of a set of pairs are."""
+    """Return where the lines of a set of pairs are."""
     return CACHE / f"peers_{Path(what).stem if what.endswith('.jsonl') else what}.jsonl"
 
 
 def read_result_rows(what: str) -> list[dict[str, Any]]:
-    """Lines of a set of pairs; none where nothing was measured."""
+    """Read the lines of a set of pairs; none where nothing was measured."""
     path = get_target(what)
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
 def run_ours(given: PeerPair) -> Outcome:
-    """From points to the pose: cells, plans, search, verdict."""
+    """Go from points to the pose: cells, plans, search, verdict."""
     from topomerge.extraction.voxels import voxelise
     from topomerge.registration.pipeline import register
 
@@ -87,7 +87,8 @@ def run_ours(given: PeerPair) -> Outcome:
 
 
 def time_whole_way(pair: GridPair) -> dict[str, float]:
-    """Seconds from two clouds to the joined map and its rooms: extraction of both, and `merge` (joined even where refused)."""
+    """Return the seconds from two clouds to the joined map and its rooms: extraction of both, and `merge` (joined even where
+    refused)."""
     from topomerge.extraction.extract import extract
     from topomerge.fusion.pipeline import merge
 
@@ -99,12 +100,12 @@ def time_whole_way(pair: GridPair) -> dict[str, float]:
 
 
 def cloud(grid: VoxelGrid, free: VoxelGrid | None = None) -> PointCloud:
-    """A grid's points as a cloud."""
+    """Return a grid's points as a cloud."""
     return PointCloud(compute_cell_means(grid).astype(np.float32), free=free)
 
 
 def run_learned(pair: GridPair) -> Outcome:
-    """`merge` of the extracted maps: rooms matched by the embedder that ships propose poses, too."""
+    """Run `merge` on the extracted maps: rooms matched by the embedder that ships propose poses, too."""
     from topomerge.fusion.pipeline import merge
 
     maps = pair.about["evaluation_pair"].maps()  # type: ignore[attr-defined]
@@ -118,7 +119,7 @@ def run_learned(pair: GridPair) -> Outcome:
 
 
 def peers(given: PeerPair, calls: Sequence[PeerCall] = PEER_CALLS) -> tuple[dict[str, Outcome], float]:
-    """The outcomes of peers, and the seconds of processor that their processes took."""
+    """Return the outcomes of peers, and the seconds of processor that their processes took."""
     outcomes: dict[str, Outcome] = {}
     used, judged = 0.0, scale_pair(given.pair)
     for call, names in calls:
@@ -136,13 +137,13 @@ def peers(given: PeerPair, calls: Sequence[PeerCall] = PEER_CALLS) -> tuple[dict
 
 
 def _measure_error(matrix: Array, pair: GridPair) -> list[float] | None:
-    """Of the pose made upright; None where it turns the map over, or no pose is right."""
+    """Measure the error of the pose made upright; None where it turns the map over, or no pose is right."""
     pose = convert_to_upright(matrix, pair)
     return None if pose is None else compute_pose_error(pose, pair)
 
 
 def measured(given: PeerPair, what: str, number: int) -> tuple[dict[str, Any], float]:
-    """The line of a pair of a set, and the seconds that the peers took.
+    """Return the line of a pair of a set, and the seconds that the peers took.
 
     Args:
         number: of the pair in its set: some methods get every so many pairs only.
@@ -162,7 +163,7 @@ def measured(given: PeerPair, what: str, number: int) -> tuple[dict[str, Any], f
 
 
 def read_done(target: Path) -> set[str]:
-    """Names of the pairs that a file has lines of."""
+    """Read the names of the pairs that a file has lines of."""
     return {json.loads(line)["name"] for line in target.read_text().splitlines()} if target.exists() else set()
 
 
@@ -208,8 +209,8 @@ def run(seconds: float, what: str = "test") -> None:
 
 
 def time_whole_ways(pairs: str = "9") -> None:
-    """Of the first test pairs, which share most: seconds from two clouds to the joined map, over those that KISS-Matcher (0.2 m)
-    takes to the refined pose. The first pair is run twice, as compiled code is loaded."""
+    """Measure, on the first test pairs, which share most, the seconds from two clouds to the joined map, over those that
+    KISS-Matcher (0.2 m) takes to the refined pose. The first pair is run twice, as compiled code is loaded."""
     check_peers()
     _pin_to_one_core()
     ratios: list[float] = []
@@ -224,8 +225,9 @@ def time_whole_ways(pairs: str = "9") -> None:
 
 
 def time_whole_ways_of_files(*folders: str) -> None:
-    """Seconds of `topomerge merge` from two files to the report, start of Python included, over those that KISS-Matcher (0.2 m)
-    takes from points in memory to the refined pose. The first pair is merged twice, as compiled code is kept."""
+    """Measure the seconds of `topomerge merge` from two files to the report, start of Python included, over those that
+    KISS-Matcher (0.2 m) takes from points in memory to the refined pose. The first pair is merged twice, as compiled code is
+    kept."""
     from topomerge.io.points import read_points
 
     check_peers()
@@ -254,7 +256,7 @@ def time_whole_ways_of_files(*folders: str) -> None:
 
 
 def measure_ours_anew(what: str = "test") -> None:
-    """Ours alone, measured anew on the pairs that a file has lines of; what the peers answered stays."""
+    """Measure ours alone anew on the pairs that a file has lines of; what the peers answered stays."""
     target = get_target(what)
     lines = {row["name"]: row for row in map(json.loads, target.read_text().splitlines())}
     for given in iter_peer_pairs(what, set()):

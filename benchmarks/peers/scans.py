@@ -111,7 +111,7 @@ def tabulate(rows: Sequence[Row]) -> str:
 
 
 def is_within(found: Row, limits: tuple[float, float]) -> bool:
-    """Is a pose within m and rad of the true one?"""
+    """Return whether a pose is within m and rad of the true one."""
     return bool(found["away"] < limits[0] and found["turned"] < limits[1])
 
 

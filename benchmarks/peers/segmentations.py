@@ -30,7 +30,8 @@ TEETH = 3.0  # cells between the two walls of a point of the graph: below are th
 
 
 def segment_by_distance(free: Array, cell: float) -> Array:
-    """Seeds are what is further from everything occupied than a threshold: the one that gives most seeds of a room's size.
+    """Segment with seeds that are further from everything occupied than a threshold: the one that gives most seeds of a room's
+    size.
 
     Args:
         free: (h, w) bool.
@@ -49,8 +50,8 @@ def segment_by_distance(free: Array, cell: float) -> Array:
 
 
 def segment_by_erosion(free: Array, cell: float) -> Array:
-    """Free space is eroded cell by cell; a piece that has come apart from others and has a room's size is a seed and taken out,
-    and so is one that would vanish in the next step.
+    """Erode free space cell by cell; a piece that has come apart from others and has a room's size is a seed and taken out, and
+    so is one that would vanish in the next step.
 
     Args:
         free: (h, w) bool.
@@ -85,7 +86,7 @@ def segment_by_erosion(free: Array, cell: float) -> Array:
 
 
 def segment_by_voronoi(free: Array, cell: float) -> Array:
-    """Critical lines of the Voronoi graph cut free space; pieces that no door parts are joined again.
+    """Cut free space at critical lines of the Voronoi graph, and join again pieces that no door parts.
 
     Args:
         free: (h, w) bool.
@@ -148,7 +149,7 @@ def count_contacts(labels: Array, count: int) -> Array:
 
 
 def join_pieces(labels: Array, count: int, cell: float) -> Array:
-    """Pieces between critical lines joined by the survey's four rules, one after the other, the smallest piece first."""
+    """Join pieces between critical lines by the survey's four rules, one after the other, the smallest piece first."""
     touch = count_contacts(labels, count).astype(float)
     area = np.bincount(labels[labels >= 0], minlength=count) * cell**2
     name = np.arange(count)
@@ -164,7 +165,7 @@ def join_pieces(labels: Array, count: int, cell: float) -> Array:
 
 
 def _join(touch: Array, area: Array, name: Array, i: int, j: int) -> None:
-    """Piece i becomes part of piece j."""
+    """Make piece i part of piece j."""
     touch[j] += touch[i]
     touch[:, j] += touch[:, i]
     touch[i] = touch[:, i] = touch[j, j] = 0
@@ -174,7 +175,7 @@ def _join(touch: Array, area: Array, name: Array, i: int, j: int) -> None:
 
 
 def _measure_shares(touch: Array, i: int) -> tuple[Array, float, Array]:
-    """Shares of a piece's outline by neighbour, of walls, and its neighbours, the longest border first."""
+    """Return the shares of a piece's outline by neighbour, of walls, and its neighbours, the longest border first."""
     outline = max(float(touch[i].sum()), 1.0)
     shares = touch[i, :-1] / outline
     order = np.argsort(-shares, kind="stable")
@@ -252,7 +253,8 @@ def _prune_dead_ends(ends: Array, count: int) -> Array:
 
 
 def find_critical_lines(free: Array, cell: float) -> list[tuple[Array, Array]]:
-    """Rows and columns of the cells of each critical line: from a narrowest point of the graph to its two nearest walls.
+    """Return the rows and columns of the cells of each critical line: from a narrowest point of the graph to its two nearest
+    walls.
 
     Args:
         free: (h, w) bool.
@@ -278,7 +280,8 @@ def find_critical_lines(free: Array, cell: float) -> list[tuple[Array, Array]]:
 
 
 def _find_narrowest(points: Array, ends: Array, clearance: Array) -> Array:
-    """Edges that no other edge of the graph within their neighbourhood undercuts; every one of a stretch of even width."""
+    """Return the edges that no other edge of the graph within their neighbourhood undercuts; every one of a stretch of even
+    width."""
     length = np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1)
     count, edges = len(points), np.arange(len(ends))
     table = sparse.csr_matrix((np.tile(edges, 2), (ends.T.ravel(), ends[:, ::-1].T.ravel())), (count, count))
@@ -302,7 +305,7 @@ def _find_narrowest(points: Array, ends: Array, clearance: Array) -> Array:
 
 
 def _line(start: Array, middle: Array, end: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:
-    """Rows and columns of the cells from one wall over the middle to the other."""
+    """Return the rows and columns of the cells from one wall over the middle to the other."""
     steps = 2 + 3 * int(np.linalg.norm(start - middle) + np.linalg.norm(end - middle))
     way = np.linspace(0, 1, steps)[:, None]
     places = np.concatenate([start + way * (middle - start), middle + way * (end - middle)])

@@ -61,17 +61,17 @@ def build_answers(rows: Sequence[Row], verdicts: Mapping[str, PeerVerdict]) -> l
 
 
 def load_answers(what: str, verdicts: Mapping[str, PeerVerdict]) -> list[Row]:
-    """`answers` of a set of pairs; none where nothing was measured."""
+    """Load the `answers` of a set of pairs; none where nothing was measured."""
     return build_answers(read_result_rows(what), verdicts)
 
 
 def list_methods(rows: Sequence[Row]) -> list[str]:
-    """Names of the methods that answered, in the order of the tables."""
+    """List the names of the methods that answered, in the order of the tables."""
     return [m for m in METHOD_TITLES if any(r["method"] == m for r in rows)]
 
 
 def format_answer_columns(mine: Sequence[Row]) -> list[object]:
-    """Under `ANSWER_HEADS`; fine before ICP is of the solver's own pose. Dashes where there is none."""
+    """Format the columns under `ANSWER_HEADS`; fine before ICP is of the solver's own pose. Dashes where there is none."""
     if not mine:
         return [0] + ["–"] * (len(ANSWER_HEADS) - 1)
     solved = sum(is_good({**r, "err": r["err_solved"]}, FINE) for r in mine)
@@ -83,7 +83,7 @@ def format_answer_columns(mine: Sequence[Row]) -> list[object]:
 
 
 def tabulate_by_area(rows: Sequence[Row]) -> str:
-    """Pairs with a right pose, by the area in common and method."""
+    """Tabulate the pairs with a right pose, by the area in common and method."""
     out = []
     for area in AREA_BINS:
         for method in list_methods(rows):
@@ -93,7 +93,8 @@ def tabulate_by_area(rows: Sequence[Row]) -> str:
 
 
 def tabulate_crossed(rows: Sequence[Row]) -> str:
-    """Pairs with a right pose, by area in common and share of rooms in common: right, right and believed, wrong and believed."""
+    """Tabulate the pairs with a right pose, by area in common and share of rooms in common: right, right and believed, wrong and
+    believed."""
     methods = list_methods(rows)
     out: list[list[object]] = []
     for area in AREA_BINS:
@@ -111,7 +112,7 @@ def _format_three(mine: Sequence[Row]) -> str:
 
 
 def tabulate_negatives_by_kind(rows: Sequence[Row]) -> str:
-    """Pairs that must not merge, by kind and modality: how many each method believes."""
+    """Tabulate, of pairs that must not merge, by kind and modality, how many each method believes."""
     methods = list_methods(rows)
     groups: dict[tuple[str, str], list[Row]] = {}
     for r in rows:
@@ -127,20 +128,20 @@ def tabulate_negatives_by_kind(rows: Sequence[Row]) -> str:
 
 
 def compute_curve(rows: Sequence[Row]) -> tuple[Any, Any]:
-    """Precision and recall of a method's answers by every threshold of its score, the strictest first."""
+    """Compute precision and recall of a method's answers by every threshold of its score, the strictest first."""
     scored = [r for r in rows if np.isfinite(r["score"])]  # the rest has no answer
     score, right = [r["score"] for r in scored], [is_good(r) for r in scored]
     return compute_precision_recall(score, right, max(sum(map(is_possible, rows)), 1))[1:]
 
 
 def interpolate_curve(precision: Any, recall: Any) -> list[float]:
-    """Recall at each of `LEVELS` of precision, and the area under the curve."""
+    """Return the recall at each of `LEVELS` of precision, and the area under the curve."""
     best = [float(recall[precision >= level].max(initial=0.0)) for level in LEVELS]
     return [*best, float((np.diff(recall, prepend=0.0) * precision).sum())]
 
 
 def tabulate_curves(groups: Mapping[str, Sequence[Row]]) -> str:
-    """Points of the curves of each group of rows and method."""
+    """Tabulate points of the curves of each group of rows and method."""
     out = []
     for name, rows in groups.items():
         for method in list_methods(rows):
@@ -152,7 +153,7 @@ def tabulate_curves(groups: Mapping[str, Sequence[Row]]) -> str:
 
 
 def tabulate_behind(rows: Sequence[Row], keys: Sequence[Callable[[Row], str]]) -> str:
-    """Where another method has more right than ours."""
+    """Tabulate where another method has more right than ours."""
     shortfalls = []
     for key in keys:
         for group in sorted({key(r) for r in rows}):
@@ -172,7 +173,7 @@ LINES = {  # colour, dashes
 
 
 def draw_curves(groups: Mapping[str, Sequence[Row]], path: Path) -> None:
-    """A panel a group of rows (`answers`), a line a method; the dot is at the threshold of the verdict."""
+    """Draw a panel a group of rows (`answers`), a line a method; the dot is at the threshold of the verdict."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.2 * len(groups), 4.0), layout="constrained", facecolor="white")
@@ -198,7 +199,7 @@ def draw_curves(groups: Mapping[str, Sequence[Row]], path: Path) -> None:
 
 
 def _measure_believed(rows: Sequence[Row]) -> tuple[float, float]:
-    """Recall and precision of what the verdict believes."""
+    """Measure recall and precision of what the verdict believes."""
     believed = [is_good(r) for r in rows if r["believed"]]
     return sum(believed) / max(sum(map(is_possible, rows)), 1), sum(believed) / len(believed)
 
@@ -217,7 +218,7 @@ def tabulate_verdicts(verdicts: Mapping[str, PeerVerdict]) -> str:
 
 
 def tabulate_raw(verdicts: Mapping[str, PeerVerdict]) -> str:
-    """The same pairs with all points and thinned."""
+    """Tabulate the same pairs with all points and thinned."""
     thin, raw = load_answers("thinned", verdicts), load_answers("raw", verdicts)
     both = {r["name"] for r in thin} & {r["name"] for r in raw}
     out = []
@@ -229,7 +230,7 @@ def tabulate_raw(verdicts: Mapping[str, PeerVerdict]) -> str:
 
 
 def tabulate_real(rows: Sequence[Row]) -> str:
-    """Real pairs by source and modality."""
+    """Tabulate real pairs by source and modality."""
     groups = sorted({(modality(r), r["source"]) for r in rows}, key=lambda g: (PAIR_CLASSES.index(g[0]), g[1]))
     out = []
     for what, source in groups:
@@ -240,7 +241,7 @@ def tabulate_real(rows: Sequence[Row]) -> str:
 
 
 def format_whole_way(rows: Sequence[Row]) -> str:
-    """How long it takes from two clouds to a map with rooms."""
+    """Tell how long it takes from two clouds to a map with rooms."""
     done = [r["whole"] for r in rows if r["method"] == "ours" and r["whole"]]
     if not done:
         return ""
@@ -252,7 +253,7 @@ def format_whole_way(rows: Sequence[Row]) -> str:
 
 
 def tabulate_by_class(rows: Sequence[Row]) -> list[str]:
-    """Tables of pairs with a right pose: ordinary scans first, the hard kinds apart."""
+    """Return tables of pairs with a right pose: ordinary scans first, the hard kinds apart."""
     parts = []
     for name in PAIR_CLASSES:
         mine = [r for r in rows if modality(r) == name and is_possible(r)]

@@ -61,7 +61,7 @@ class PeerVerdict:
         return -np.inf if large else scores.get(self.score, -np.inf)
 
     def is_accepted(self, outcome: Row) -> bool:
-        """Is an answer believed?"""
+        """Return whether an answer is believed."""
         return self.at_least is not None and self.get_score(outcome) >= self.at_least
 
 
@@ -73,7 +73,7 @@ def apply_refinement(row: Row, variant: str) -> Row:
 
 
 def is_possible(row: Row) -> bool:
-    """Is there a right pose?"""
+    """Return whether there is a right pose."""
     return row["kind"] == "overlap" and row["common"] >= 1
 
 
@@ -97,7 +97,7 @@ def find_least_score(score: Array, right: Array, of: int) -> tuple[float | None,
 
 
 def iter_verdicts(rows: Sequence[Row], variant: str) -> Iterable[PeerVerdict]:
-    """A variant's verdicts by every score and limit of the residual."""
+    """Yield a variant's verdicts by every score and limit of the residual."""
     mine = [apply_refinement(r, variant) for r in rows if variant in r["methods"]]
     right = np.array([is_good(r) for r in mine])
     of = sum(map(is_possible, mine))
@@ -115,7 +115,7 @@ def iter_verdicts(rows: Sequence[Row], variant: str) -> Iterable[PeerVerdict]:
 
 
 def choose(rows: Sequence[Row]) -> dict[str, PeerVerdict]:
-    """Each peer's verdict of highest recall, of equal ones that with more right answers, then the first that was tried."""
+    """Choose each peer's verdict of highest recall, of equal ones that with more right answers, then the first that was tried."""
     rows = [r for r in rows if is_tellable(r) and not is_broken(r)]
     return {
         peer: max((v for name in variants for v in iter_verdicts(rows, name)), key=lambda v: (v.recall, v.right))
@@ -124,7 +124,7 @@ def choose(rows: Sequence[Row]) -> dict[str, PeerVerdict]:
 
 
 def load_verdicts(path: Path = THRESHOLDS_FILE) -> dict[str, PeerVerdict]:
-    """Verdicts that were written by `main`.
+    """Load the verdicts that were written by `main`.
 
     Raises:
         InputError: they were not.

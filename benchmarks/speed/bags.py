@@ -45,7 +45,7 @@ def simulate_office_walk(spacing: float) -> Walk:
 
 
 def iter_laps(walk: Walk, gigabytes: float, m: Messages) -> Iterable[Entry]:
-    """The messages of as many laps as give the bag its size."""
+    """Yield the messages of as many laps as give the bag its size."""
     rng, size, lap = np.random.default_rng(0), 0, 0
     while size < gigabytes * 1e9:
         scans = (np.repeat(s, REPEATS, axis=0) for s in walk.scans)
@@ -63,7 +63,8 @@ def iter_laps(walk: Walk, gigabytes: float, m: Messages) -> Iterable[Entry]:
 
 
 def measure(path: str, alone: bool) -> dict[str, float]:
-    """Seconds and peak memory (MiB, with the process that reads), of extracting a bag or of reading it by the library alone."""
+    """Measure seconds and peak memory (MiB, with the process that reads), of extracting a bag or of reading it by the library
+    alone."""
     watch, rooms = Stopwatch(), 0
     if alone:
         from rosbags.highlevel import AnyReader
@@ -82,7 +83,7 @@ def measure(path: str, alone: bool) -> dict[str, float]:
 
 
 def measure_in_process(path: Path, alone: bool) -> dict[str, float]:
-    """`measure` in a process of its own."""
+    """Run `measure` in a process of its own."""
     command = [sys.executable, "-m", "benchmarks.speed.bags", "--measure", str(path), "alone" if alone else "extract"]
     output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     result: dict[str, float] = json.loads(output.splitlines()[-1])

@@ -19,7 +19,7 @@ DOOR_WIDTH = 1.0  # m
 
 
 def time_best(fn: Callable[[], Any], repeat: int = 5) -> float:
-    """Shortest of `repeat` runs, s: the least disturbed one. Call `fn` once before, if it compiles."""
+    """Return the shortest of `repeat` runs, s: the least disturbed one. Call `fn` once before, if it compiles."""
     seconds = []
     for _ in range(repeat):
         gc.collect()  # a peer that returns lists must not pay for the garbage of another

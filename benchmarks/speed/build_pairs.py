@@ -36,7 +36,7 @@ RECIPE = Recipe(
 
 
 def build_one(item: Item) -> tuple[float, float]:
-    """Seconds of a pair, and those that the processor worked."""
+    """Return the seconds of a pair, and those that the processor worked."""
     with tempfile.TemporaryDirectory() as folder:
         reason, seconds, worked = build_in_worker(item, folder)
     if reason:
@@ -57,7 +57,7 @@ def build_in_worker(item: Item, folder: str) -> tuple[str, float, float]:
 
 
 def time_all(items: list[Item], jobs: int) -> float:
-    """Seconds that warm workers take for all items, the longest first, as `build` does."""
+    """Return the seconds that warm workers take for all items, the longest first, as `build` does."""
     from joblib.externals.loky import get_reusable_executor
 
     pool = get_reusable_executor(max_workers=jobs, timeout=600, kill_workers=True, env=dict.fromkeys(SINGLE, "1"))

@@ -57,7 +57,7 @@ def build_cells(wall: Array, door: Array) -> Array:
 
 
 def build_two_maps(rooms: int) -> tuple[VoxelGrid, VoxelGrid, Array]:
-    """Three quarters of a floor each, of which the second one is turned; and its points (n, 3), m."""
+    """Build two maps of three quarters of a floor each, of which the second one is turned; and its points (n, 3), m."""
     wall, door = draw_floor_plan(rooms)
     cells = build_cells(wall, door)
     quarter = wall.shape[0] // 4
@@ -69,7 +69,7 @@ def build_two_maps(rooms: int) -> tuple[VoxelGrid, VoxelGrid, Array]:
 
 
 def measure(rooms: int) -> None:
-    """One size."""
+    """Measure one size."""
     import resource
 
     a, b, points = build_two_maps(rooms)

@@ -118,7 +118,7 @@ def _run_two_passes(kernel: Callable[..., None], tables: CSR, cells: np.ndarray,
 
 
 def build_methods(grid: VoxelGrid, queries: np.ndarray) -> dict[str, Callable[[float], Any]]:
-    """Name -> function of a radius; each has its index built already."""
+    """Build the methods, name -> function of a radius; each has its index built already."""
     octree = SparseVoxelOctree(grid)
     centroids, centres, cells = grid.compute_centroids(), grid.compute_centroids(queries), queries.astype(np.int64)
     tree = cKDTree(centroids)
@@ -148,7 +148,7 @@ def build_methods(grid: VoxelGrid, queries: np.ndarray) -> dict[str, Callable[[f
 
 
 def count_found(result: Any) -> np.ndarray:
-    """Cells found for each query, whatever the method returns."""
+    """Count the cells found for each query, whatever the method returns."""
     if isinstance(result, np.ndarray):
         return np.array([len(r) for r in result])
     return np.diff(result[0] if len(result) == 2 else result[2].numpy())

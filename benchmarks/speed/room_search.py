@@ -33,7 +33,7 @@ SEARCH_COLUMNS = (
 
 
 def add_noise(rng: np.random.Generator, vectors: Array, noise: float) -> Array:
-    """Vectors with noise of such a length added, of length 1, in single precision."""
+    """Add noise of such a length to vectors; the result is of length 1, in single precision."""
     other = vectors + np.float32(noise / np.sqrt(VECTOR)) * rng.standard_normal(vectors.shape, dtype=np.float32)
     out: Array = other / np.linalg.norm(other, axis=1, keepdims=True)
     return out
@@ -50,7 +50,7 @@ def draw_table(rng: np.random.Generator, rooms: int) -> Array:
 
 
 def time_query(search: Callable[..., object], *inputs: Array) -> float:
-    """Of the processor, a query; the best of three runs."""
+    """Return the seconds of the processor a query; the best of three runs."""
     spent = []
     for _ in range(3):
         began = process_time()
@@ -60,7 +60,7 @@ def time_query(search: Callable[..., object], *inputs: Array) -> float:
 
 
 def measure(rooms: int) -> str:
-    """One size: a row of the table."""
+    """Measure one size: a row of the table."""
     rng = np.random.default_rng(rooms)
     table = draw_table(rng, rooms)
     itself = rng.integers(0, rooms, ASKED)

@@ -62,12 +62,12 @@ def measure(rooms: int) -> dict[str, float]:
 
 
 def _sum_cpu(processes: Sequence[psutil.Process]) -> float:
-    """Seconds of CPU that processes have used."""
+    """Sum the seconds of CPU that processes have used."""
     return sum(t.user + t.system for t in (p.cpu_times() for p in processes if p.is_running()))
 
 
 def _pan(one: MapPage) -> dict[str, float]:
-    """Frames a second with all rooms in view and near, and ms of CPU of the whole browser for one."""
+    """Measure frames a second with all rooms in view and near, and ms of CPU of the whole browser for one."""
     browser = [p for p in psutil.Process().children(recursive=True) if "chrom" in p.name()]
     used, rows = _sum_cpu(browser), []
     for zoom in (1, 4):
@@ -84,7 +84,7 @@ def _pan(one: MapPage) -> dict[str, float]:
 
 
 def _edit(one: MapPage, server: psutil.Process) -> dict[str, float]:
-    """Seconds from sending an edit until it is drawn, and of the server's CPU."""
+    """Measure the seconds from sending an edit until it is drawn, and of the server's CPU."""
     took: dict[str, float] = {}
     room = one.room(2)
     middle, (left, top, right, bottom) = [room["x"], room["y"]], room["box"]

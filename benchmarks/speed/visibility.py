@@ -19,7 +19,7 @@ VIEW_RANGE = 5.0  # m
 
 
 def build_cubes(grid: VoxelGrid):
-    """Open3D scene of one cube a cell (12 triangles), in units of cells."""
+    """Build an Open3D scene of one cube a cell (12 triangles), in units of cells."""
     import open3d as o3d
 
     corner = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32)

@@ -76,7 +76,7 @@ def merge(folder: Path) -> tuple[float, float, tuple[tuple[str, float], ...]]:
 
 
 def run_peer(folder: Path) -> float:
-    """Seconds that KISS-Matcher takes, in a process of its own."""
+    """Return the seconds that KISS-Matcher takes, in a process of its own."""
     words = [sys.executable, "-m", "benchmarks.speed.whole", "peer", str(folder)]
     return float(subprocess.run(words, check=True, capture_output=True, text=True).stdout.split()[-1])
 

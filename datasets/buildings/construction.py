@@ -74,7 +74,7 @@ def build_building(
 
 
 def _build_stairs(plans: Sequence[Plan], floors: Array, spaces: list[RoomCells]) -> tuple[Array, list[Prism], TriangleSoup]:
-    """True stairs, the holes in the slabs, and the steps."""
+    """Return the true stairs, the holes in the slabs, and the steps."""
     rows, wells, soup = [], [], TriangleSoup()
     for k, plan in enumerate(plans[:-1]):
         for flight in plan.flights:
@@ -138,7 +138,7 @@ def _is_outdoors(points: Array, plans: list[shapely.Geometry], floors: Array) ->
 
 
 def _is_indoors(points: Array, spaces: list[RoomCells]) -> Array:
-    """Does a point lie within a room's outline, at its height?"""
+    """Return whether a point lies within a room's outline, at its height."""
     tree = shapely.STRtree([s.shape for s in spaces])
     point, space = tree.query(shapely.points(points[:, :2]), predicate="intersects")
     low, high = (np.array([getattr(s, w) for s in spaces]) for w in ("floor", "ceiling"))

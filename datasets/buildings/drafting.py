@@ -35,7 +35,7 @@ class Draft:
     flights: list[Flight] = field(default_factory=list)
 
     def add_room(self, outline: shapely.Polygon, kind: str, ceiling: float = 0.0) -> int:
-        """Add a room; returns its index."""
+        """Add a room; return its index."""
         outline = snap(outline)
         inner = np.asarray(shapely.orient_polygons(outline.buffer(-self.wall / 2, join_style="mitre")).exterior.coords)[:-1]
         self.outlines.append(outline)
@@ -68,7 +68,8 @@ class Draft:
         return self.outlines[a].exterior.difference(shapely.union_all(near).buffer(0.45, join_style="mitre"))
 
     def cut(self, line: shapely.Geometry, width: float, kind: str, at: float | None, **more: float | str) -> bool:
-        """An opening in the longest straight piece of a line; False where it is too short, or where an opening is already."""
+        """Cut an opening into the longest straight piece of a line; False where it is too short, or where an opening is
+        already."""
         edges = split_straight(line)
         spare = self.wall / 2 + CORNER_MARGIN
         if not len(edges):

@@ -37,7 +37,7 @@ def add_fittings(
     difficulty: Difficulty,
     rng: np.random.Generator,
 ) -> Array:
-    """Add all fittings and furniture; returns (M,) THING_DTYPE."""
+    """Add all fittings and furniture; return (M,) THING_DTYPE."""
     things: list[tuple] = []
     _add_leaves(soup, things, spaces, doors, difficulty.frames, rng)
     for hole in holes:
@@ -55,7 +55,8 @@ def add_fittings(
 
 
 def compute_leaf_yaw(door: Array, pivot: Array, angle: float) -> float:
-    """rad, where a leaf that turns about `pivot` points when it is opened by `angle`, away from its wall."""
+    """Return the direction, rad, in which a leaf that turns about `pivot` points when it is opened by `angle`, away from its
+    wall."""
     along = np.array([np.sin(door["direction"]), -np.cos(door["direction"])])
     normal = np.array([np.cos(door["direction"]), np.sin(door["direction"])])
     offset = np.asarray(pivot) - door["centre"][:2]
@@ -67,7 +68,7 @@ def compute_leaf_yaw(door: Array, pivot: Array, angle: float) -> float:
 def _add_leaves(
     soup: TriangleSoup, things: list[tuple], spaces: list[RoomCells], doors: Array, frames: float, rng: np.random.Generator
 ) -> None:
-    """One leaf a door, two for wide ones, hung so that it swings into the room and not into the corridor.
+    """Add one leaf a door, two for wide ones, hung so that it swings into the room and not into the corridor.
 
     Args:
         frames: share of the doors with a frame and handles.
@@ -104,7 +105,7 @@ def _add_leaves(
 
 
 def _add_door_frame(soup: TriangleSoup, door: Array, rng: np.random.Generator) -> float:
-    """A casing around a door on one face of its wall or both; returns how deep the leaf stands in the wall, m."""
+    """Add a casing around a door on one face of its wall or both; return how deep the leaf stands in the wall, m."""
     wide, thick = float(rng.uniform(0.05, 0.1)), float(rng.uniform(0.008, 0.025))
     half, height, out = door["width"] / 2 + wide / 2, float(door["height"]), door["thickness"] / 2 + thick / 2
     for face in (1, -1):
@@ -117,7 +118,7 @@ def _add_door_frame(soup: TriangleSoup, door: Array, rng: np.random.Generator) -
 
 
 def _add_pane(soup: TriangleSoup, hole: WallOpening) -> None:
-    """Glass in the middle of a window, with posts every 1.3 m."""
+    """Add glass in the middle of a window, with posts every 1.3 m."""
     if hole.opening.kind != "window":
         return
     a, b = np.array(hole.opening.start), np.array(hole.opening.end)
@@ -133,7 +134,7 @@ def _add_pane(soup: TriangleSoup, hole: WallOpening) -> None:
 
 
 def _add_sloped_ceiling(soup: TriangleSoup, space: RoomCells) -> None:
-    """A ceiling that falls along the room; the flat one above it is out of sight."""
+    """Add a ceiling that falls along the room; the flat one above it is out of sight."""
     if space.plan.slope <= 0:
         return
     corners = np.asarray(shapely.minimum_rotated_rectangle(space.shape).exterior.coords)
@@ -167,7 +168,7 @@ def _add_columns(
     difficulty: Difficulty,
     rng: np.random.Generator,
 ) -> list[shapely.Polygon]:
-    """Those of the plan, and a row of columns in large rooms."""
+    """Add the columns of the plan, and a row of columns in large rooms."""
     given = np.zeros((0, 4)) if plan.columns is None else np.asarray(plan.columns, float).reshape(-1, 4)
     spots = [c for c in given if space.shape.contains(shapely.Point(c[:2]).buffer(c[2] / 2))]
     if not len(given) and space.shape.area > 60 and rng.random() < difficulty.columns:
@@ -193,7 +194,7 @@ def _add_columns(
 def _add_lamps_and_beams(
     soup: TriangleSoup, things: list[tuple], space: RoomCells, difficulty: Difficulty, rng: np.random.Generator
 ) -> None:
-    """Lamps below the ceiling and beams along it."""
+    """Add lamps below the ceiling and beams along it."""
     del things
     if space.shape.area < 4 or space.plan.slope > 0:
         return
@@ -227,7 +228,7 @@ def _add_ducts(
     difficulty: Difficulty,
     rng: np.random.Generator,
 ) -> None:
-    """Air ducts, pipes and cable trays under the ceiling, along the room or across it.
+    """Add air ducts, pipes and cable trays under the ceiling, along the room or across it.
 
     Args:
         frame: middle (2,), yaw (rad), length and width (m) of the rectangle around the room.

@@ -80,7 +80,8 @@ def _make_sofa(w: float, d: float = 0.9) -> list[list[float]]:
 
 
 def _make_desk(w: float, d: float, g: np.random.Generator) -> list[list[float]]:
-    """Desk with screen, chair and what lies on it; the chair's side is y < 0, anywhere between pushed in and pulled out."""
+    """Make a desk with a screen, a chair and what lies on it; the chair's side is y < 0, anywhere between pushed in and pulled
+    out."""
     y = 0.35
     shift = [[b[0], b[1] + y, *b[2:]] for b in [*_make_table(w, d), *_make_pile(w, d, 0.74, g)]]
     x, out = float(g.normal(0, 0.12)), float(g.uniform(-0.1, 0.35))
@@ -93,7 +94,7 @@ def _make_desk(w: float, d: float, g: np.random.Generator) -> list[list[float]]:
 
 
 def _make_dining_table(w: float, d: float, g: np.random.Generator) -> list[list[float]]:
-    """Table with chairs on both sides; one in eight is missing."""
+    """Make a table with chairs on both sides; one in eight is missing."""
     xs = np.arange(int(w / 0.65)) * 0.65
     xs = xs - xs.mean()
     seats = [(float(x + g.normal(0, 0.05)), s, float(g.uniform(0.0, 0.3))) for x in xs for s in (-1.0, 1.0) if g.random() < 0.88]
@@ -105,7 +106,7 @@ def _make_dining_table(w: float, d: float, g: np.random.Generator) -> list[list[
 
 
 def _make_counter(w: float, g: np.random.Generator, d: float = 0.6) -> list[list[float]]:
-    """Kitchen run with cupboards above and a tall fridge."""
+    """Make a kitchen run with cupboards above and a tall fridge."""
     cupboard = [w * 0.1, d / 2 - 0.17, 1.75, w * 0.75, 0.34, 0.65]
     return [[0, 0, 0.45, w, d, 0.9], *_make_pile(w, d, 0.9, g), cupboard, [-w / 2 + 0.3, 0, 0.95, 0.6, d, 1.9]]
 
@@ -115,7 +116,7 @@ def _make_toilet() -> list[list[float]]:
 
 
 def _make_bench(w: float, d: float, g: np.random.Generator) -> list[list[float]]:
-    """Laboratory island: drawers, a worktop and a rack of shelves along its middle."""
+    """Make a laboratory island: drawers, a worktop and a rack of shelves along its middle."""
     return [
         [0, 0, 0.42, w * 0.95, d * 0.8, 0.84],
         [0, 0, 0.89, w, d, 0.06],
@@ -126,7 +127,7 @@ def _make_bench(w: float, d: float, g: np.random.Generator) -> list[list[float]]
 
 
 def _make_school_desk(w: float, g: np.random.Generator) -> list[list[float]]:
-    """School desk for two with two chairs."""
+    """Make a school desk for two with two chairs."""
     back = [b for x in (-w / 4, w / 4) for b in _make_chair(x, -float(g.uniform(0.3, 0.6)))]
     return [*_make_table(w, 0.5, 0.72), *back]
 
@@ -289,7 +290,7 @@ class FurnishedFloor:
         return self._add_item(item, at[free[0]], float(yaw[free[0]])) if len(free) else None
 
     def _sample_misalignment(self, item: Item) -> float:
-        """rad by which a thing is not parallel to the walls; what is fitted stands straight."""
+        """Sample the angle, rad, by which a thing is not parallel to the walls; what is fitted stands straight."""
         return float(self.rng.normal(0, ASKEW)) if item.movable else 0.0
 
     def is_fitting(self, at: Array, yaw: Array, item: Item) -> Array:
@@ -306,7 +307,7 @@ class FurnishedFloor:
         return item
 
     def _sample_by_wall(self, item: Item) -> tuple[Array, Array]:
-        """Places with the back to a wall; half of them in corners, as people put things."""
+        """Sample places with the back to a wall; half of them in corners, as people put things."""
         width, depth = item.size[:2]
         weight = np.maximum(self.lengths - width, 0) + 1e-9
         wall = self.rng.choice(len(weight), PLACES_TRIED, p=weight / weight.sum())

@@ -129,7 +129,7 @@ def make_layout(shape: str, size: Size, rng: np.random.Generator) -> Layout:
 
 
 def _add_wing(layout: Layout, x: float, w: float, d: float, length: float) -> None:
-    """A side corridor that leaves the main one at x, with rooms on both sides."""
+    """Add a side corridor that leaves the main one at x, with rooms on both sides."""
     number = len(layout.corridors)
     layout.corridors.append(shapely.box(x, w, x + w, w + d + length))
     layout.joints.append((0, number))
@@ -138,7 +138,7 @@ def _add_wing(layout: Layout, x: float, w: float, d: float, length: float) -> No
 
 
 def _draw_ring(size: Size, rng: np.random.Generator) -> Layout:
-    """A corridor around a core of one or two rows, in two halves that doors part; rooms on its outside."""
+    """Draw a corridor around a core of one or two rows, in two halves that doors part; rooms on its outside."""
     w, d = size.corridor, size.near
     back_to_back = bool(rng.random() < 0.5)
     deep = round(float(rng.uniform(4.0, 5.0)), 2)
@@ -159,7 +159,7 @@ def _draw_ring(size: Size, rng: np.random.Generator) -> Layout:
 
 
 def draw(layout: Layout, draft: Draft, kind: str = "corridor", merge: bool = False) -> list[int]:
-    """Draw the corridors into a draft; returns the room of each corridor.
+    """Draw the corridors into a draft; return the room of each corridor.
 
     Args:
         merge: make one room of corridors that meet, instead of parting them by doors.
@@ -274,7 +274,7 @@ class RoomDeck:
         self.widths = {} if style is None else {k: float(fixed.uniform(*CORE_WIDTHS[k])) for k in sorted(set(kinds))}
 
     def _sample_width(self, kind: str) -> float:
-        """m; some rooms are as wide as two, as where a wall was left out."""
+        """Sample a width, m; some rooms are as wide as two, as where a wall was left out."""
         width = float(self.rng.uniform(*CORE_WIDTHS[kind]))
         wide = kind in MERGED and self.rng.random() < self.spread
         return width * float(self.rng.uniform(1.4, 2.2)) if wide else width
@@ -334,7 +334,7 @@ def fill_row(
 def _add_row_room(
     draft: Draft, row: Row, span: Range, kind: str, corridor: int, rng: np.random.Generator, closets: float
 ) -> list[tuple[int, int]]:
-    """One room of a row; hotel rooms and wards have their own bath, flats are several rooms."""
+    """Add one room of a row; hotel rooms and wards have their own bath, flats are several rooms."""
     a, b = span
     outline = row.build_outline(a, b)
     if b - a < 1.4:
@@ -361,7 +361,7 @@ def _add_row_room(
 
 
 def _add_closet(draft: Draft, row: Row, span: Range, rng: np.random.Generator) -> int:
-    """A closet in the corner of a room, beside the corridor."""
+    """Add a closet in the corner of a room, beside the corridor."""
     a, b = span
     wide, deep = np.round(rng.uniform(1.6, min(2.4, (b - a) / 2.1)), 2), np.round(rng.uniform(1.75, 2.8), 2)
     start = a if rng.random() < 0.5 else b - wide
@@ -369,7 +369,7 @@ def _add_closet(draft: Draft, row: Row, span: Range, rng: np.random.Generator) -
 
 
 def _add_ensuite(draft: Draft, row: Row, span: Range, kind: str, corridor: int) -> list[tuple[int, int]]:
-    """A bath beside the entrance; every second room is mirrored, so that baths lie back to back."""
+    """Add a bath beside the entrance; every second room is mirrored, so that baths lie back to back."""
     a, b = span
     mirrored = len(draft.rooms) % 4 >= 2
     wide, deep = min(2.0, b - a - 1.8), 2.2
@@ -382,7 +382,7 @@ def _add_ensuite(draft: Draft, row: Row, span: Range, kind: str, corridor: int) 
 
 
 def _add_flat(draft: Draft, row: Row, span: Range, corridor: int, rng: np.random.Generator) -> list[tuple[int, int]]:
-    """A flat: a hall from the corridor; bath, kitchen and bedrooms beside it, the living room at its end."""
+    """Add a flat: a hall from the corridor; bath, kitchen and bedrooms beside it, the living room at its end."""
     a, b = span
     depth = min(row.ends)
     mirrored = bool(rng.random() < 0.5)

@@ -149,7 +149,7 @@ def _convert_item(item: Item, room: int, building: Building) -> AddedThing:
 
 
 def _match_doors(doors: Array, shift: Array) -> dict[int, int]:
-    """Doors -> those that lie by `shift` from them; where none lies, the door itself."""
+    """Map doors to those that lie by `shift` from them; where none lies, the door itself."""
     out = {}
     for d, door in enumerate(doors):
         far = np.linalg.norm(doors["centre"][:, :2] - door["centre"][:2] - shift, axis=1)
@@ -272,7 +272,7 @@ def find_module_rooms(module: Array, k: int) -> Array:
 
 
 def _add_bay(draft: Draft, module: ModulePlan, k: int, count: int) -> int:
-    """A bay of the corridor: it touches the next one, without a wall between them."""
+    """Add a bay of the corridor: it touches the next one, without a wall between them."""
     low = k * module.width - (module.ends[0] if k == 0 else 0.0)
     high = (k + 1) * module.width + (module.ends[1] if k == count - 1 else 0.0)
     inset = draft.wall / 2
@@ -284,7 +284,7 @@ def _add_bay(draft: Draft, module: ModulePlan, k: int, count: int) -> int:
 
 
 def _add_rooms(draft: Draft, module: ModulePlan, start: float, bay: int, side: int) -> None:
-    """The rooms of a bay on one side (1: above the corridor), with their doors."""
+    """Add the rooms of a bay on one side (1: above the corridor), with their doors."""
     wide, deep, cut = module.width, module.depth, round(module.split * module.width, 2)
     flip = side < 0 and module.turned
 

@@ -22,7 +22,8 @@ def list_windows(building: Building) -> list[tuple[float, ...]]:
 
 
 def find_windows(building: Building) -> list[tuple[float, ...]]:
-    """Windows: middle at the height of the floor, direction of the normal (rad), width, sill and head above the floor (m)."""
+    """Return the windows: middle at the height of the floor, direction of the normal (rad), width, sill and head above the floor
+    (m)."""
     glass = building.triangles[building.labels == SURFACES.index("glass")]
     windows = []
     for triangle in glass[::2]:  # two make a pane
@@ -94,7 +95,7 @@ def build_true_room(space: RoomCells) -> TrueRoom:
 
 
 def compute_footprint(shapes: Sequence[shapely.Geometry]) -> shapely.Geometry:
-    """Plan of a storey out to the outer walls' faces; courtyards of more than 9 m2 stay open."""
+    """Compute the plan of a storey out to the outer walls' faces; courtyards of more than 9 m2 stay open."""
     closed = shapely.union_all([s.buffer(2 * OUTER_WALL, join_style="mitre") for s in shapes]).buffer(
         -OUTER_WALL, join_style="mitre"
     )
@@ -152,7 +153,7 @@ def build_openings(
 
 
 def _find_spaces(probes: Array, shapes: list[shapely.Polygon], here: list[int]) -> Array:
-    """Space of each probe point; -1: outside of the building, -2: within a wall."""
+    """Return the space of each probe point; -1: outside of the building, -2: within a wall."""
     points = shapely.points(probes.reshape(-1, 2))
     out = np.full(len(points), -2)
     outside = ~shapely.contains(compute_footprint(shapes), points)
@@ -182,7 +183,7 @@ def _build_opening(
 
 
 def _convert_glass_walls(plan: Plan) -> list[Opening]:
-    """Glass walls as windows from the floor up, doors left out."""
+    """Convert glass walls to windows from the floor up, doors left out."""
     doors = shapely.union_all([build_rectangle(o.start, o.end, 0.6) for o in plan.openings if o.kind != "window"])
     out = []
     for wall in (w for w in plan.walls if w.glass):
@@ -260,7 +261,7 @@ def cut_niches(
 def _cut_niche(
     start: Array, along: Array, length: float, space: RoomCells, solid: shapely.Geometry, rng: np.random.Generator
 ) -> tuple[Prism, tuple[object, ...]] | None:
-    """One in the wall that runs from a corner along the room, which lies to its left; None where the wall is too thin.
+    """Cut a niche into the wall that runs from a corner along the room, which lies to its left; None where the wall is too thin.
 
     Args:
         solid: what is wall, without what other openings and niches need.

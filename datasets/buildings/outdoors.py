@@ -88,7 +88,7 @@ def _add_bound(soup: TriangleSoup, box: Array, side: int, low: float, rng: np.ra
 
 
 def _add_box(soup: TriangleSoup, across: float, along: float, size: Array, axis: int, low: float, yaw: float) -> None:
-    """A box on the ground: `size` across the side, along it, and up."""
+    """Add a box on the ground: `size` across the side, along it, and up."""
     corners = BOX * size
     turned = np.column_stack([np.cos(yaw) * corners[:, 0] - np.sin(yaw) * corners[:, 1],
                               np.sin(yaw) * corners[:, 0] + np.cos(yaw) * corners[:, 1]])  # fmt: skip
@@ -97,7 +97,7 @@ def _add_box(soup: TriangleSoup, across: float, along: float, size: Array, axis:
 
 
 def _add_plants(soup: TriangleSoup, box: Array, taken: shapely.Geometry, low: float, rng: np.random.Generator) -> None:
-    """Trees, and bushes that begin at the ground; their leaves are triangles that hang about."""
+    """Add trees, and bushes that begin at the ground; their leaves are triangles that hang about."""
     area = float(np.prod(box[1] - box[0])) - taken.area
     for place in rng.uniform(box[0], box[1], (rng.poisson(rng.uniform(0, 1) * area / PLANT_AREA), 2)):
         if taken.distance(shapely.Point(place)) < 0.8:

@@ -71,7 +71,7 @@ def _measure_longest_gap(row: Row) -> float:
 
 
 def _sample_core_size(kind: str, flight: str, height: float, wall: float, rng: np.random.Generator) -> Range:
-    """Width along the row and depth, m; depth 0: that of the row."""
+    """Sample the width along the row and depth, m; depth 0: that of the row."""
     if kind == "stairs":
         behind = FOOT_OF_FLIGHT if flight == "straight" else 0.02
         lane = FOOT_OF_FLIGHT if flight == "straight" else 0.05  # beside the flight, to walk back on
@@ -115,7 +115,7 @@ def draw_core(draft: Draft, row: Row, core: Core, corridor: int, k: int, storeys
 
 
 def _get_lintel_height(kind: str) -> float:
-    """Height of the lintel that a core's door always has; 0: drawn."""
+    """Return the height of the lintel that a core's door always has; 0: drawn."""
     return 2.1 if kind in ("lift", "stairs", "hall") else 0.0
 
 
@@ -234,7 +234,7 @@ def _draw_storey(
 
 
 def _add_second_doors(draft: Draft, rooms: list[int], corridor: int) -> None:
-    """Second doors, for rooms that lie between two corridors."""
+    """Add second doors, for rooms that lie between two corridors."""
     for room in rooms:
         if draft.rooms[room].kind == "lounge":
             draft.add_door(room, corridor, 2.4, "opening")

@@ -56,7 +56,7 @@ def make_twin_wing(building: Building, rng: np.random.Generator | int = 0) -> Bu
 
 
 def _build_piecewise_map(knots: Array, slopes: tuple[float, float, float]) -> Place:
-    """Continuous map of a coordinate with a slope before, between and after the two inner knots."""
+    """Build a continuous map of a coordinate with a slope before, between and after the two inner knots."""
 
     def place(x: Array) -> Array:
         middle = np.clip(x, knots[1], knots[2])
@@ -153,7 +153,7 @@ class Stack:
 
 
 def iter_stacks(folder: str | Path, plans: dict[str, Plan | Refusal] | None = None) -> Iterator[tuple[str, Stack | Refusal]]:
-    """Every two neighbouring sibling storeys of a folder as a stack, or why they are none; names are joined by " + ".
+    """Yield every two neighbouring sibling storeys of a folder as a stack, or why they are none; names are joined by " + ".
 
     Args:
         plans: of `iter_plans`, where they are known already.
@@ -209,7 +209,8 @@ def stack_storeys(plans: Sequence[Plan], names: Sequence[str] = (), common: bool
 
 
 def _estimate_unit(plans: Sequence[Plan], placed: Sequence[Plan]) -> float:
-    """Factor for all: the scale of the plan whose stairwells (whose storey, if there are none) are nearest to a usual size."""
+    """Estimate the factor for all: the scale of the plan whose stairwells (whose storey, if there are none) are nearest to a
+    usual size."""
     best, factor = np.inf, 1.0
     for plan, now in zip(plans, placed, strict=True):
         wells = [_build_polygon(r).area for r in plan.rooms if r.kind == "stairs"]
@@ -288,7 +289,7 @@ def _build_polygon(room: object) -> shapely.Polygon:
 
 
 def _iter_hypotheses(target: _StoreyShape, source: _StoreyShape) -> Iterator[tuple[float, float, float]]:
-    """Scale and shift from: nothing, two shafts of each, one shaft and its size, the corners of the boxes around."""
+    """Yield the scale and shift from: nothing, two shafts of each, one shaft and its size, the corners of the boxes around."""
     yield 1.0, 0.0, 0.0
     shafts = [(a, b) for a, b in product(target.shafts, source.shafts) if a[0] == b[0]]
     low, high = (np.array(s.floor.bounds).reshape(2, 2) for s in (target, source))
@@ -331,7 +332,7 @@ def _score(target: _StoreyShape, source: _StoreyShape, scale: float, shift: Arra
 def _measure_overlay(
     target: _StoreyShape, source: _StoreyShape, scale: float, shift: Array, step: int = 1
 ) -> tuple[float, float]:
-    """Shares of walls over walls, and of floor over floor."""
+    """Return the shares of walls over walls, and of floor over floor."""
     near = WALL_NEAR * min(
         scale, 1.0
     )  # a plan that shrinks has more walls a metre, so that more of them lie near others by chance

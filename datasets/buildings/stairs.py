@@ -56,7 +56,7 @@ def compute_flight_length(kind: str, rise: float) -> float:
 
 
 def compute_flight_width(kind: str, rise: float) -> float:
-    """m across that a flight needs; a spiral's treads must be deep enough along its walking line."""
+    """Return the metres across that a flight needs; a spiral's treads must be deep enough along its walking line."""
     spiral = max(2.6, np.ceil((count_risers(rise) - 1) * 0.265 / SPIRAL_TURN * 3 / 2 * 2 * 20) / 20)
     return {"straight": 1.3, "spiral": float(spiral), "lift": 1.0}.get(kind, 2.5)
 
@@ -97,7 +97,7 @@ def _build_placement(flight: Flight):  # type: ignore[no-untyped-def]
 
 
 def _resample(path: Array, count: int = 16) -> Array:
-    """`count` points along a polyline; its corners are kept where it has fewer."""
+    """Return `count` points along a polyline; its corners are kept where it has fewer."""
     while len(path) < count:
         longest = int(np.argmax(np.linalg.norm(np.diff(path, axis=0), axis=1)))
         path = np.insert(path, longest + 1, path[longest : longest + 2].mean(axis=0), axis=0)
@@ -113,7 +113,7 @@ Parts = tuple[Array, tuple[Array, Array], Array, float, float]
 
 
 def _build_steps(x: float, width: float, y: float, tread: float, riser: float, count: int, bottom: float, rail: float) -> Array:
-    """Boxes of `count` steps that go up along y (down along it for a negative tread), with a rail at `x + rail`."""
+    """Build the boxes of `count` steps that go up along y (down along it for a negative tread), with a rail at `x + rail`."""
     i = np.arange(count)
     top = bottom + (i + 1) * riser
     thick = np.minimum(top, STEP_SLAB + riser)
@@ -209,7 +209,7 @@ TRIED = 60  # places of a kind of stairs
 
 
 def add_stairs(plans: Sequence[Plan]) -> tuple[list[Plan], tuple[int, ...]]:
-    """Plans with flights where a stairwell lies over a stairwell, and how many there are from each storey to the next.
+    """Return plans with flights where a stairwell lies over a stairwell, and how many there are from each storey to the next.
 
     A flight is put where it fits into both rooms with its landings, and where every door of both rooms can still be reached; over
     a flight that comes from below, only the same one may go on. Of each stairwell one flight goes up.
@@ -239,7 +239,7 @@ def _build_polygon(plan: Plan, room: int) -> shapely.Polygon:
 
 
 def _find_stairwells(low: Plan, high: Plan) -> list[tuple[int, int]]:
-    """Stairwells of the two plans that lie over each other, those with most floor in common first."""
+    """Return the stairwells of the two plans that lie over each other, those with most floor in common first."""
     rooms = [[i for i, r in enumerate(plan.rooms) if r.kind == "stairs"] for plan in (low, high)]
     common = {(i, j): _build_polygon(low, i).intersection(_build_polygon(high, j)).area for i, j in product(*rooms)}
     return sorted((pair for pair, area in common.items() if area > LEAST_STAIRWELL), key=lambda pair: (-common[pair], pair))
@@ -288,7 +288,7 @@ def _is_climbable(flight: Flight, rise: float) -> bool:
 
 
 def _list_sizes(rise: float) -> list[tuple[str, float, float]]:
-    """Kinds of stairs with width and length, the comfortable ones first."""
+    """List the kinds of stairs with width and length, the comfortable ones first."""
     n, spiral = count_risers(rise), compute_flight_width("spiral", rise)
     dogleg = [
         ("dogleg", wide, (n // 2 - 1) * tread + HALF_LANDING)
@@ -299,7 +299,7 @@ def _list_sizes(rise: float) -> list[tuple[str, float, float]]:
 
 
 def _list_placements(well: shapely.Polygon, kind: str, width: float, length: float, heading: float) -> list[Flight]:
-    """Flights of a size and heading within a stairwell, landings included; some of all places, spread evenly."""
+    """List the flights of a size and heading within a stairwell, landings included; some of all places, spread evenly."""
     turn = build_rotation(heading - np.pi / 2)  # own frame -> plan: p @ turn
     shape = shapely.transform(well, lambda p: p @ turn.T)
     low, high = np.array(shape.bounds).reshape(2, 2)
@@ -318,7 +318,7 @@ def _list_placements(well: shapely.Polygon, kind: str, width: float, length: flo
 
 
 def _is_clear(flight: Flight, rooms: tuple[shapely.Polygon, shapely.Polygon], doors: tuple[Array, Array]) -> bool:
-    """Can one walk from every door of both rooms to the flight's landings, and to all of the floor?"""
+    """Return whether one can walk from every door of both rooms to the flight's landings, and to all of the floor."""
     turn = build_rotation(flight.heading - np.pi / 2)
 
     def place(points: Array) -> Array:

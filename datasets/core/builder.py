@@ -214,7 +214,7 @@ def _read_cached_row(path: Path) -> dict[str, Any] | None:
 
 
 def _generalize_reason(reason: str) -> str:
-    """A reason without the names and numbers, to be counted."""
+    """Return a reason without the names and numbers, to be counted."""
     return re.sub(r"\S*\d\S*", "#", reason)
 
 
@@ -279,7 +279,7 @@ def _run_parallel(tasks: Iterable[Task], sharing: BuildSettings, work: Work) -> 
 
 @contextmanager
 def _configure_backend(sharing: BuildSettings) -> Iterator[None]:
-    """Where joblib works: processes started afresh (never forked: threads and locks don't survive that), or a cluster."""
+    """Set where joblib works: processes started afresh (never forked: threads and locks don't survive that), or a cluster."""
     from joblib import parallel_config
 
     if sharing.cluster is None:
@@ -352,7 +352,7 @@ def derive(
 
 
 def read_sources(path: Path) -> list[str]:
-    """Stems of the names of the files that a file was made from."""
+    """Read the stems of the names of the files that a file was made from."""
     about: dict[str, Any] = json.loads(archive.read(path, "cached item", only=["about"])["about"].tobytes())
     sources: list[str] = about["sources"]
     return sources

@@ -315,7 +315,7 @@ def _draw_opening(sheet: Sheet, opening: OpeningShape, hand: Hand, walls: Array,
 
 
 def _measure_wall(sheet: Sheet, middle: Array, normal: Array, walls: Array, thickness: float) -> tuple[float, float]:
-    """How far the wall reaches to both sides of the middle of an opening, m: against the normal and along it."""
+    """Return how far the wall reaches to both sides of the middle of an opening, m: against the normal and along it."""
     out = []
     most = max(thickness, 0.15) / 2 + 0.45
     for way in (-normal, normal):

@@ -44,7 +44,7 @@ def spoil_page(drawing: Drawing, rng: np.random.Generator) -> Drawing:
 
 
 def _sample_camera(h: int, w: int, rng: np.random.Generator) -> Sequence[float]:
-    """Coefficients of Pillow's perspective: corners moved a little, and turned."""
+    """Sample the coefficients of Pillow's perspective: corners moved a little, and turned."""
     corners = np.array([[0, 0], [w, 0], [w, h], [0, h]], float)
     angle = rng.normal(0, 0.06)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -130,7 +130,7 @@ def _sample_centre(shapes: DrawingShapes, rng: np.random.Generator, window: floa
 
 
 def _sample_scale(rng: np.random.Generator) -> float:
-    """Px/m at which a page is looked at."""
+    """Sample the px/m at which a page is looked at."""
     kind = rng.random()
     if kind < AT_FINEST:
         return SEEN_SCALES[1]

@@ -109,7 +109,7 @@ class Sheet:
         self.texts: list[DrawnText] = []
 
     def place(self, points: Array) -> list[tuple[float, float]]:
-        """Finer pixels (column, row) of points (n, 2), m."""
+        """Return the finer pixels (column, row) of points (n, 2), m."""
         at = (np.asarray(points, np.float64).reshape(-1, 2) - self.corner) * self.scale
         at[:, 1] = self.shape[0] - 1 - at[:, 1]
         return [(float(x), float(y)) for x, y in at]

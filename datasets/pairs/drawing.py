@@ -167,7 +167,7 @@ def find_inner_doors(building: Building, storey: int) -> Array:
 
 
 def _draw_leaf_and_arc(door: Array, rng: np.random.Generator) -> list[Array]:
-    """Lines (k, 2), m, of an open leaf and of the way that it swings; none of an opening without a leaf."""
+    """Return the lines (k, 2), m, of an open leaf and of the way that it swings; none of an opening without a leaf."""
     if door["state"] == "none":
         return []
     normal = np.array([np.cos(door["direction"]), np.sin(door["direction"])]) * rng.choice([-1.0, 1.0])
@@ -186,7 +186,7 @@ def _list_furniture_outlines(building: Building, storey: int) -> list[Array]:
 
 
 def _draw_letters(polygon: Array, rng: np.random.Generator) -> list[Array]:
-    """Lines (k, 2), m, of letters in a room, two to eight of them, of strokes at random."""
+    """Draw lines (k, 2), m, of letters in a room, two to eight of them, of strokes at random."""
     place = np.asarray(shapely.Polygon(polygon).representative_point().coords)[0]
     size, count = rng.uniform(*LETTER_SIZES), int(rng.integers(2, 9))
     starts = place + np.column_stack([(np.arange(count) - count / 2) * size * 0.8, np.zeros(count)])

@@ -92,7 +92,7 @@ def build_edited_truth(path: str | Path, output: str | Path) -> EditedTruth:
 
 
 def _name_files(files: Sequence[Path]) -> dict[Path, str]:
-    """A name for each map, its own unless another one has it."""
+    """Choose a name for each map, its own unless another one has it."""
     taken: Counter[str] = Counter()
     names = {}
     for file in files:
@@ -102,7 +102,7 @@ def _name_files(files: Sequence[Path]) -> dict[Path, str]:
 
 
 def _format_table(edited: Mapping[Path, EditedMap], names: Mapping[Path, str]) -> list[str]:
-    """Edits a room of each map and of all, the measure in the field, and what was edited."""
+    """Tabulate the edits a room of each map and of all, the measure in the field, and what was edited."""
     rows = [("map", "rooms", "edits", "a room", "what was edited")]
     ops: Counter[str] = Counter()
     for file, done in edited.items():

@@ -115,7 +115,7 @@ def load_set(manifest: Path) -> list[EvaluationPair]:
 
 
 def _number_matched_rooms(matches: Array, sizes: Sequence[int]) -> tuple[Array, Array]:
-    """A number of its own for each match; rooms without one have -1."""
+    """Return a number of its own for each match; rooms without one have -1."""
     out = [np.full(n, -1) for n in sizes]
     for k, (i, j) in enumerate(matches.tolist()):
         out[0][i] = out[1][j] = k
@@ -174,7 +174,7 @@ def find_twins(true: Array, other: Array, rooms: Sequence[TrueRoom], others: Seq
 
 
 def _measure_plan(room: TrueRoom) -> tuple[float, float, float]:
-    """Area, m2, and sides of the smallest rectangle about it, m."""
+    """Return the area, m2, and the sides of the smallest rectangle about it, m."""
     shape = shapely.Polygon(room.polygon)
     corners = np.array(shapely.minimum_rotated_rectangle(shape).exterior.coords)
     sides = np.linalg.norm(np.diff(corners[:3], axis=0), axis=1)
@@ -192,7 +192,7 @@ def measure_common_area(maps: Sequence[TopometricMap], truth: Sim3 | None) -> fl
 
 
 def _compute_columns(map: TopometricMap, into: Sim3, floors: Array) -> Array:
-    """Sorted keys of the (storey, x, y) columns of which a map knows anything, in another frame."""
+    """Return the sorted keys of the (storey, x, y) columns of which a map knows anything, in another frame."""
     at = into.apply(np.concatenate([map.grid.compute_centroids(), map.navigable.compute_centroids()]))
     rows = np.column_stack([np.searchsorted(floors, at[:, 2]) - 1, np.floor(at[:, :2] / COLUMN_SIZE)]).astype(np.int64)
     return np.unique(rows[:, 0] * 2**40 + (rows[:, 1] + 2**18) * 2**20 + rows[:, 2] + 2**18)

@@ -109,7 +109,7 @@ def build_several_maps(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str,
 def _build_map_arrays(
     sides: str, maps: Sequence[TopometricMap], truths: Sequence[Array], points_per_room: int
 ) -> dict[str, Array]:
-    """Graph, storeys from above and true rooms of each map."""
+    """Return the graph, the storeys from above and true rooms of each map."""
     arrays: dict[str, Array] = {}
     for side, map, truth in zip(sides, maps, truths, strict=True):
         arrays |= {f"{side}.{name}": array for name, array in build_graph_arrays(map, points_per_room).items()}
@@ -177,7 +177,7 @@ def build_pair_arrays(pair: Pair, maps: Sequence[TopometricMap], item_entries: M
 
 
 def _make_first_pair(item: Item, plans: Sequence[Sequence[Plan]]) -> tuple[Pair, list[Landmarks]]:
-    """The pair of the first candidate that has one, and the signs that both maps read; none without."""
+    """Return the pair of the first candidate that has one, and the signs that both maps read; none without."""
 
     def make(k: int, rng: np.random.Generator) -> tuple[Pair, list[Landmarks]]:
         building, other = build_candidate(item, k, plans)
@@ -206,7 +206,7 @@ def build_candidate(item: Item, k: int, plans: Sequence[Sequence[Plan]]) -> tupl
 
 
 def _build_building(item: Item, k: int, plans: Sequence[Sequence[Plan]]) -> Building:
-    """Candidate k; after the last one comes the other building."""
+    """Build candidate k; after the last one comes the other building."""
     name = (*item.buildings, item.other[0])[k]
     if item.source == "procedural":
         return make_building(item.kind, int(name), item.storeys, get_difficulty(item))

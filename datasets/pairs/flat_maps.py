@@ -119,7 +119,8 @@ def extrude_flat(flat: FlatMap, z: float = 0.0) -> PointCloud:
 
 
 def encode_rows(*sets: Array) -> tuple[Array, ...]:
-    """One int64 for each row of integers (n, k), the same for the same row in all sets: much faster to compare than rows."""
+    """Return one int64 for each row of integers (n, k), the same for the same row in all sets: much faster to compare than
+    rows."""
     low = np.min([s.min(axis=0) for s in sets if len(s)], axis=0)
     size = np.max([s.max(axis=0) for s in sets if len(s)], axis=0) - low + 1
     return tuple(np.ravel_multi_index(tuple((s - low).T), tuple(size.tolist())) for s in sets)
@@ -143,7 +144,7 @@ def _repeat_at_heights(points: Array, levels: Sequence[float] | Array) -> Array:
 
 
 def _build_free_grid(flat: FlatMap, z: float) -> VoxelGrid:
-    """Cells at the laser's height that hold free floor and no wall."""
+    """Build the grid of the cells at the laser's height that hold free floor and no wall."""
     corner = np.concatenate([flat.free, flat.walls]).min(axis=0) - 1.5 * FREE_CELL  # a lattice of this step falls on middles
     free = thin(flat.free - corner, FREE_CELL)
     rows, walls = encode_rows(compute_cells(free, FREE_CELL), compute_cells(flat.walls - corner, FREE_CELL))

@@ -145,7 +145,8 @@ def choose_drawn_place(item: DrawingItem, plans: Sequence[Plans], folder: Path) 
 
 
 def find_places(pair: GridPair, item: GridItem, plans: Plans) -> list[MapOrigin]:
-    """Both maps of a cached pair; maps of several storeys are left out. None where the generator gives another pair by now."""
+    """Find the places of both maps of a cached pair; maps of several storeys are left out. None where the generator gives another
+    pair by now."""
     simulated = item.item
     for k in range(len(simulated.buildings)):
         try:
@@ -212,7 +213,7 @@ def measure_differences(here: MapOrigin, other: MapOrigin, storey: int) -> dict[
 
 
 def _add_common_area(arrays: dict[str, Array], here: MapOrigin) -> dict[str, Array]:
-    """With the area that the map saw of what is drawn."""
+    """Add the area that the map saw of what is drawn."""
     about = json.loads(arrays["about"].tobytes())
     if about["kind"] == "overlap":
         pair = unpack_pair(here.name, arrays)

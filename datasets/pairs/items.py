@@ -237,7 +237,8 @@ class Item:
 
 
 def compute_plan_digest(storeys: Sequence[Plan]) -> str:
-    """Hash of what plans contain, to a micrometre: the last bits of a reckoned number differ from one machine to the next."""
+    """Compute a hash of what plans contain, to a micrometre: the last bits of a reckoned number differ from one machine to the
+    next."""
     text = json.dumps([_round_values(convert_to_plain(asdict(plan))) for plan in storeys], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -329,7 +330,7 @@ def _pick(weights: Mapping[str, float], rng: np.random.Generator) -> str:
 
 
 def _sample_difficulty(spread: float, rng: np.random.Generator) -> tuple[tuple[str, float], ...]:
-    """Every number of the difficulty about its default."""
+    """Sample every number of the difficulty about its default."""
     drawn_fields = [f for f in fields(Difficulty) if f.name not in UNDRAWN]
     drawn = {f.name: round(float(f.default * rng.uniform(1 - spread, 1 + spread)), 3) for f in drawn_fields}  # type: ignore[operator]
     drawn = {name: value if name in ("furniture", "clutter", "people") else min(value, 1.0) for name, value in drawn.items()}

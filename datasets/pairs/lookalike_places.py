@@ -96,7 +96,7 @@ def sample_places(kind: str, furniture: str, seed: int) -> LookalikePlaces:
 
 
 def _sample_row(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> LookalikePlaces:
-    """Parts of a row: of a row of rooms (at most half of it) or of one of modules."""
+    """Sample parts of a row: of a row of rooms (at most half of it) or of one of modules."""
     layout = str(rng.choice(["room", "ensuite"] if kind == "shifted-row" else ["pair", "suite"]))
     count = int(rng.integers(6, 11)) if kind == "shifted-row" else 9
     row = make_row(draw_module(layout, rng), count, difficulty, seed, f"{kind}-{seed}")
@@ -113,14 +113,14 @@ def _sample_row(kind: str, furniture: str, seed: int, difficulty: Difficulty, rn
 
 
 def compute_row_poses(row: ModuleRow, first: int, second: int, seen: int) -> tuple[Sim3, ...]:
-    """Poses by whole periods, but the true one, that lay a module of b on one of a: each shows `seen`, from `first` and from
-    `second` on."""
+    """Return the poses by whole periods, but the true one, that lay a module of b on one of a: each shows `seen`, from `first`
+    and from `second` on."""
     shifts = [first - second + k for k in range(1 - seen, seen)]
     return tuple(Sim3(0.0, (k * row.period, 0.0, 0.0)) for k in shifts if k)
 
 
 def _furnish_row(row: ModuleRow, furniture: str, difficulty: Difficulty, rng: np.random.Generator) -> Building:
-    """The row with things; an inner module is furnished and copied, as those at the ends are longer."""
+    """Furnish the row; an inner module is furnished and copied, as those at the ends are longer."""
     building, density, clutter = row.building, difficulty.furniture, difficulty.clutter
     if furniture == "other":
         return replace_furniture(building, range(len(building.rooms)), density, clutter, rng)
@@ -140,7 +140,7 @@ def _sample_corridors(kind: str, furniture: str, seed: int, difficulty: Difficul
 
 
 def _sample_same_room(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> LookalikePlaces:
-    """One room of a size, and another one."""
+    """Sample one room of a size, and another one."""
     wide, deep = np.round(rng.uniform([4.0, 3.6], [9.0, 7.5]), 2).tolist()
     draft = Draft(round(float(rng.uniform(0.1, 0.2)), 2), rng)
     room = draft.add_box((0.0, 0.0), (wide, deep), str(rng.choice([*ROOM_KINDS, "openplan", "storage"])))
@@ -157,7 +157,7 @@ def _sample_same_room(kind: str, furniture: str, seed: int, difficulty: Difficul
 
 
 def _mirror(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> LookalikePlaces:
-    """A part of a building and its mirror image."""
+    """Return a part of a building and its mirror image."""
     a = make_building(str(rng.choice(MIRRORED_KINDS)), seed, 1, difficulty)
     rooms = sample_part(a, int(rng.choice(ROOMS_MIRRORED)), rng, start=_sample_room(a, rng))
     b = stretch_building(_vary_furniture(a, furniture, rooms, difficulty, rng), 0, lambda x: x, mirrored=True)
@@ -165,7 +165,7 @@ def _mirror(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: n
 
 
 def _draw_storeys(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> LookalikePlaces:
-    """Parts of two storeys of one plan. They begin in one corridor, where there is one."""
+    """Draw parts of two storeys of one plan. They begin in one corridor, where there is one."""
     difficulty = replace(difficulty, furniture=_draw_density(furniture, rng))
     a = make_building(str(rng.choice(MIRRORED_KINDS)), seed, 1, difficulty)
     start = _find_largest_corridor(a) if rng.random() < 0.7 else _sample_room(a, rng)
@@ -181,7 +181,7 @@ def _draw_storeys(kind: str, furniture: str, seed: int, difficulty: Difficulty, 
 
 
 def _draw_halves(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> LookalikePlaces:
-    """Parts of the two halves of a building that half a turn lays on itself; each has furniture of its own."""
+    """Draw parts of the two halves of a building that half a turn lays on itself; each has furniture of its own."""
     difficulty = replace(difficulty, furniture=_draw_density(furniture, rng), curved=0.0)
     for _ in range(HALVES_TRIED):
         profile = replace(PROFILES[str(rng.choice(MIRRORED_KINDS))], shapes=HALF_SHAPES)
@@ -202,7 +202,8 @@ def _draw_halves(kind: str, furniture: str, seed: int, difficulty: Difficulty, r
 
 
 def mirror_by_point(half: Plan) -> tuple[Plan, Array]:
-    """A plan and its image by half a turn about the end of its corridor, joined there by an opening; and that point (2,), m.
+    """Return a plan and its image by half a turn about the end of its corridor, joined there by an opening; and that point (2,),
+    m.
 
     The building lies on itself when it is turned by half a turn about the point.
     """
@@ -231,12 +232,12 @@ def mirror_by_point(half: Plan) -> tuple[Plan, Array]:
 
 
 def _is_near(start: Point, end: Point, middle: Array) -> bool:
-    """Does an opening lie where the two halves are joined?"""
+    """Return whether an opening lies where the two halves are joined."""
     return shapely.LineString([start, end]).distance(shapely.Point(middle)) < 0.6
 
 
 def add_pilasters(building: Building, share: float, rng: np.random.Generator) -> Building:
-    """The building with pillars and ends of walls along the walls of its rooms, `share` of them a metre, clear of doors."""
+    """Add pillars and ends of walls along the walls of a building's rooms, `share` of them a metre, clear of doors."""
     added = []
     clear = shapely.union_all([shapely.Point(*d["centre"][:2]).buffer(d["width"] / 2 + 0.5) for d in building.doors])
     for number, room in enumerate(building.rooms):
@@ -279,7 +280,7 @@ PLACES_OF: dict[str, Callable[[str, str, int, Difficulty, np.random.Generator], 
 
 
 def _vary_furniture(a: Building, furniture: str, rooms: Array, difficulty: Difficulty, rng: np.random.Generator) -> Building:
-    """The same plan a second time."""
+    """Return the same plan a second time."""
     every = range(len(a.rooms)) if furniture == "clutter" else rooms
     if furniture == "other":
         return replace_furniture(a, every, difficulty.furniture, difficulty.clutter, rng)

@@ -80,7 +80,8 @@ class _PlaceRasters:
 
 
 def measure_differences(a: VisiblePlace, b: VisiblePlace, pose: Sim3) -> dict[str, float]:
-    """Amounts by which two places differ when b's coordinates are mapped into a's; ``common``: m2 that both maps show."""
+    """Measure the amounts by which two places differ when b's coordinates are mapped into a's; ``common``: m2 that both maps
+    show."""
     corners = np.concatenate([r.polygon for r in a.building.rooms])
     low, high = corners.min(axis=0) - MARGIN, corners.max(axis=0) + MARGIN
     shape = tuple(np.ceil((high - low)[::-1] / RULE_CELL).astype(int).tolist())
@@ -113,8 +114,8 @@ def compute_strength(amount: Mapping[str, float]) -> float:
 
 
 def evaluate_poses(a: VisiblePlace, b: VisiblePlace, poses: Sequence[Sim3]) -> tuple[bool, dict[str, Any], Sim3 | None]:
-    """Is the pair tellable; the amounts of the pose at which it differs least, and that pose. Without one that both maps show
-    anything of, nothing is alike: tellable, no amounts."""
+    """Return whether the pair is tellable, the amounts of the pose at which it differs least, and that pose. Without one that
+    both maps show anything of, nothing is alike: tellable, no amounts."""
     rows = [(measure_differences(a, b, pose), pose) for pose in poses]
     most = max((r["common"] for r, _ in rows), default=0.0)
     alike = [(r, p) for r, p in rows if r["common"] >= COMPARABLE * most and r["common"] > 0]
@@ -378,14 +379,14 @@ def compute_seen_columns(grid: VoxelGrid, free: VoxelGrid | None, back: Sim3) ->
 
 
 def _describe_distinguishability(shown: list[VisiblePlace], places: LookalikePlaces, frames: list[Sim3]) -> dict[str, Any]:
-    """Who could tell, by what, and where they are alike."""
+    """Describe who could tell, by what, and where they are alike."""
     tellable, amount, pose = evaluate_poses(shown[0], shown[1], places.poses)
     alike = None if pose is None else (frames[0] @ pose @ frames[1].inverse()).matrix.round(6).tolist()
     return {"tellable": tellable, "amount": amount, "alike": alike, "repeats": places.repeats}
 
 
 def _describe_overlap(common: float, seen: list[Array]) -> dict[str, Any]:
-    """Kind of the pair, and the share of what both maps show of one place; hardly anything is nothing."""
+    """Return the kind of the pair, and the share of what both maps show of one place; hardly anything is nothing."""
     if common < LEAST_SHARED:
         return {"kind": "lookalike", "overlap": 0.0, "common": 0.0}
     mean = (len(seen[0]) + len(seen[1])) / 2 * 0.01

@@ -181,7 +181,7 @@ def select_consistent(tried: Sequence[TriedPair]) -> list[TriedPair]:
 
 
 def _count_triangles(one: TriedPair, accepted: Sequence[TriedPair]) -> int:
-    """How many triangles of believed pairs close over a pair, less those that do not."""
+    """Count how many triangles of believed pairs close over a pair, less those that do not."""
     assert one.pose is not None
     neighbours = [
         {other.b if other.a == end else other.a: other for other in accepted if end in (other.a, other.b)}
@@ -193,7 +193,7 @@ def _count_triangles(one: TriedPair, accepted: Sequence[TriedPair]) -> int:
 
 
 def _is_unconfirmed(one: TriedPair, kept: Sequence[TriedPair]) -> bool:
-    """Does a pair alone hold three captures or more together?"""
+    """Return whether a pair alone holds three captures or more together."""
     component = next(of for of in find_components(kept) if one.a in of)
     return len(component) > 2 and component not in find_components([other for other in kept if other is not one])
 

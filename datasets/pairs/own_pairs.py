@@ -275,7 +275,7 @@ def split_pairs(listing: PairsFile) -> tuple[dict[str, list[PairTruth]], tuple[s
 
 
 def _drawn(buildings: Sequence[str], listing: PairsFile) -> dict[str, str]:
-    """Part of each building: shares of them, at least one for test and training, and with three one to be watched."""
+    """Draw the part of each building: shares of them, at least one for test and training, and with three one to be watched."""
     order = sorted(buildings, key=lambda name: _hash([listing.split.seed, name]))
     counts = [max(round(share * len(order)), 1) for share in listing.split.shares[1:]]
     counts[0] = counts[0] if len(order) > 2 else 0
@@ -286,7 +286,7 @@ def _drawn(buildings: Sequence[str], listing: PairsFile) -> dict[str, str]:
 
 
 def _captures_held_out(listing: PairsFile, pairs: Sequence[PairTruth]) -> dict[str, str]:
-    """Part of each capture of one building, so that every part has a pair; of few captures none are watched.
+    """Return the part of each capture of one building, so that every part has a pair; of few captures none are watched.
 
     Raises:
         InputError: there are too few.
@@ -309,7 +309,7 @@ def _captures_held_out(listing: PairsFile, pairs: Sequence[PairTruth]) -> dict[s
 def _negatives(
     listing: PairsFile, positives: Sequence[PairTruth], part: str, part_of: Callable[[str, str], str]
 ) -> list[PairTruth]:
-    """Pairs of two buildings, or of two storeys, drawn in a number that goes by the pairs of a part."""
+    """Draw pairs of two buildings, or of two storeys, in a number that goes by the pairs of a part."""
     listed = {frozenset((pair.a, pair.b)) for pair in listing.pairs}
     near = {name for pair in positives for name in (pair.a, pair.b)}
     choices = [

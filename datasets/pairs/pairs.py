@@ -200,7 +200,7 @@ def choose_visited_places(
 
 
 def _make_other_building(building: Building) -> Building:
-    """A building of the same kind from another seed, of the same split: seeds come in pairs there."""
+    """Make a building of the same kind from another seed, of the same split: seeds come in pairs there."""
     if building.seed < 0 or not building.kind:
         raise InputError(f"{building.name}: name the other building of the hard negative")
     parameters = building.parameters
@@ -208,7 +208,8 @@ def _make_other_building(building: Building) -> Building:
 
 
 def draw_frames(count: int, scale: bool, rng: np.random.Generator) -> list[Sim3]:
-    """Random frames, building -> cloud; no two are turned alike. With `scale` all but the first have a scale of their own."""
+    """Draw random frames, building -> cloud; no two are turned alike. With `scale` all but the first have a scale of their
+    own."""
     frames: list[Sim3] = []
     while len(frames) < count:
         low, high = np.log(MAP_SCALES)

@@ -264,7 +264,7 @@ def _rooms(value: Any, where: str) -> tuple[tuple[int, int], ...]:
 
 
 def _pairs_of_frames(captures: Mapping[str, Capture], listed: set[frozenset[str]]) -> Iterator[PairTruth]:
-    """Pairs of captures in one frame, of one building, on storeys that may be the same, which are not listed."""
+    """Yield pairs of captures in one frame, of one building, on storeys that may be the same, which are not listed."""
     for a, b in itertools.combinations(captures.values(), 2):
         framed = a.frame != "" and a.frame == b.frame and a.building == b.building
         if framed and not are_on_two_storeys(a, b) and frozenset((a.name, b.name)) not in listed:
@@ -272,7 +272,7 @@ def _pairs_of_frames(captures: Mapping[str, Capture], listed: set[frozenset[str]
 
 
 def are_on_two_storeys(a: Capture, b: Capture) -> bool:
-    """Are two captures of one building known to show two storeys?"""
+    """Return whether two captures of one building are known to show two storeys."""
     return a.storey != "" and b.storey != "" and a.storey != b.storey
 
 
@@ -337,7 +337,7 @@ def _number(value: Any, where: str, least: float = -1e9, most: float = 1e9) -> f
 
 
 def _shown(value: Any) -> str:
-    """A short text of a value of a stranger's file, which may be huge."""
+    """Return a short text of a value of a stranger's file, which may be huge."""
     if isinstance(value, list) and len(value) <= 4 and not any(isinstance(v, list | Mapping) for v in value):
         return f"[{', '.join(_shown(v) for v in value)}]"
     if value is None or isinstance(value, bool | float):

@@ -22,7 +22,8 @@ Neighbours = dict[int, set[int]]
 
 
 def build_room_graph(building: Building, among: Iterable[int] | None = None) -> Neighbours:
-    """Room -> rooms that a door, an opening or stairs lead to; lifts, and rooms that are not `among` the given, left out."""
+    """Map each room to the rooms that a door, an opening or stairs lead to; lifts, and rooms that are not `among` the given, left
+    out."""
     fits = set(range(len(building.rooms)) if among is None else map(int, among))
     fits -= {i for i, room in enumerate(building.rooms) if room.kind == "lift"}
     neighbours: Neighbours = {i: set() for i in sorted(fits)}
@@ -110,7 +111,8 @@ def _add_neighbour(part: set[int], other: set[int], neighbours: Neighbours, rng:
 
 
 def find_twin_rooms(building: Building) -> dict[int, int]:
-    """Rooms of one storey -> the rooms over them with the same plan (IoU above `SAME_PLAN`): of the two storeys that share most.
+    """Map rooms of one storey to the rooms over them with the same plan (IoU above `SAME_PLAN`): of the two storeys that share
+    most.
 
     Corridors, halls and stairwells need to have less in common (`SAME_CORRIDOR`): they lead from room to room, also where
     they differ.
@@ -133,7 +135,7 @@ def find_twin_rooms(building: Building) -> dict[int, int]:
 
 
 def _match_rooms_above(building: Building, shapes: Array, low: Array, high: Array) -> dict[int, int]:
-    """Rooms -> the rooms over them that are alike, best pairs first, each room once."""
+    """Map rooms to the rooms over them that are alike, best pairs first, each room once."""
     if not len(low) or not len(high):
         return {}
     i, j = shapely.STRtree(shapes[high]).query(shapes[low], predicate="intersects")
@@ -208,7 +210,7 @@ def label_cells(map: TopometricMap, cloud: PointCloud) -> Array:
 
 
 def _measure_height(cells: Array) -> float:
-    """Levels between the lowest and the highest cells, but for one in a hundred."""
+    """Count the levels between the lowest and the highest cells, but for one in a hundred."""
     low, high = np.percentile(np.unique(cells, axis=0)[:, 2], [1, 99])
     return float(high - low)
 

@@ -246,7 +246,7 @@ def _transform_rooms(cloud: PointCloud, frame: Sim3) -> tuple[TrueRoom, ...]:
 
 
 def _list_panels(rooms: tuple[TrueRoom, ...], sides: list[Any]) -> list[Any]:
-    """(rooms, storey, sides) of each storey that is visited."""
+    """List (rooms, storey, sides) of each storey that is visited."""
     storeys = sorted({rooms[i].storey for side in sides for i in side[2]})
     return [(rooms, storey, sides) for storey in storeys]
 
@@ -299,7 +299,7 @@ def _draw_storey(ax: Axes, rooms: tuple[TrueRoom, ...], storey: int, sides: list
 
 
 def _draw_walk(ax: Axes, at: Array, floor: float, above: float, colour: str) -> None:
-    """The positions of the sensor on this storey; a line joins those of one round."""
+    """Draw the positions of the sensor on this storey; a line joins those of one round."""
     here = (at[:, 2] > floor) & (at[:, 2] < above + 0.2)
     far = np.linalg.norm(np.diff(at, axis=0), axis=1) > 1.0  # a surveyor with a tripod leaves no line
     pieces = np.split(np.where(here[:, None], at, np.nan), np.flatnonzero(far) + 1)

@@ -109,7 +109,7 @@ def list_niches(building: Building) -> Sequence[tuple[float, ...]]:
 
 
 def _list_doors(building: Building, states: Sequence[str]) -> Sequence[tuple[float, ...]]:
-    """Middle on the floor (m), direction of the normal (rad), width and thickness (m) of the doors that stand so."""
+    """List the middle on the floor (m), direction of the normal (rad), width and thickness (m) of the doors that stand so."""
     doors = building.doors[np.isin(building.doors["state"], states)]
     return [(*d["centre"].tolist(), *(float(d[k]) for k in ("direction", "width", "thickness"))) for d in doors]
 
@@ -281,7 +281,7 @@ def make_walls(item: WallItem, plan: Plan | None) -> WallExample:
 
 
 def _simulate_flat(building: Building, visited: Array, seed: int, rng: np.random.Generator) -> tuple[str, PointCloud, Any]:
-    """As `_seen`, by a 2D laser or as a grid map."""
+    """Simulate, as `_seen`, by a 2D laser or as a grid map."""
     if rng.random() >= SLICE_SHARE:
         return "drawn", simulate_grid_map(building, visited, rng), None
     cloud, shift = scan_with_drift(building, "laser2d", visited, rng, seed)
@@ -289,7 +289,7 @@ def _simulate_flat(building: Building, visited: Array, seed: int, rng: np.random
 
 
 def _simulate_scan(building: Building, visited: Array, item: WallItem, rng: np.random.Generator) -> tuple[str, PointCloud, Any]:
-    """How a building was seen, its cloud, and places of it with what undoes its drift there (None: it has none)."""
+    """Return how a building was seen, its cloud, and places of it with what undoes its drift there (None: it has none)."""
     sensor, seed = get_sensor(str(rng.choice(list(SENSOR_SHARES), p=list(SENSOR_SHARES.values())))), item.seed
     if seed % DRAWN_EVERY == DRAWN_EVERY - 1:
         return "drawn", simulate_grid_map(building, visited, rng), None

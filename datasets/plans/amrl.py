@@ -30,7 +30,7 @@ LINE_MAP_BYTES, LINE_MAP_CELLS = 50 << 20, 50_000_000
 
 
 def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
-    """Name and maker of the one storey."""
+    """Yield the name and maker of the one storey."""
     yield path.name.removesuffix(".vectormap.json"), partial(parse_sketch, read_limited(path, LINE_MAP_BYTES))
 
 
@@ -61,7 +61,7 @@ def parse_sketch(text: bytes) -> Sketch:
 
 
 def _parse_segments(text: bytes) -> Array:
-    """(n, 2, 2), m."""
+    """Parse the segments (n, 2, 2), m."""
     try:
         loaded = json.loads(text)
         lines = np.array([[[s[p]["x"], s[p]["y"]] for p in ("p0", "p1")] for s in loaded], float).reshape(-1, 2, 2)
@@ -84,7 +84,7 @@ def _find_inside(distance: Array) -> Array:
 
 
 def _find_outdoor_regions(labels: Array, free: Array, wall: Array) -> Array:
-    """Labels of corners between two wings: regions that end without a wall for longer than they are wide."""
+    """Return the labels of corners between two wings: regions that end without a wall for longer than they are wide."""
     edge = ndimage.binary_dilation(~free & ~wall) & (labels > 0)
     length, area = (np.bincount(labels[where], minlength=labels.max() + 1) for where in (edge, labels > 0))
     return np.flatnonzero(length > 1.2 * np.sqrt(area))

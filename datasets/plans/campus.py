@@ -64,12 +64,12 @@ class _NoDoctype(ElementTree.TreeBuilder):
     """Entities can only be declared in a DOCTYPE, so none is taken."""
 
     def doctype(self, *_: str | None) -> None:
-        """Called by the parser."""
+        """Refuse a DOCTYPE; called by the parser."""
         raise InputError("not read: XML with a DOCTYPE")
 
 
 def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
-    """Name and maker of the one storey of a file."""
+    """Yield the name and maker of the one storey of a file."""
     yield path.stem.removesuffix("_updated"), partial(parse_sketch, read_limited(path, CAMPUS_BYTES))
 
 
@@ -112,7 +112,7 @@ def _parse_points(element: ElementTree.Element, path: str) -> Array:
 
 
 def _parse_shape(space: ElementTree.Element, result: Sketch) -> shapely.Polygon | None:
-    """Outline in pixels; None for helpers without one."""
+    """Return the outline in pixels; None for helpers without one."""
     points = _parse_points(space, "bounding_polygon/point")
     label = space.findtext("labels/label")
     if len(np.unique(points, axis=0)) < 3 or not np.isfinite(points).all():
@@ -135,7 +135,7 @@ def _parse_shape(space: ElementTree.Element, result: Sketch) -> shapely.Polygon 
 def _estimate_scale(
     root: ElementTree.Element, spaces: list[ElementTree.Element], shapes: dict[str, shapely.Polygon | None], result: Sketch
 ) -> float:
-    """m per pixel: that of the file, or that of usual rooms where they are more than `TRUSTED` apart."""
+    """Return the metres per pixel: that of the file, or that of usual rooms where they are more than `TRUSTED` apart."""
     real, drawn = (float(root.findtext(f"scale/{w}_distance/value") or "nan") for w in ("real", "represented"))
     if not (real > 0 and drawn > 0):
         raise InputError("no scale: scale/real_distance and scale/represented_distance must be above 0")
@@ -155,7 +155,7 @@ def _estimate_scale(
 
 
 def _tidy(result: Sketch, indices: dict[str, int], helper: dict[str, bool]) -> None:
-    """Unlabelled helpers that overlap a labelled room go; of two rooms that overlap a little, the larger one gives way."""
+    """Drop unlabelled helpers that overlap a labelled room; of two rooms that overlap a little, cut the larger one."""
     keys = {i: key for key, i in indices.items()}
     for i, j, share in find_overlaps(result.shapes):
         small, large = sorted((i, j), key=lambda k: result.shapes[k].area)
@@ -180,7 +180,7 @@ def _tidy(result: Sketch, indices: dict[str, int], helper: dict[str, bool]) -> N
 
 
 def _add_doors(result: Sketch, spaces: list[ElementTree.Element], indices: dict[str, int], scale: float) -> None:
-    """One door for each portal; marks of the same door from both sides count once."""
+    """Add one door for each portal; marks of the same door from both sides count once."""
     marks: dict[tuple[int, int], list[tuple[Array, str, float]]] = {}
     for space in spaces:
         lines = {line.get("id"): _parse_points(line, "point") for line in space.findall("space_representation/linesegment")}

@@ -100,7 +100,7 @@ def _is_in_room(flight: Flight, rooms: tuple[PlanRoom, ...]) -> bool:
 
 
 def iter_plans(folder: str | Path, among: Collection[str] | None = None) -> Iterator[tuple[str, Plan | Refusal]]:
-    """Every plan of a folder, or of one file, in the order of their names; a bad one is a `Refusal` and the rest goes on.
+    """Yield every plan of a folder, or of one file, in the order of their names; a bad one is a `Refusal` and the rest goes on.
 
     Names are paths below the folder, without suffix, with the storey or the archive's member behind them: unique, and the same
     on every machine. What was changed or left out of a plan is logged at level INFO.
@@ -128,7 +128,7 @@ def list_plan_names(folder: str | Path) -> list[str]:
 
 
 def _list_files(folder: Path) -> list[tuple[Path, Path]]:
-    """Files with plans, and the folder that their names count from."""
+    """List the files with plans, and the folder that their names count from."""
     if not folder.exists():
         raise InputError(f"{folder}: no such file or folder")
     if folder.is_file():
@@ -137,7 +137,7 @@ def _list_files(folder: Path) -> list[tuple[Path, Path]]:
 
 
 def _build_full_name(file: Path, root: Path, name: str) -> str:
-    """Path of the folder and name of the plan, without repeating the folder's own name."""
+    """Return the path of the folder and name of the plan, without repeating the folder's own name."""
     above = file.parent.relative_to(root)
     if above.name and above.name == name.split("/")[0]:
         above = above.parent
@@ -165,7 +165,7 @@ def group_siblings(folder: str | Path) -> list[list[str]]:
 
 
 def map_plans_to_frames(folder: str | Path) -> dict[str, str]:
-    """Plan (named as of `iter_plans`) -> the frame it is in: that of its file or survey, otherwise one of its own."""
+    """Map each plan (named as of `iter_plans`) to the frame it is in: that of its file or survey, otherwise one of its own."""
     out = {}
     for file, root in _list_files(Path(folder)):
         for name in (_build_full_name(file, root, name) for name in _list_names(file)):
@@ -196,7 +196,7 @@ def summarise(results: Iterable[tuple[str, Plan | Refusal] | Refusal]) -> dict[s
 
 
 def _find_reader(path: Path) -> str:
-    """Name of the module that reads a file, or nothing."""
+    """Return the name of the module that reads a file, or nothing."""
     name = path.as_posix()
     if NOT_PLANS.search(name):
         return ""
@@ -205,7 +205,7 @@ def _find_reader(path: Path) -> str:
 
 
 def _read(path: Path, requested: Callable[[str], bool] = lambda name: True) -> Iterator[tuple[str, Plan | Refusal]]:
-    """Name and plan or refusal of each storey of a file."""
+    """Yield the name and plan or refusal of each storey of a file."""
     module = _find_reader(path)
     if not module:
         yield path.stem, Refusal(path.stem, f"not a known format: {path.name}")

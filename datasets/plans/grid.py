@@ -34,7 +34,7 @@ BUSY = 5  # doors from which on a room is a corridor
 
 
 def flood(labels: Array, free: Array, height: Array | None = None) -> Array:
-    """Labels spread over free cells, highest first, never across a wall: two regions meet where the way between them is lowest.
+    """Spread labels over free cells, highest first, never across a wall: two regions meet where the way between them is lowest.
 
     Args:
         labels: (h, w) int32, 0 where nothing is yet.
@@ -100,7 +100,7 @@ def find_contacts(labels: Array, resolution: float, origin: Array) -> list[tuple
 
 
 def _cluster_points(points: Array) -> list[Array]:
-    """Points that are at most two cells apart belong together."""
+    """Group points that are at most two cells apart."""
     low = np.floor(points.min(axis=0)).astype(int) - 2
     image = np.zeros(np.floor(points.max(axis=0)).astype(int) - low + 3, bool)
     cells = np.floor(points).astype(int) - low
@@ -132,7 +132,7 @@ def add_rooms(
     smallest: float,
     thin: float = 0.0,
 ) -> dict[int, int]:
-    """Add a room for each label whose outline has at least `smallest` m2; returns its index by label."""
+    """Add a room for each label whose outline has at least `smallest` m2; return its index by label."""
     index = {}
     for label, place in enumerate(ndimage.find_objects(labels), 1):
         if place is None:
@@ -169,7 +169,7 @@ MAX_PIXELS = 100_000_000
 
 
 def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
-    """Name and maker of the one storey."""
+    """Yield the name and maker of the one storey."""
     if path.suffix == ".yaml":
         yield path.parent.name, partial(read_bwi, path)
     else:
@@ -266,7 +266,7 @@ def _add_listed_doors(result: Sketch, doors: Any, room_of_name: dict[str, int]) 
 
 
 def _add_connections(result: Sketch, neighbours: Any, room_of_name: dict[str, int]) -> None:
-    """Openings for rooms that `connectivity.yaml` calls neighbours and that have none yet."""
+    """Add openings for rooms that `connectivity.yaml` calls neighbours and that have none yet."""
     done = {frozenset(ends) for ends in result.ends}
     for name, others in sorted(neighbours.items()) if isinstance(neighbours, dict) else []:
         for other in others:
@@ -280,7 +280,7 @@ def _add_connections(result: Sketch, neighbours: Any, room_of_name: dict[str, in
 
 
 def _remove_outside(labels: Array, free: Array) -> Array:
-    """White regions that are not free in the scan, or touch the rim of the image, are no rooms."""
+    """Remove white regions that are not free in the scan, or touch the rim of the image: they are no rooms."""
     counts = np.bincount(labels.ravel())
     share = np.bincount(labels.ravel(), free.ravel()) / np.maximum(counts, 1)
     rim = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])

@@ -50,7 +50,7 @@ HEIGHTS = (2.4, 8.0)  # m, of a storey
 
 
 def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
-    """Name and maker of every storey that has spaces, lowest first.
+    """Yield the name and maker of every storey that has spaces, lowest first.
 
     Raises:
         InputError: the extra is missing; damaged file; no spaces.
@@ -133,7 +133,7 @@ def build_sketch(rooms: list[tuple[Any, Array]], holes: list[tuple[str, Array, A
 
 
 def _find_storey_id(element: Any) -> int:
-    """Id of the storey that an element is part of, 0: none."""
+    """Return the id of the storey that an element is part of, 0: none."""
     from ifcopenshell.util.element import get_aggregate, get_container
 
     above = element
@@ -147,7 +147,7 @@ def _find_storey_id(element: Any) -> int:
 
 
 def _compute_base_outline(triangles: Array) -> shapely.Polygon:
-    """Outline of the lower side of a solid, seen from above."""
+    """Return the outline of the lower side of a solid, seen from above."""
     z = triangles[..., 2]
     low = triangles[(z < z.min() + 0.3).all(axis=1)]
     for chosen in (low, triangles):
@@ -160,7 +160,8 @@ def _compute_base_outline(triangles: Array) -> shapely.Polygon:
 
 
 def _find_openings(model: Any, solids: ElementSolids) -> list[tuple[str, Array, Array]]:
-    """Kind, ends (2, 2) along the middle of the wall, and lower and upper height of every door, window and bare opening."""
+    """Return the kind, ends (2, 2) along the middle of the wall, and lower and upper height of every door, window and bare
+    opening."""
     out = []
     for element in [*model.by_type("IfcDoor"), *model.by_type("IfcWindow")]:
         hole = next((rel.RelatingOpeningElement for rel in element.FillsVoids), None)
@@ -189,7 +190,7 @@ def _build_opening(kind: str, triangles: Array) -> tuple[str, Array, Array]:
 
 
 def _add_open_sides(result: Sketch) -> None:
-    """Openings where two spaces touch for at least 0.8 m."""
+    """Add openings where two spaces touch for at least 0.8 m."""
     shapes = np.array(result.shapes, object)
     first, second = shapely.STRtree(shapes).query(shapes, predicate="dwithin", distance=TOUCHING)
     for i, j in sorted({(i, j) for i, j in zip(first.tolist(), second.tolist(), strict=True) if i < j}):

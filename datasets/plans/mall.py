@@ -41,7 +41,7 @@ MALL_BYTES = 50 << 20
 
 
 def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
-    """Name (of the folder) and maker of the one storey."""
+    """Yield the name (of the folder) and maker of the one storey."""
     check_size(path, MALL_BYTES)
     yield path.parent.name, partial(read_sketch, path)
 
@@ -85,7 +85,7 @@ def _load(path: Path) -> dict[str, Any]:
 
 
 def _convert_to_metres(feature: dict[str, Any], origin: Array) -> shapely.Geometry:
-    """Shape in metres, x east, y north."""
+    """Convert a shape to metres, x east, y north."""
     shape = shapely.geometry.shape(feature["geometry"])
     factor = np.array([np.cos(np.radians(origin[1])), 1.0]) * DEGREE
     return shapely.make_valid(shapely.transform(shape, lambda points: (points - origin) * factor))
@@ -111,7 +111,7 @@ def _classify_room(name: str) -> str:
 
 
 def _remove_duplicates(result: Sketch) -> None:
-    """Many rooms are in the file twice, and small ones lie within larger ones: the smaller one stays."""
+    """Remove duplicates: many rooms are in the file twice, and small ones lie within larger ones: the smaller one stays."""
     gone: set[int] = set()
     for i, j, share in find_overlaps(result.shapes):
         small, large = sorted((i, j), key=lambda k: (result.shapes[k].area, k))

@@ -49,7 +49,7 @@ Rows = list[tuple[Array, str, str]]  # (2, 2) px, category, type
 
 
 def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
-    """Name and maker of every plan of a text file or a tar archive, whose members are read in memory only.
+    """Yield the name and maker of every plan of a text file or a tar archive, whose members are read in memory only.
 
     Raises:
         InputError: truncated or absurdly large archive.
@@ -122,7 +122,8 @@ def _parse_rows(text: bytes) -> Rows:
 
 
 def _estimate_scale(rows: Rows) -> float:
-    """m per pixel: the middle one of what doors, bathtubs and toilets say, kept where narrow doors are 0.7 to 0.9 m."""
+    """Return the metres per pixel: the middle one of what doors, bathtubs and toilets say, kept where narrow doors are 0.7 to 0.9
+    m."""
 
     def lengths(category: str, types: tuple[str, ...] = ()) -> Array:
         chosen = [np.ptp(ends, axis=0).max() for ends, c, t in rows if c == category and (not types or t in types)]
@@ -142,7 +143,7 @@ def _estimate_scale(rows: Rows) -> float:
 
 
 def _build_faces(walls: Array, snap: float) -> list[shapely.Polygon]:
-    """Faces of the walls after making them longer by `snap` at both ends; slivers between double lines are left out."""
+    """Build the faces of the walls after making them longer by `snap` at both ends; slivers between double lines are left out."""
     along = walls[:, 1] - walls[:, 0]
     along = along / np.linalg.norm(along, axis=1, keepdims=True) * snap
     lines = np.stack([walls[:, 0] - along, walls[:, 1] + along], axis=1)
@@ -155,7 +156,7 @@ def _build_faces(walls: Array, snap: float) -> list[shapely.Polygon]:
 
 
 def _classify_faces(faces: list[shapely.Polygon], rows: Rows, scale: float) -> list[str]:
-    """Kind of each face: that of the seed in it, the most telling one where there are several."""
+    """Return the kind of each face: that of the seed in it, the most telling one where there are several."""
     tree, order = shapely.STRtree(faces), list(APARTMENT_KINDS)
     best = np.full(len(faces), len(order))
     for ends, category, _ in rows:
@@ -174,7 +175,7 @@ def _check_seeds(faces: list[shapely.Polygon], rows: Rows, scale: float) -> None
 
 
 def _add_openings(result: Sketch, rows: Rows, scale: float, faces: list[shapely.Polygon], rooms: Array, walls: Array) -> None:
-    """Doors between rooms and at the entrance; other openings to outside are windows, wide ones down to the floor."""
+    """Add doors between rooms and at the entrance; other openings to outside are windows, wide ones down to the floor."""
     ends = np.array([ends * scale for ends, category, _ in rows if category == "door" and np.ptp(ends, axis=0).max() > 0])
     if not len(ends):
         return

@@ -51,7 +51,7 @@ Level = dict[str, Any]
 
 
 def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
-    """Name and maker of every level, lowest first.
+    """Yield the name and maker of every level, lowest first.
 
     Raises:
         InputError: no YAML, or not of this format.
@@ -73,7 +73,7 @@ def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
 
 
 def _check_depth(text: bytes, loader: Any) -> None:
-    """The C loader calls itself for every list within a list, and ends the process where there are too many."""
+    """Refuse too many lists within lists: the C loader calls itself for each, and ends the process."""
     depth = 0
     for event in yaml.parse(text, loader):
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
@@ -82,7 +82,7 @@ def _check_depth(text: bytes, loader: Any) -> None:
 
 
 def build_sketch(site: dict[str, Any], order: list[str], k: int, stem: str = "") -> Sketch:
-    """Level k of a building, in the frame of its lowest level.
+    """Build level k of a building, in the frame of its lowest level.
 
     Raises:
         InputError: no scale; no walls; walls that enclose nothing.
@@ -127,7 +127,8 @@ def _estimate_scale(level: Level) -> float:
 
 
 def _compute_placement(site: dict[str, Any], order: list[str], name: str) -> tuple[float, Array]:
-    """m per pixel and shift, m, that bring a level's pixels into the frame of the lowest level, by the common fiducials."""
+    """Return the metres per pixel and the shift, m, that bring a level's pixels into the frame of the lowest level, by the common
+    fiducials."""
     level, first = site["levels"][name], site["levels"][order[0]]
     scale = _estimate_scale(level)
     marks = [{f[2]: np.array(f[:2], float) * (1, -1) for f in each.get("fiducials", [])} for each in (level, first)]
@@ -154,7 +155,8 @@ def _list_segments(level: Level, key: str, points: Array) -> Array:
 
 
 def _list_lifts(site: dict[str, Any], order: list[str], k: int) -> list[tuple[str, Array]]:
-    """Name and cabin's corners (4, 2), m, of the lifts that stop at level k; the door is in front of the last two corners."""
+    """List the name and cabin's corners (4, 2), m, of the lifts that stop at level k; the door is in front of the last two
+    corners."""
     out = []
     for name, lift in sorted((site.get("lifts") or {}).items()):
         if order[k] in lift.get("level_doors", {}):
@@ -207,7 +209,7 @@ def _find_gaps(lines: Array, walls: Array) -> Array:
 
 
 def _build_faces(lines: Array, level: Level, points: Array, shafts: list[Array]) -> list[shapely.Polygon]:
-    """Faces of the lines that lie on the level's floors or are cabins of lifts."""
+    """Build the faces of the lines that lie on the level's floors or are cabins of lifts."""
     along = lines[:, 1] - lines[:, 0]
     along = along / np.linalg.norm(along, axis=1, keepdims=True) * LINE_SNAP
     longer = np.stack([lines[:, 0] - along, lines[:, 1] + along], axis=1)
@@ -231,7 +233,8 @@ def _compute_height(site: dict[str, Any], order: list[str], k: int) -> float:
 
 
 def _assign_names(result: Sketch, level: Level, points: Array, shafts: list[Array], stem: str) -> None:
-    """Names from the waypoints in each room; kinds from words in them, from the lifts, and from the number of doors."""
+    """Assign names from the waypoints in each room, and kinds from words in them, from the lifts, and from the number of
+    doors."""
     tree = shapely.STRtree(result.shapes)
     for vertex, point in zip(level.get("vertices", []), points, strict=True):
         if len(vertex) > 3 and vertex[3]:

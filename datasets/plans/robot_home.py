@@ -38,7 +38,7 @@ def is_robot_home(path: Path) -> bool:
 
 
 def iter_sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
-    """Name and maker of the one storey."""
+    """Yield the name and maker of the one storey."""
     yield path.stem, partial(read_robot_home, path)
 
 

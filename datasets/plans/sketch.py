@@ -252,7 +252,7 @@ def build_outline(shape: shapely.Polygon) -> Array:
 
 
 def _cut(shape: shapely.Polygon, slit: shapely.LineString) -> shapely.Polygon | None:
-    """The shape less a thin slit, or None where that breaks it."""
+    """Return the shape less a thin slit, or None where that breaks it."""
     if slit.length < 1e-6:  # the hole touches the outline
         blade = slit.buffer(10 * SLIT)
     else:
@@ -357,5 +357,5 @@ def _verify_openings(sketch: Sketch, shapes: Sequence[shapely.Polygon]) -> Array
 
 
 def _is_kept(ends: tuple[int, int], connected: Array) -> bool:
-    """Openings stay between kept rooms, and from a kept room to outside."""
+    """Return whether an opening stays: those between kept rooms, and from a kept room to outside."""
     return all(e < 0 or connected[e] for e in ends) and any(e >= 0 for e in ends)

@@ -79,7 +79,7 @@ def get_seed_range(split: str) -> tuple[int, int]:
 
 
 def _read(split: str) -> tuple[frozenset[str], frozenset[str], tuple[int, int]]:
-    """Buildings, whole sources and seeds of a split."""
+    """Read the buildings, whole sources and seeds of a split."""
     refuse_split(split)
     if split not in (*SPLITS, SEALED):
         raise InputError(f"split {split!r}: {', '.join(SPLITS)} are possible")
@@ -110,7 +110,7 @@ def iter_relatives(source: str, plans: Mapping[str, Plan]) -> Iterator[list[str]
 
 
 def assign_splits(source: str, drawn: list[list[str]]) -> dict[str, list[str]]:
-    """Groups dealt to the splits in the order of a hash of their names: the test takes its share first, one group at least."""
+    """Deal groups to the splits in the order of a hash of their names: the test takes its share first, one group at least."""
     order = sorted(drawn, key=lambda group: hashlib.sha256(f"{source}/{group[0]}".encode()).digest())
     total, out = sum(map(len, drawn)), {split: list[str]() for split in SPLITS}
     for k, group in enumerate(order):

@@ -35,7 +35,7 @@ POSE = re.compile(r"(\S+)\s+\[" + r"\s*,\s*".join([rf"\(({NUMBER})\s*,\s*({NUMBE
 
 
 def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
-    """Name and maker of every two sequences of a building.
+    """Yield the name and maker of every two sequences of a building.
 
     Raises:
         InputError: no building with poses in the folder.

@@ -32,7 +32,7 @@ LARGEST_HOUSE = 100 << 20  # bytes of a .house file
 
 
 def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
-    """Name and maker of a pair of parts of each house.
+    """Yield the name and maker of a pair of parts of each house.
 
     Raises:
         InputError: the folder holds no house.

@@ -32,7 +32,7 @@ TILT = 10.0  # degrees; a transform that leans more is wrong
 
 
 def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
-    """Name and maker of a pair of each reference and each of its later scans that is there.
+    """Yield the name and maker of a pair of each reference and each of its later scans that is there.
 
     Raises:
         InputError: `3RScan.json` is missing or damaged.

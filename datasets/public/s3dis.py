@@ -36,7 +36,7 @@ CONTROL = bytes(set(range(32)) - set(b"\t\n\r"))
 
 
 def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
-    """Name and maker of a pair of parts of each area.
+    """Yield the name and maker of a pair of parts of each area.
 
     Raises:
         InputError: the folder holds no area.
@@ -48,7 +48,8 @@ def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
 
 
 def read_area(area: Path) -> PointCloud:
-    """All rooms of an area. A room that can't be read is left out, with a warning; the outlines are the points' convex hulls.
+    """Read all rooms of an area. A room that can't be read is left out, with a warning; the outlines are the points' convex
+    hulls.
 
     Raises:
         InputError: none of them can be read, or the area is sealed.

@@ -78,7 +78,7 @@ def iter_scenes(folder: str | Path) -> Iterator[tuple[str, Scene | Refusal]]:
 
 
 def group_scans_by_place(folder: str | Path) -> dict[str, list[str]]:
-    """Place -> names of its scans, for places that were scanned more than once."""
+    """Map each place to the names of its scans, for places that were scanned more than once."""
     out: dict[str, list[str]] = {}
     for name in _list_names(Path(folder)):
         out.setdefault(name.partition("_")[0], []).append(name)
@@ -122,7 +122,7 @@ def read_scene(folder: Path) -> Scene:
 
 
 def _read_values(path: Path) -> tuple[Array, str]:
-    """Alignment (4, 4) and kind of a scan; the identity and nothing where they are not published."""
+    """Read the alignment (4, 4) and kind of a scan; the identity and nothing where they are not published."""
     if not path.is_file() or path.stat().st_size > LARGEST_VALUES:
         return np.eye(4), ""
     lines = [line.partition("=") for line in path.read_text(encoding="latin-1").splitlines()]

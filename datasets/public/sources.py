@@ -60,7 +60,7 @@ def iter_public_pairs(folder: str | Path, source: str) -> Iterator[tuple[str, Pa
 
 
 def _guard_sealed(source: str, makers: Iterator[tuple[str, Callable[[], Pair]]]) -> Iterator[tuple[str, Callable[[], Pair]]]:
-    """The makers, of which those of sealed buildings refuse."""
+    """Yield the makers, of which those of sealed buildings refuse."""
     for name, make in makers:
         yield name, partial(_make_if_unsealed, source, name, make)
 
@@ -107,7 +107,7 @@ def compute_hull(points: Array) -> Array:
 def iter_part_pairs(
     folders: Sequence[Path], read: Callable[[Path], PointCloud], source: str
 ) -> Iterator[tuple[str, Callable[[], Pair]]]:
-    """Name and maker of a pair of parts of each building, which `read` gives as a labelled cloud."""
+    """Yield the name and maker of a pair of parts of each building, which `read` gives as a labelled cloud."""
     for folder in folders:
         yield folder.name, partial(_make_part_pair, folder, read, source)
 
@@ -117,7 +117,7 @@ def _make_part_pair(folder: Path, read: Callable[[Path], PointCloud], source: st
 
 
 def cut_pair(cloud: PointCloud, name: str, source: str, sensor: str, seed: int) -> Pair:
-    """Two connected parts of a labelled cloud in random frames, a third to a half of their rooms in common, as in the thesis.
+    """Cut two connected parts of a labelled cloud in random frames, a third to a half of their rooms in common, as in the thesis.
 
     Raises:
         InputError: too few rooms that hang together.

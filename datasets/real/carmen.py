@@ -33,7 +33,7 @@ LOG_CELLS = 200_000_000  # of a raster
 
 
 def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
-    """Name and maker of three pairs a log.
+    """Yield the name and maker of each of three pairs a log.
 
     Raises:
         InputError: the folder has no log.
@@ -148,7 +148,8 @@ def draw_map(poses: Array, ranges: Array, frame: Sim3, source: str = "") -> Flat
 
 
 def _cast_rays(origins: Array, headings: Array, ranges: Array) -> tuple[Array, Array]:
-    """Where the rays (n, k) of n scans ended within `LASER_REACH`, and points on the way there, one a cell: (m, 2) each."""
+    """Return where the rays (n, k) of n scans ended within `LASER_REACH`, and points on the way there, one a cell: (m, 2)
+    each."""
     good = (ranges > NEAREST) & (ranges < FAILED)
     scan = np.nonzero(good)[0]
     far, ray = ranges[good], np.stack([np.cos(headings[good]), np.sin(headings[good])], axis=1)

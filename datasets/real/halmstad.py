@@ -24,7 +24,7 @@ LARGEST_LISTING = 10 << 20  # bytes of the list of pairs
 
 
 def iter_pairs(folder: Path, pixel: float = PIXEL) -> Iterator[tuple[str, Callable[[], Pair]]]:
-    """Name and maker of every pair of maps of one place; of the two orders in which a pair is listed, the first.
+    """Yield the name and maker of every pair of maps of one place; of the two orders in which a pair is listed, the first.
 
     Args:
         pixel: m.
@@ -49,7 +49,7 @@ def iter_pairs(folder: Path, pixel: float = PIXEL) -> Iterator[tuple[str, Callab
 
 
 def _load_pair(read: Callable[[str], FlatMap], points: dict[str, Array], a: str, b: str, same: Array) -> Pair:
-    """One pair, in the owner's frames: they differ."""
+    """Load one pair, in the owner's frames: they differ."""
     maps = read(a), read(b)
     try:
         truth = fit_points(*(points[n][same[:, k]] for k, n in enumerate((a, b))))

@@ -35,7 +35,7 @@ UNDER_CEILING = 0.15  # m under its floor that a point may lie
 
 
 def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
-    """Name and maker of a pair for each of `MODELS`."""
+    """Yield the name and maker of a pair for each of `MODELS`."""
     for name in MODELS:
         yield f"{name}-scan", partial(_load_pair, folder / f"{name}.ifc")
 
@@ -123,7 +123,7 @@ def _read_model(path: Path) -> PointCloud:
 
 
 def _sample_model(path: Path, building: Building) -> PointCloud:
-    """Points sampled on the model, in the building's frame and with its rooms."""
+    """Sample points on the model, in the building's frame and with its rooms."""
     cloud = _read_model(path)
     points = cloud.points.astype(np.float64) + cloud.shift - [0.0, 0.0, find_ground(path, building)]
     labels = np.full(len(points), -1, np.int32)

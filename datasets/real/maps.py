@@ -56,7 +56,7 @@ def build_real_pairs(
 
 
 def _build_source(data: Path, folder: Path, source: str, voxel_size: float, log_line: Callable[[str], None]) -> list[Path]:
-    """Files of a source; a list of them lies beside, so that nothing is read where all are there."""
+    """Build the files of a source; a list of them lies beside, so that nothing is read where all are there."""
     whole = f"{source}-{compute_source_digest(data, source, voxel_size)}"
     listed = folder / f"{whole}.json"
     if listed.exists():
@@ -131,7 +131,8 @@ def iter_real_grid_pairs(folder: str | Path, sources: Sequence[str] | None = Non
 
 
 def build_floor(folder: str | Path, cache: str | Path, log_line: LogFn = lambda text: None) -> list[Path]:
-    """Files of the pairs of the development floor, in the order of the pairs, as `build_grids` makes those of simulated ones.
+    """Build the files of the pairs of the development floor, in the order of the pairs, as `build_grids` makes those of simulated
+    ones.
 
     Raises:
         InputError: the floor is not in the folder.

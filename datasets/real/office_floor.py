@@ -17,7 +17,7 @@ OFFICE_PIXEL = 0.03  # m; not published: offices and doors are of a plausible si
 
 
 def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
-    """Name and maker of every pair of maps of the floor; their source is halmstad, their building F5.
+    """Yield the name and maker of every pair of maps of the floor; their source is halmstad, their building F5.
 
     Raises:
         InputError: the list of pairs is missing or damaged.

@@ -165,7 +165,7 @@ def _iterate(folder: Path, sources: Sequence[str]) -> Iterator[tuple[str, Pair |
 
 
 def iter_pair_makers(source: str, folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
-    """Name and maker of each pair of a source.
+    """Yield the name and maker of each pair of a source.
 
     Args:
         folder: of all real data.

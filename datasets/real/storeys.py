@@ -24,7 +24,7 @@ COPIED = {"7f", "8f"}
 
 
 def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
-    """Name and maker of each pair: two storeys of one building, then one storey in two years."""
+    """Yield the name and maker of each pair: two storeys of one building, then one storey in two years."""
     read = cache(lambda name: read_flat(folder / f"{name}.yaml"))
     number = 0
     for building, storeys in STOREYS.items():

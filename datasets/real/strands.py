@@ -31,7 +31,7 @@ INTO_2016 = {  # session -> 2016; the fit of 2015 to 2017 differs from that to 2
 
 
 def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
-    """Name and maker of the three pairs."""
+    """Yield the name and maker of each of the three pairs."""
     read = cache(lambda session: read_flat(folder / SESSIONS[session]))
     for number, (a, b) in enumerate(combinations(SESSIONS, 2)):
         yield f"tsc-{a}-{b}", partial(_load_pair, read, a, b, number)

@@ -46,7 +46,7 @@ LARGEST_LINE_MAP, UTEXAS_CELLS = 50 << 20, 50_000_000
 
 
 def iter_pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
-    """Name and maker of four pairs of a grid and a line map, and three of a grid and a part of it."""
+    """Yield the names and makers of four pairs of a grid and a line map, and three of a grid and a part of it."""
     read = cache(partial(_read_grid, folder))
     for seed, floor in enumerate(INTO_LINES):
         yield f"gdc{floor}-lines", partial(_load_lines_pair, read, folder.parent / LINES_FOLDER, floor, seed)
@@ -78,7 +78,7 @@ def _read_grid(folder: Path, name: str) -> FlatMap:
 
 
 def _read_rooms(path: Path, plan: Path) -> tuple[TrueRoom, ...]:
-    """Rooms of a floor: their outlines are given in pixels from the map's upper left corner.
+    """Read the rooms of a floor: their outlines are given in pixels from the map's upper left corner.
 
     Raises:
         InputError: missing or damaged file.

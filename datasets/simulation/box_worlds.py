@@ -34,10 +34,12 @@ Sequence3 = tuple[float, float, float]
 
 @dataclass
 class World:
-    """Args:
-    rooms: (n, 4) x0, y0, x1, y1 between the faces of the walls, m; the first one is the corridor.
-    doors: (d, 3) x, y, room: from the corridor into each room.
-    things: of each room, boxes (k, 5) x0, y0, x1, y1, height.
+    """A corridor and the rooms beside it, in which boxes stand.
+
+    Args:
+        rooms: (n, 4) x0, y0, x1, y1 between the faces of the walls, m; the first one is the corridor.
+        doors: (d, 3) x, y, room: from the corridor into each room.
+        things: of each room, boxes (k, 5) x0, y0, x1, y1, height.
     """
 
     rooms: Array
@@ -176,7 +178,7 @@ def furnish_row(world: World, width: float, kind: str, rng: np.random.Generator)
 
 
 def scan_part(world: World, width: float, start: int, rng: np.random.Generator) -> tuple[Array, Sim3]:
-    """`ROOMS_SEEN` rooms of both sides of a row, and the corridor a little beyond them."""
+    """Scan `ROOMS_SEEN` rooms of both sides of a row, and the corridor a little beyond them."""
     rooms = world.rooms.copy()
     rooms[0, [0, 2]] = (start - 0.4) * width, (start + ROOMS_SEEN + 0.4) * width
     visited = [0, *(1 + k + side for side in (0, ROW_ROOMS) for k in range(start, start + ROOMS_SEEN))]
@@ -184,7 +186,8 @@ def scan_part(world: World, width: float, start: int, rng: np.random.Generator) 
 
 
 def load_pair(kind: str, seed: int, cache: Path) -> tuple[TopometricMap, TopometricMap, Sim3, Array]:
-    """Both maps of a pair, the true pose T_ab if they are of one place, and the middle of b, m; made where they are missing."""
+    """Load both maps of a pair, the true pose T_ab if they are of one place, and the middle of b, m; made where they are
+    missing."""
     about = cache / f"{kind}-{seed}.json"
     files = [cache / f"{kind}-{seed}-{side}.tmap" for side in "ab"]
     if not about.exists():
@@ -200,7 +203,7 @@ def load_pair(kind: str, seed: int, cache: Path) -> tuple[TopometricMap, Topomet
 
 
 def is_right(registration: Registration, kind: str, truth: Sim3, middle: Array) -> bool:
-    """Is a pose right? Of places that are not one, none is."""
+    """Return whether a pose is right. Of places that are not one, none is."""
     if registration.transform is None or kind in APART[:-1]:
         return False
     off = registration.transform.apply(middle[None]) - truth.apply(middle[None])

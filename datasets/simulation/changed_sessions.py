@@ -134,7 +134,7 @@ def make_base_building(kind: str, seed: int, rng: np.random.Generator) -> Buildi
 
 
 def _add_doors(plan: Plan, rng: np.random.Generator) -> Plan:
-    """The plan with doors between up to three pairs of neighbours."""
+    """Add doors between up to three pairs of neighbours."""
     shapes = [shapely.Polygon(r.polygon) for r in plan.rooms]
     taken = [build_rectangle(o.start, o.end, o.thickness) for o in plan.openings]
     added: list[Opening] = []
@@ -156,7 +156,8 @@ def _add_doors(plan: Plan, rng: np.random.Generator) -> Plan:
 
 
 def _alter(base: Building, visited: Sequence[int], rng: np.random.Generator) -> tuple[Building, Building, list[TrueChange]]:
-    """The building, its things in the way taken out, and the same with a wall more and a doorway less; and what that is."""
+    """Return the building, its things in the way taken out, and the same with a wall more and a doorway less; and what that
+    is."""
     done: list[TrueChange] = []
     divided: list[TrueChange] = []
     other = base
@@ -194,7 +195,7 @@ Masonry = tuple[tuple[float, ...], tuple[float, ...], float]  # centre, size, ya
 def _draw_wall(
     building: Building, room: int, rng: np.random.Generator
 ) -> tuple[list[Masonry], shapely.Polygon, shapely.Polygon] | None:
-    """Boxes of a wall with a doorway across a room, its outline and that of the doorway."""
+    """Draw the boxes of a wall with a doorway across a room, its outline and that of the doorway."""
     about = building.rooms[room]
     shape = shapely.Polygon(about.polygon)
     if shape.area < ROOM_AREA or about.kind in ("stairs", "lift", "corridor", "void") or about.ceiling - about.floor < 2.3:
@@ -232,7 +233,7 @@ def _draw_wall(
 
 
 def _add_masonry(building: Building, parts: Sequence[Masonry], room: int) -> Building:
-    """The building with boxes of masonry; they are things, too, so that nobody walks through them."""
+    """Add boxes of masonry to the building; they are things, too, so that nobody walks through them."""
     vertices, triangles, rows = [building.vertices], [building.triangles], []
     count = len(building.vertices)
     for centre, size, yaw in parts:
@@ -296,14 +297,14 @@ def _describe(kind: str, outline: shapely.Polygon) -> TrueChange:
 
 
 def _find_reachable(building: Building, visited: Sequence[int]) -> list[int]:
-    """Those of the rooms that can be walked to from the most of them."""
+    """Return those of the rooms that can be walked to from the most of them."""
     part = building.find_components()[list(visited)]
     most = np.bincount(part).argmax()
     return [r for r, p in zip(visited, part.tolist(), strict=True) if p == most]
 
 
 def _list_door_states(old: Building, new: Building, visited: Sequence[int]) -> list[TrueChange]:
-    """Doors that were opened or shut; those that only swung further are as they were."""
+    """List the doors that were opened or shut; those that only swung further are as they were."""
     out = []
     for door in new.doors:
         same = np.flatnonzero(np.linalg.norm(old.doors["centre"] - door["centre"], axis=1) < 0.05)
@@ -315,7 +316,7 @@ def _list_door_states(old: Building, new: Building, visited: Sequence[int]) -> l
 
 
 def _list_furniture(old: Building, new: Building, visited: Sequence[int]) -> list[TrueChange]:
-    """Things that stand on the floor of a visited room in one session, and not there in the other one."""
+    """List the things that stand on the floor of a visited room in one session, and not there in the other one."""
     tables = []
     for building in (old, new):
         present = np.isin(np.arange(len(building.things)), building.thing_of)
@@ -338,7 +339,8 @@ def _list_furniture(old: Building, new: Building, visited: Sequence[int]) -> lis
 
 
 def _is_seen(change: TrueChange, scans: Sequence[PointCloud], days: Sequence[Building]) -> bool:
-    """Did both sessions see it: points on what stands, in one, and its ground, or the ceiling over it, in the other one?"""
+    """Return whether both sessions saw it: points on what stands, in one, and its ground, or the ceiling over it, in the other
+    one."""
     near = change.outline.buffer(0.12)
     counts, shares = [], []
     for scan, day in zip(scans, days, strict=True):

@@ -237,7 +237,7 @@ def predict_storey_columns(truth: FloorTruth, storey: int, stood: Array, over: A
 
 
 def _spread_labels(labels: Array, reach: float) -> Array:
-    """Labels, with those of the nearest labelled column within `reach` m where there are none."""
+    """Return the labels, with those of the nearest labelled column within `reach` m where there are none."""
     if not (labels >= 0).any():
         return labels
     far, (i, j) = ndimage.distance_transform_edt(labels < 0, return_indices=True)
@@ -315,7 +315,7 @@ def evaluate_map(map: TopometricMap, truth: FloorTruth, columns: Array | None = 
 
 
 def _compute_levels(map: TopometricMap, truth: FloorTruth) -> Array:
-    """Heights of the map's storeys in the building's frame, m."""
+    """Return the heights of the map's storeys in the building's frame, m."""
     return map.storeys["floor"] * truth.matrix[2, 2] + truth.matrix[2, 3]
 
 

@@ -47,7 +47,7 @@ def simulate_sensor_poses(walk: Walk, sensor: Sensor, visited: Sequence[int], rn
 
 
 def _compute_heading(points: Array) -> Array:
-    """rad, the way the walk goes at each point, looking 0.5 m ahead."""
+    """Return the direction, rad, in which the walk goes at each point, looking 0.5 m ahead."""
     ahead = np.roll(points, -5, axis=0)[:, :2] - points[:, :2]
     ahead[-5:] = ahead[-6] if len(points) > 5 else (1.0, 0.0)
     return np.arctan2(ahead[:, 1], ahead[:, 0])
@@ -81,7 +81,7 @@ def add_drift(poses: Array, walk: Walk, along: Array, sensor: Sensor, rng: np.ra
 
 
 def _add_jitter(poses: Array, sensor: Sensor, rng: np.random.Generator) -> Array:
-    """The poses, each off by itself: what is left of the errors when a map has been put together."""
+    """Return the poses, each off by itself: what is left of the errors when a map has been put together."""
     out = poses.copy()
     shift, turn = rng.normal(0, sensor.jitter[0], (len(poses), 3)), np.radians(rng.normal(0, sensor.jitter[1], (len(poses), 3)))
     flat = sensor.beams == 1
@@ -130,7 +130,7 @@ def compute_hit_points(poses: Array, hits: RayHits, ranges: Array) -> Array:
 
 
 def _build_scene(vertices: Array, triangles: Array) -> Any:
-    """Embree's search tree over some of the triangles."""
+    """Build Embree's search tree over some of the triangles."""
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
@@ -184,14 +184,15 @@ def cast(building: Building, sensor: Sensor, poses: Array, number: int, rng: np.
 
 
 def _reflect_rays(rays: Array, ranges: Array, normal: Array) -> Array:
-    """Rays (n, 6) as panes with these normals throw them back."""
+    """Return rays (n, 6) as panes with these normals throw them back."""
     way = rays[:, 3:]
     back = way - 2 * np.einsum("ni,ni->n", way, normal)[:, None] * normal
     return np.hstack([rays[:, :3] + way * (ranges[:, None] - 0.001), back]).astype(np.float32)
 
 
 def _shoot(scene: Any, rays: Array) -> tuple[Array, Array, Array, Array]:
-    """Range (inf: none), triangle (-1: none), |cosine| of incidence and unit normals (n, 3) of rays (n, 6) of unit length."""
+    """Return the range (inf: none), triangle (-1: none), |cosine| of incidence and unit normals (n, 3) of rays (n, 6) of unit
+    length."""
     answer = scene.run(np.ascontiguousarray(rays[:, :3]), np.ascontiguousarray(rays[:, 3:]), output=True)
     triangle = answer["primID"].astype(np.int64)
     ranges = np.where(triangle >= 0, answer["tfar"], np.float32(np.inf)).astype(np.float32)
@@ -200,7 +201,7 @@ def _shoot(scene: Any, rays: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def _mix_edge_ranges(image: Array, share: float, rng: np.random.Generator) -> Array:
-    """Ranges between the two surfaces at some of the depth edges along a row."""
+    """Return ranges between the two surfaces at some of the depth edges along a row."""
     out = image.copy()
     if image.shape[2] < 2 or not share:
         return out
@@ -308,7 +309,7 @@ def _transform_room(room: TrueRoom, frame: Sim3) -> TrueRoom:
 
 
 def _count_rays(building: Building, visited: Sequence[int], spacing: float) -> int:
-    """Rays that cover floor, ceiling and walls of the rooms at a spacing."""
+    """Count the rays that cover floor, ceiling and walls of the rooms at a spacing."""
     surface = 0.0
     for room in (building.rooms[i] for i in visited):
         x, y = room.polygon.T
@@ -348,7 +349,7 @@ def _find_hit_rooms(building: Building, poses: Array, hits: RayHits) -> Array:
 
 
 def _thin(points: Array, spacing: float) -> Array:
-    """Rows of one point a cube."""
+    """Keep the rows of one point a cube."""
     cells = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64)
     size = cells.max(axis=0) + 1
     key = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]

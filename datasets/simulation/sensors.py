@@ -173,7 +173,8 @@ def corrupt_cloud(cloud: PointCloud, building: Building, spoil: str, rng: np.ran
 
 
 def cut_upper_half(cloud: PointCloud, building: Building, rng: np.random.Generator) -> PointCloud:
-    """The upper half of rooms, as somebody with a tablet captures it; no point lies in the joints of the ceiling's panels."""
+    """Return the upper half of rooms, as somebody with a tablet captures it; no point lies in the joints of the ceiling's
+    panels."""
     floor = building.storeys["floor"]
     storey = np.clip(np.searchsorted(floor - 0.3, cloud.points[:, 2]) - 1, 0, None)
     height = cloud.points[:, 2] - floor[storey]

@@ -102,7 +102,7 @@ def _carry(vertices: Array, rows: Array, old: Array, new: Array) -> None:
 def _add_people(
     building: Building, mesh: list[Array], things: Array, outlines: Array, difficulty: Difficulty, rng: np.random.Generator
 ) -> Array:
-    """Put persons on free spots of the rooms; returns the things with them."""
+    """Put persons on free spots of the rooms; return the things with them."""
     tree = shapely.STRtree(outlines.tolist())
     stairs = [shapely.Polygon(s["footprint"]) for s in building.stairs]
     rows: list[Any] = []

@@ -145,7 +145,7 @@ def number_rooms(building: Building, numbering: Numbering) -> dict[int, str]:
 
 
 def _place_beside_door(building: Building, door: Array, own: int, other: int, text: str, height: float) -> tuple[object, ...]:
-    """A sign of a room beside its door, on the wall of the room that one comes from."""
+    """Place a sign of a room beside its door, on the wall of the room that one comes from."""
     normal = np.array([np.cos(door["direction"]), np.sin(door["direction"])])
     to_other = building.rooms[other].polygon.mean(axis=0) - door["centre"][:2]
     normal = normal if normal @ to_other >= 0 else -normal

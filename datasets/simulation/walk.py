@@ -95,7 +95,7 @@ def plan_walk(building: Building, rooms: Sequence[int], rng: np.random.Generator
 
 
 def _compute_costs(building: Building, floors: FloorRasters, requested: list[int]) -> tuple[Array, Array]:
-    """Price of each cell (inf: wall) and its distance to what stands around, m."""
+    """Return the price of each cell (inf: wall) and its distance to what stands around, m."""
     passable = floors.room >= 0
     _open_doorways(building, floors, passable)
     things = building.things[building.things["kind"] != "leaf"]
@@ -139,7 +139,7 @@ def _rasterize_polygons(polygons: Sequence[Array], floors: FloorRasters) -> Arra
 
 
 def _build_graph(building: Building, floors: FloorRasters, cost: Array) -> tuple[coo_array, Array]:
-    """Steps between cells, and along stairs; and where each node lies."""
+    """Return the steps between cells, and along stairs, and where each node lies."""
     nodes = np.arange(cost.size).reshape(cost.shape)
     rows, columns, prices = [], [], []
     height, width = cost.shape[1:]
@@ -169,7 +169,7 @@ def _build_graph(building: Building, floors: FloorRasters, cost: Array) -> tuple
 
 
 def _find_nearest_node(point: Array, storey: int, floors: FloorRasters, cost: Array) -> int:
-    """Node of the passable cell nearest to a point."""
+    """Return the node of the passable cell nearest to a point."""
     i, j = np.nonzero(np.isfinite(cost[storey]))
     at = floors.compute_cells(point[None])[0]
     best = int(np.argmin((i - at[0]) ** 2 + (j - at[1]) ** 2))
@@ -177,7 +177,7 @@ def _find_nearest_node(point: Array, storey: int, floors: FloorRasters, cost: Ar
 
 
 def _choose_stops(floors: FloorRasters, clear: Array, storey: int, room: int, sight: float) -> list[int]:
-    """Nodes from which a room is seen: its freest spot, then whatever lies far from the stops so far."""
+    """Choose the nodes from which a room is seen: its freest spot, then whatever lies far from the stops so far."""
     inside = floors.room[storey] == room
     i, j = np.nonzero(inside & (clear[storey] >= min(0.35, clear[storey][inside].max(initial=0.0))))
     if not len(i) or clear[storey][i, j].max() <= 0:
@@ -191,7 +191,7 @@ def _choose_stops(floors: FloorRasters, clear: Array, storey: int, room: int, si
 
 
 def _sample_unfinished_stops(stops: list[int], floors: FloorRasters, rng: np.random.Generator) -> list[int]:
-    """Of the stops in a long room those next to one of them."""
+    """Return, of the stops in a long room, those next to one of them."""
     i, j = np.unravel_index(stops, floors.room.shape)[1:] if stops else (np.empty(0), np.empty(0))
     if not len(i) or np.hypot(i - i[0], j - j[0]).max() * floors.cell < LONG:
         return stops
@@ -202,7 +202,7 @@ def _sample_unfinished_stops(stops: list[int], floors: FloorRasters, rng: np.ran
 
 
 def _build_tour(start: int, stops: list[int], before: Array, reach: Array) -> tuple[Array, list[int]]:
-    """Nodes of a walk over all stops along the tree of shortest ways, and where on it the stops are."""
+    """Return the nodes of a walk over all stops along the tree of shortest ways, and where on it the stops are."""
     trunks = {}
     for stop in stops:
         trunk = [stop]
@@ -221,7 +221,7 @@ def _build_tour(start: int, stops: list[int], before: Array, reach: Array) -> tu
 
 
 def _order_stops(stops: list[int], trunks: dict[int, list[int]], reach: Array) -> list[int]:
-    """Stops in the order of a depth-first walk over the tree, near branches first."""
+    """Return the stops in the order of a depth-first walk over the tree, near branches first."""
     edges = np.array([(a, b) for t in trunks.values() for a, b in pairwise(t)]).reshape(-1, 2)
     nodes, inverse = np.unique(np.append(edges.ravel(), stops), return_inverse=True)
     del inverse

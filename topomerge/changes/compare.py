@@ -84,7 +84,7 @@ Split = tuple[int, tuple[int, ...], Array, float, float, dict[str, float]]
 
 
 def _find_splits(layers: StoreyLayers, whole: Array, parts: Array, walls: Sequence[WallChange]) -> list[Split]:
-    """Rooms of one map that are several of the other one, and a wall stands within them that the first one has not."""
+    """Return the rooms of one map that are several of the other one, and a wall stands within them that the first one has not."""
     found: dict[int, Split] = {}
     for wall in walls:
         ends = wall.ends
@@ -114,8 +114,8 @@ def _find_splits(layers: StoreyLayers, whole: Array, parts: Array, walls: Sequen
 def _find_enclosed(
     layers: StoreyLayers, own: Array, other: Array, walls: Sequence[WallChange], reported: set[int]
 ) -> list[tuple[int, Array, float, float, dict[str, float]]]:
-    """Rooms of one map whose ground the other one saw and in which none of its rooms lies, and whose border walls make that only
-    the first one has: room, outline, m2, probability and evidence."""
+    """Return the rooms of one map whose ground the other one saw and in which none of its rooms lies, and whose border walls make
+    that only the first one has: room, outline, m2, probability and evidence."""
     if not walls:
         return []
     found, sizes = [], np.bincount(other[other >= 0], minlength=1)
@@ -140,7 +140,7 @@ def _find_enclosed(
 
 
 def _find_sides(layers: StoreyLayers, parts: Array, ends: Array) -> set[int]:
-    """Rooms on the two sides of a wall; one where it parts nothing."""
+    """Return the rooms on the two sides of a wall; one where it parts nothing."""
     along = (ends[1] - ends[0]) / max(float(np.hypot(*(ends[1] - ends[0]))), 1e-9)
     across = np.array([-along[1], along[0]])
     line = ends[0] + np.linspace(0.1, 0.9, 9)[:, None] * (ends[1] - ends[0])
@@ -161,7 +161,7 @@ def _trace_box(layers: StoreyLayers, mask: Array) -> Array:
 
 
 def _find_grown(layers: StoreyLayers, walls: Sequence[WallChange], reported: tuple[set[int], set[int]]) -> list[RoomChange]:
-    """Rooms that won or lost ground to their neighbours because a wall between them was moved."""
+    """Return the rooms that won or lost ground to their neighbours because a wall between them was moved."""
     old, new, both = layers.old.room, layers.new.room, layers.both
     if not walls or not (old >= 0).any() or not (new >= 0).any():
         return []

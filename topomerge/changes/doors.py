@@ -141,7 +141,7 @@ def find_door_corrections(layers: StoreyLayers, reader: DoorReader) -> list[Door
 
 
 def _pair_doors(old: Array, new: Array) -> dict[int, int]:
-    """Doors of the new map by those of the old one that stand where they do, the nearest first, one to one."""
+    """Return the doors of the new map by those of the old one that stand where they do, the nearest first, one to one."""
     apart = np.linalg.norm(old[:, None, :2] - new[None, :, :2], axis=2)
     partner: dict[int, int] = {}
     for at in np.argsort(apart, axis=None, kind="stable").tolist():
@@ -154,7 +154,7 @@ def _pair_doors(old: Array, new: Array) -> dict[int, int]:
 
 
 def _is_in_wall(door: Array, wall: WallChange) -> bool:
-    """Is a door in a wall that is new or gone?"""
+    """Return whether a door is in a wall that is new or gone."""
     ends = wall.ends
     along = (ends[1] - ends[0]) / max(wall.length, 1e-9)
     apart = door["centre"][:2] - ends[0]
@@ -163,7 +163,7 @@ def _is_in_wall(door: Array, wall: WallChange) -> bool:
 
 
 def _decide(old: dict[str, float], new: dict[str, float], walled: float) -> tuple[str, float]:
-    """The most probable change between two states, each state with its probability and ``seen``; "" where none is.
+    """Return the most probable change between two states, each state with its probability and ``seen``; "" where none is.
 
     Args:
         walled: probability that the wall of the door is new or gone: its doors are, too, then.
@@ -222,15 +222,15 @@ def read_state(layers: StoreyLayers, map: MapLayer, door: Array, own: Array | No
 
 
 def _is_beside_seen(layers: StoreyLayers, map: MapLayer, door: Array, normal: Array) -> float:
-    """Did the map see the ground on one side of a door at least?"""
+    """Return how surely the map saw the ground on one side of a door at least, 0 to 1."""
     steps = np.array([0.45, 0.6, 0.75])
     sides = [layers.sample(map.free, door["centre"][:2] + sign * steps[:, None] * normal).mean() for sign in (-1, 1)]
     return float(np.clip(2 * max(sides), 0.0, 1.0))
 
 
 def _estimate_leaf(door: Array, own: Array | None, points: Array, floor: float) -> float:
-    """Probability that what blocks a door is a leaf and no wall: a leaf lies in one face of
-    the wall beside it at most, masonry in both."""
+    """Return the probability that what blocks a door is a leaf and no wall: a leaf lies in one face of the wall beside it at
+    most, masonry in both."""
     own_leaf = own is not None and own["kind"] == "door"
     blind = 0.5 + 0.48 * float(own["confidence"]) if own is not None and own_leaf else BLIND_LEAF
     width, reach = float(door["width"]), float(door["width"]) / 2 + 0.6

@@ -120,7 +120,7 @@ def _widen(mask: Array, metres: float) -> Array:
 
 
 def _merge_faces(lines: Sequence[Line]) -> list[tuple[float, float, Line]]:
-    """(near, far, line): lines that are faces of one wall are one, `near` and `far` m across it."""
+    """Return (near, far, line): lines that are faces of one wall are one, `near` and `far` m across it."""
     left, out = sorted(lines, key=lambda line: -line.length), []
     while left:
         first, rest = left[0], []
@@ -156,7 +156,7 @@ def _count_bins(mask: Array, line: Line, low: float, high: float) -> Array:
 
 
 def _split_runs(changed: Array, line: Line, low: float, high: float) -> list[tuple[float, float]]:
-    """Stretches (start, end) of a line that are parted by gaps wider than a door."""
+    """Return the stretches (start, end) of a line that are parted by gaps wider than a door."""
     seen = _count_bins(changed, line, low, high)
     if not seen.any():
         return []
@@ -200,15 +200,15 @@ def _measure_wall(
 
 
 def _ring(pixels: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:
-    """Pixels 0.5 m around some, within a raster: walls themselves are of no room."""
+    """Return the pixels 0.5 m around some, within a raster: walls themselves are of no room."""
     steps = round(0.5 / CHANGE_CELL) * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
     around = (pixels[:, None] + steps).reshape(-1, 2).clip(0, np.array(shape) - 1)
     return around[:, 0], around[:, 1]
 
 
 def _lengthen(one: MapLayer, other: MapLayer, line: Line, low: float, high: float) -> tuple[float, float]:
-    """Start and end of a wall that changed, m along its line, each up to the wall of both maps that it meets: what is near that
-    one does not count as changed, but belongs to it."""
+    """Return the start and end of a wall that changed, m along its line, each up to the wall of both maps that it meets: what is
+    near that one does not count as changed, but belongs to it."""
     ends = []
     for tip, sign in ((line.start, -1), (line.end, 1)):
         step = 0
@@ -236,7 +236,7 @@ def _find_pixels(mask: Array, line: Line) -> Array:
 
 
 def _drop_repeated(walls: Sequence[WallChange]) -> list[WallChange]:
-    """The walls without those that mostly lie in a longer one of their kind."""
+    """Return the walls without those that mostly lie in a longer one of their kind."""
     chosen: list[tuple[WallChange, shapely.Polygon]] = []
     for wall in sorted(walls, key=lambda w: -w.length):
         shape = shapely.Polygon(wall.outline).buffer(0.15)
@@ -307,7 +307,8 @@ def _measure_thing(layers: StoreyLayers, kind: str, one: MapLayer, other: MapLay
 
 
 def _measure_ring(one: MapLayer, pixels: Array) -> float:
-    """Share of the ground 0.2 m around a thing that is floor: a floor that has drifted upwards has no other one around it."""
+    """Measure the share of the ground 0.2 m around a thing that is floor: a floor that has drifted upwards has no other one
+    around it."""
     low = (pixels.min(axis=0) - 6).clip(0)
     high = pixels.max(axis=0) + 7
     box = tuple(slice(a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True))
@@ -318,7 +319,7 @@ def _measure_ring(one: MapLayer, pixels: Array) -> float:
 
 
 def _is_leaf(thing: ThingChange, doors: Doors) -> bool:
-    """May it be the leaf of a door that stands otherwise?"""
+    """Return whether it may be the leaf of a door that stands otherwise."""
     sides = np.linalg.norm(np.diff(thing.outline[:3], axis=0), axis=1)
     if sides.min() > LEAF_THICKNESS:
         return False
@@ -326,7 +327,7 @@ def _is_leaf(thing: ThingChange, doors: Doors) -> bool:
 
 
 def _match_moved(new: Sequence[ThingChange], gone: Sequence[ThingChange]) -> list[ThingChange]:
-    """Furniture that is gone here and new there, of one size and in one room, has been moved."""
+    """Join furniture that is gone here and new there, of one size and in one room: it has been moved."""
     options = []
     for i, a in enumerate(gone):
         for j, b in enumerate(new):

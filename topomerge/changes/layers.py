@@ -210,7 +210,8 @@ def _find_storey(map: TopometricMap, floor: float) -> int:
 
 
 def _find_common_box(v: PlanFields, other: StoreyPlan, placement: PlacedMap) -> tuple[Array, Array, Array]:
-    """Lower corner, m, size, pixels, and axes of the box that both plans reach into, along the walls of the old one."""
+    """Return the lower corner, m, size, pixels, and axes of the box that both plans reach into, along the walls of the old
+    one."""
     main = v.main_direction
     axes = np.array([[np.cos(main), np.sin(main)], [-np.sin(main), np.cos(main)]])
     corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])

@@ -208,7 +208,7 @@ def _build_frame(normal: Array) -> Array:
 
 
 def _list_faced(points: Array, normal: Array, layers: Sequence[StoreyLayers]) -> tuple[Array, Array]:
-    """Which points (n, 3) may be of a face that looks against a normal, and of one that looks along it: two (n,) bool."""
+    """Return which points (n, 3) may be of a face that looks against a normal, and of one that looks along it: two (n,) bool."""
     floors = np.array([storey.floor for storey in layers])
     if abs(normal[2]) > 0.5:
         upwards = (np.abs(points[:, 2:] - floors) < FLOOR_REACH).any(axis=1)
@@ -340,7 +340,8 @@ def _correct_shift(plane: PlaneShift, correct: Correction) -> float:
 
 
 def _decide_elsewhere(shift: float, sigma: float) -> tuple[str, float]:
-    """Seen or elsewhere, and how probable that is: few elements stand elsewhere, so that a shift has to be clear."""
+    """Return whether it is seen or elsewhere, and how probable that is: few elements stand elsewhere, so that a shift has to be
+    clear."""
     beyond = float(ndtr((abs(shift) - TOLERANCE) / sigma))
     elsewhere = beyond * DEVIATING / (beyond * DEVIATING + 1 - beyond)
     return ("elsewhere", elsewhere) if elsewhere > 0.5 else ("seen", 1 - elsewhere)
@@ -371,7 +372,7 @@ def _outline_element(element: ModelElement) -> shapely.Geometry:
 
 
 def _measure_empty_share(element: ModelElement, layers: Sequence[StoreyLayers]) -> float:
-    """Share of an element's ground that the scan saw empty, and nothing beside it."""
+    """Measure the share of an element's ground that the scan saw empty, and nothing beside it."""
     best = 0.0
     low, high = element.vertices[:, 2].min(), element.vertices[:, 2].max()
     for storey in layers:
@@ -401,7 +402,7 @@ class _ModelDoors:
         self.partner = self._pair()
 
     def _pair(self) -> dict[str, tuple[int, float]]:
-        """Row in `found`, and shift along the wall, of the door of the scan that each is, the nearest first."""
+        """Return the row in `found`, and shift along the wall, of the door of the scan that each is, the nearest first."""
         options = []
         for guid, door in self.doors.items():
             apart = self.found["centre"] - door["centre"]

@@ -84,7 +84,7 @@ def _add(args: argparse.Namespace) -> int:
 
 
 def _build_workers(args: argparse.Namespace) -> Workers | None:
-    """Who registers pairs: None is this process."""
+    """Return who registers pairs: None is this process."""
     from topomerge.fusion.atlas.partners import connect_cluster, start_processes
 
     jobs = getattr(args, "jobs", 1)

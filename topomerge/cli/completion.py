@@ -146,7 +146,7 @@ complete -F _topomerge topomerge
 
 
 def _strip_shell_signs(text: str) -> str:
-    """Words that mean nothing to a shell."""
+    """Strip a text of the signs that mean something to a shell."""
     return re.sub(r"[\[\]:'\"\\`$]", "", " ".join(text.split()))
 
 

@@ -152,7 +152,8 @@ def show_log(verbose: int, debug: bool) -> None:
 
 
 def _is_at_memory_limit() -> bool:
-    """Has this process taken nearly as much memory as it may? Then an odd error is most likely a failed allocation."""
+    """Return whether this process has taken nearly as much memory as it may. Then an odd error is most likely a failed
+    allocation."""
     try:
         import resource
 
@@ -165,7 +166,7 @@ def _is_at_memory_limit() -> bool:
 
 
 def _format_memory_limit() -> str:
-    """How much of it this process may take, if that is limited."""
+    """Tell how much memory this process may take, if that is limited."""
     try:
         import resource
     except ImportError:  # Windows has no such limits
@@ -226,7 +227,8 @@ class _WriteProbe(Exception):
 
 
 def _resolve_path(path: str | Path) -> Path:
-    """Where a path leads, through all links; one that leads round in a circle, at which `Path.resolve` fails, to itself."""
+    """Return where a path leads, through all links; one that leads round in a circle, at which `Path.resolve` fails, to
+    itself."""
     return Path(os.path.realpath(path))
 
 
@@ -376,7 +378,8 @@ def exit_on_signals() -> None:
 
 
 def _is_deaf(frame: FrameType | None) -> bool:
-    """Would an exception be lost here: is any function on the stack the compiler's, or a callback of the importer's locks?"""
+    """Return whether an exception would be lost here: whether any function on the stack is the compiler's, or a callback of the
+    importer's locks."""
     while frame is not None:
         code = frame.f_code
         if COMPILER in code.co_filename or (code.co_filename == IMPORTER and code.co_name == CALLBACK):

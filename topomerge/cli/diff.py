@@ -94,7 +94,7 @@ def _compare(args: argparse.Namespace, folder: Path | None, belief: dict[str, An
 def _align(
     old: TopometricMap, new: TopometricMap, args: argparse.Namespace, belief: dict[str, Any]
 ) -> tuple[PlacedMap | None, str]:
-    """Where the new map lies in the old one's frame, None where that is not believed, and why."""
+    """Return where the new map lies in the old one's frame, None where that is not believed, and why."""
     if args.aligned:
         from topomerge.types import Placement, Sim3
 
@@ -122,7 +122,7 @@ def _find_changes(old: TopometricMap, new: TopometricMap, placement: PlacedMap, 
 def _list_files(
     changes: Changes, args: argparse.Namespace, folder: Path | None
 ) -> list[tuple[str | Path, Callable[[Path], None]]]:
-    """Where to write, and what writes it."""
+    """List where to write, and what writes it."""
     from topomerge.changes.files import save_bcf, save_geojson, save_json
 
     files: list[tuple[str | Path, Callable[[Path], None]]] = []

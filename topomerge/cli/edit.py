@@ -87,7 +87,7 @@ def run_edit(args: argparse.Namespace) -> int:
 
 
 def _find_verb(args: argparse.Namespace, path: Path) -> str:
-    """The option that says what to do; empty where the corrected map is asked for only.
+    """Return the option that says what to do; empty where the corrected map is asked for only.
 
     Raises:
         InputError: none or several, or one that does not fit the input or the other options.
@@ -114,7 +114,7 @@ def _find_verb(args: argparse.Namespace, path: Path) -> str:
 
 
 def _format_edits(journal: Journal) -> list[str]:
-    """Lines about the edits of a journal; those that were taken back are marked."""
+    """Return lines about the edits of a journal; those that were taken back are marked."""
     from topomerge.edits.journal import select_effective
 
     held = {id(edit) for edit in select_effective(journal.edits)}
@@ -126,7 +126,7 @@ def _format_edits(journal: Journal) -> list[str]:
 
 
 def _build_edits(args: argparse.Namespace, verb: str, path: Path, journal: Journal) -> list[Edit]:
-    """The edits that the options ask for."""
+    """Build the edits that the options ask for."""
     from topomerge.edits.journal import build_edit, build_redo, build_undo, read_journal
 
     by = getattr(args, "by", None)
@@ -157,7 +157,7 @@ def _require_file(name: str) -> Path:
 
 
 def _collect_values(args: argparse.Namespace, verb: str, path: Path, journal: Journal) -> dict[str, Any]:
-    """The fields of an edit of a map: numbers of rooms, doors and windows become places."""
+    """Collect the fields of an edit of a map: numbers of rooms, doors and windows become places."""
     map = _load(path, journal, ())
     given = getattr(args, verb)
     values: dict[str, Any] = {**collect_given(args, "width", "sill", "head", "kind", "outside", "looked_into")}
@@ -192,7 +192,7 @@ def _load(path: Path, journal: Journal, edits: Sequence[Edit]) -> TopometricMap:
 
 
 def _find_room(map: TopometricMap, number: Any, path: Path) -> list[float]:
-    """A place in the room of a number."""
+    """Return a place in the room of a number."""
     from topomerge.edits.draft import find_room_place
 
     if not str(number).strip().isdecimal() or int(number) >= len(map.rooms):
@@ -203,7 +203,7 @@ def _find_room(map: TopometricMap, number: Any, path: Path) -> list[float]:
 
 
 def _find_place(map: TopometricMap, numbers: Sequence[float], args: argparse.Namespace) -> list[float]:
-    """X,Y on the floor of the storey that is asked for, or X,Y,Z."""
+    """Return X,Y on the floor of the storey that is asked for, or X,Y,Z."""
     if len(numbers) == 3:
         return list(numbers)
     storey = getattr(args, "storey", 0)
@@ -213,7 +213,7 @@ def _find_place(map: TopometricMap, numbers: Sequence[float], args: argparse.Nam
 
 
 def _find_row(map: TopometricMap, given: Sequence[float], verb: str, args: argparse.Namespace) -> list[float]:
-    """Where the door or the window of a number is; or the place that was given."""
+    """Return where the door or the window of a number is, or the place that was given."""
     if len(given) != 1:
         return _find_place(map, given, args)
     table, what = (map.windows, "window") if verb.endswith("window") else (map.edges, "door")
@@ -225,7 +225,7 @@ def _find_row(map: TopometricMap, given: Sequence[float], verb: str, args: argpa
 
 
 def _build_merge_edits(args: argparse.Namespace, verb: str, path: Path, by: str) -> list[Edit]:
-    """A decision about two maps of a merge."""
+    """Build a decision about two maps of a merge."""
     from topomerge.edits.journal import build_edit
     from topomerge.fusion.decisions import build_acceptance, build_matches, list_sources
 

@@ -48,7 +48,7 @@ def run_export(args: argparse.Namespace) -> int:
 
 
 def _collect_export_options(args: argparse.Namespace, names: list[str]) -> dict[str, Any]:
-    """The options that only some formats know.
+    """Collect the options that only some formats know.
 
     Raises:
         InputError: one was given that none of the formats knows.
@@ -82,7 +82,7 @@ def _collect_export_options(args: argparse.Namespace, names: list[str]) -> dict[
 
 
 def _find_map_file(named: str) -> Path:
-    """The .tmap that a user means, who may have named the folder of a merge or of an atlas."""
+    """Return the .tmap that a user means, who may have named the folder of a merge or of an atlas."""
     path = Path(named)
     if path.is_dir():
         joined = [path / "map.tmap"] if (path / "map.tmap").is_file() else sorted(path.glob("map_*.tmap"))
@@ -99,7 +99,7 @@ def _find_map_file(named: str) -> Path:
 
 
 def _choose_output_path(args: argparse.Namespace, names: list[str], source: Path) -> tuple[Path, bool]:
-    """Where to write: a file, or (True) a folder with the stem of the names in it."""
+    """Return where to write: a file, or (True) a folder with the stem of the names in it."""
     from topomerge.io.exports import FORMATS
 
     several = len(names) > 1 or FORMATS[names[0]].folder

@@ -74,7 +74,7 @@ def run_extract(args: argparse.Namespace) -> int:
 
 
 def _replay_journal(extracted: TopometricMap, args: argparse.Namespace) -> TopometricMap:
-    """The map with the corrections of an earlier extraction to the same file."""
+    """Apply to the map the corrections of an earlier extraction to the same file."""
     from topomerge.edits.apply import correct_map
     from topomerge.edits.journal import find_journal, read_journal
 
@@ -82,7 +82,7 @@ def _replay_journal(extracted: TopometricMap, args: argparse.Namespace) -> Topom
 
 
 def _list_outputs(args: argparse.Namespace) -> list[tuple[str, str]]:
-    """Where to write, and the name of topomerge's function (map, path) that writes it."""
+    """List where to write, and the name of topomerge's function (map, path) that writes it."""
     if args.figure and Path(args.figure).suffix.lower() not in FIGURE_FORMATS:
         raise InputError(f"{args.figure}: unknown kind of figure; end the name with one of {' '.join(FIGURE_FORMATS)}")
     for name, suffixes in (("ply", (".ply",)), ("report", PAGE_SUFFIXES)):

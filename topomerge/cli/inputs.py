@@ -196,7 +196,7 @@ def _load_future(path: str, args: argparse.Namespace, start_task: Starter) -> Fu
 
 
 def _load_map(path: str, args: argparse.Namespace, start_task: Starter) -> LoadedMap:
-    """The map of one input.
+    """Load the map of one input.
 
     Raises:
         InputError: as `iter_input_maps`.
@@ -226,7 +226,7 @@ def _load_map(path: str, args: argparse.Namespace, start_task: Starter) -> Loade
 
 
 def _load_corrected_map(path: str, lines: int | None) -> TopometricMap:
-    """A stored map with what lies beside it; where nothing does, nothing of the extraction is imported."""
+    """Load a stored map with what lies beside it; where nothing does, nothing of the extraction is imported."""
     from topomerge.edits.journal import find_journal
     from topomerge.io.landmarks import find_landmark_file
     from topomerge.io.maps import load_map
@@ -398,7 +398,7 @@ class _Processes:
         return message  # type: ignore[no-any-return]
 
     def _get_process(self) -> tuple[BaseProcess, Connection[Any, Any]]:
-        """The process of this thread."""
+        """Return the process of this thread."""
         if not hasattr(self._local, "number"):
             self._local.number = next(self._numbers)
         return self._started[self._local.number]
@@ -406,8 +406,8 @@ class _Processes:
 
 @contextmanager
 def _hold_interrupts(method: str) -> Iterator[None]:
-    """A terminal sends Ctrl-C to all processes. Those that are started meanwhile do not hear it: this one answers later, and ends
-    them."""
+    """Hold Ctrl-C, which a terminal sends to all processes. Those that are started meanwhile do not hear it: this one answers
+    later, and ends them."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows has none
         yield
         return

@@ -111,7 +111,7 @@ def _build_added(args: argparse.Namespace) -> Landmarks:
 
 
 def _drop_source(map: TopometricMap, sources: Sequence[str]) -> TopometricMap:
-    """The map without what came from these sources before."""
+    """Return the map without what came from these sources before."""
     import numpy as np
 
     of = np.array([*(source in sources for source in map.landmarks.sources), False], bool)[map.landmarks.table["source"]]
@@ -119,7 +119,7 @@ def _drop_source(map: TopometricMap, sources: Sequence[str]) -> TopometricMap:
 
 
 def _select_rows(args: argparse.Namespace, landmarks: Landmarks) -> Array:
-    """(n,) bool: is it what the options say? All are, where none is given."""
+    """Return (n,) bool, whether it is what the options say. All are, where none is given."""
     import numpy as np
 
     given = {kind: getattr(args, kind) for kind in MARKED_KINDS if hasattr(args, kind)}
@@ -198,7 +198,7 @@ def _iter_found(path: Path, given: dict[str, list[str]]) -> Iterator[dict[str, A
 
 
 def _keep_strongest(readings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Of each sender and room the strongest reading: a map may have thousands."""
+    """Keep, of each sender and room, the strongest reading: a map may have thousands."""
     ranked = sorted(readings, key=lambda entry: entry["number"] if entry["number"] is not None else -1e9)
     return list({(entry["value"], entry["storey"], entry["room"]): entry for entry in ranked}.values())[::-1]
 

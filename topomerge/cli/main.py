@@ -206,7 +206,7 @@ def _add(commands: Any, command: Command) -> None:
 
 
 def _collect_paths(args: argparse.Namespace) -> tuple[list[str], list[str]]:
-    """The files that the user named, the input first; and the output."""
+    """Collect the files that the user named, the input first; and the output."""
     values = {name: getattr(args, name) for name in args.paths if getattr(args, name, None)}
     output = values.pop("output", None)
     paths = [str(path) for value in values.values() for path in (value if isinstance(value, list) else [value])]
@@ -214,14 +214,15 @@ def _collect_paths(args: argparse.Namespace) -> tuple[list[str], list[str]]:
 
 
 def _find_empty_name(args: argparse.Namespace) -> str:
-    """For which file an empty name was given, if for one; that is what a script's unset variable leaves, and pathlib would take
-    it for the current folder."""
+    """Return for which file an empty name was given, if for one; that is what a script's unset variable leaves, and pathlib would
+    take it for the current folder."""
     values = {name: getattr(args, name, None) for name in args.paths}
     return next((name for name, value in values.items() if value == "" or (isinstance(value, list) and "" in value)), "")
 
 
 def _join_signed_values(words: Sequence[str]) -> list[str]:
-    """`--origin -33.9,151.2` as `--origin=-33.9,151.2`: argparse takes a value that starts with a dash for another option."""
+    """Write `--origin -33.9,151.2` as `--origin=-33.9,151.2`: argparse takes a value that starts with a dash for another
+    option."""
     joined: list[str] = []
     for word in words:
         if joined and joined[-1] in SIGNED_OPTIONS and word.startswith("-"):
@@ -240,7 +241,7 @@ def _open_closed_streams() -> None:
 
 
 def _drop_output() -> None:
-    """The interpreter flushes stdout once more at exit: give it a place where that succeeds."""
+    """Give the interpreter, which flushes stdout once more at exit, a place where that succeeds."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

@@ -59,8 +59,8 @@ if TYPE_CHECKING:
 
 
 def choose_point_files(inputs: Sequence[str], folder: Path) -> dict[int, Path]:
-    """Number of an input -> the file for its points; a number stands in the name where two inputs are called alike. Of maps,
-    which have none, there is none."""
+    """Map the number of an input to the file for its points; a number stands in the name where two inputs are called alike. Of
+    maps, which have none, there is none."""
     from topomerge.io.transformed_points import choose_suffix
 
     files: dict[int, Path] = {}
@@ -102,7 +102,7 @@ def write_points(result: MergeResult, folder: Path, args: argparse.Namespace) ->
 
 
 def _find_earlier_points(folder: Path, inputs: Sequence[str]) -> set[Path]:
-    """The files of points that the merge in a folder names, but for those that are inputs now."""
+    """Return the files of points that the merge in a folder names, but for those that are inputs now."""
     try:
         names = json.loads((folder / "merge.json").read_text(encoding="utf-8"))["points"].values()
         names = [name for name in names if re.fullmatch(r"[^/\\]*_merged\.(las|laz|ply)", name)]
@@ -135,7 +135,7 @@ def _write(result: MergeResult, k: int, path: Path, args: argparse.Namespace) ->
 
 
 def _compute_middle(result: MergeResult, k: int) -> np.ndarray:
-    """(3,) m, of map k in the joined frame."""
+    """Compute the middle (3,), m, of map k in the joined frame."""
     low, high = result.maps[k].grid.bounds
     middle: np.ndarray = result.placements[k].pose.apply((low + high)[None] / 2)[0]
     return middle
@@ -191,7 +191,7 @@ def _merge(args: argparse.Namespace, inputs: InputMaps, folder: Path, files: Map
 
 
 def _take_prepared(loaded: Sequence[LoadedMap], maps: Sequence[TopometricMap]) -> list[TopometricMap | Prepared]:
-    """The maps, those of which everything is drawn with that."""
+    """Return the maps, those of which everything is drawn with that."""
     from topomerge.registration.prepared import unpack_prepared
 
     return [map if one.parts is None else unpack_prepared(one.parts, map) for one, map in zip(loaded, maps, strict=True)]

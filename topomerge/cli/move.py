@@ -54,7 +54,7 @@ def run_move(args: argparse.Namespace) -> int:
 
 
 def _parse_files(words: Sequence[str], frames: Mapping[int, object]) -> dict[int, str]:
-    """Number of a map -> its file, of words like ``1=b.db``; those without a number are counted from 0."""
+    """Map the number of a map to its file, of words like ``1=b.db``; those without a number are counted from 0."""
     named: dict[int, str] = {}
     for place, word in enumerate(words):
         number = re.match(r"(\d{1,6})=(.+)", word)
@@ -68,7 +68,7 @@ def _parse_files(words: Sequence[str], frames: Mapping[int, object]) -> dict[int
 
 
 def _find_file(name: str, how: str = "as NUMBER=FILE") -> Path:
-    """The file to write again: of a folder of scans its trajectory.
+    """Return the file to write again: of a folder of scans its trajectory.
 
     Args:
         how: another file is named, for messages.

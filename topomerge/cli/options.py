@@ -53,7 +53,7 @@ def collect_given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 @contextmanager
 def name_option_in_errors(name: str) -> Iterator[None]:
-    """An error of the input within is the fault of this option: its line begins with it."""
+    """Begin the line of an error of the input within with this option, whose fault it is."""
     try:
         yield
     except InputError as error:

@@ -53,7 +53,7 @@ def _print_address(address: str) -> None:
 
 
 def _prepare_page(args: argparse.Namespace, scratch: str | None = None) -> Path:
-    """The report to show; that of a map is made first."""
+    """Return the report to show; make that of a map first."""
     path = Path(args.input)
     if path.is_dir():
         page = path / "report.html"
@@ -148,7 +148,7 @@ def run_studio(args: argparse.Namespace) -> int:
 
 
 def _find_password(args: argparse.Namespace, host: str) -> str:
-    """The password that the page asks for; "" where only this machine can reach it.
+    """Return the password that the page asks for; "" where only this machine can reach it.
 
     Raises:
         InputError: others could reach it, and there is none, or it is too short.

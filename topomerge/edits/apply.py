@@ -120,7 +120,7 @@ def correct_map(map: TopometricMap, journal: Journal, lines: int | None = None) 
 
 
 def _convert_value(value: Any) -> Any:
-    """Places as arrays, all else as it is."""
+    """Return places as arrays, all else as it is."""
     return np.array(value, float) if isinstance(value, list) else value
 
 

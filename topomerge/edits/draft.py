@@ -206,12 +206,12 @@ class Draft:
             self.rooms[name][room] = value
 
     def select_floor(self, rows: Array) -> Array:
-        """Select of rows of navigable cells those that have none right below: the floor proper; all where that is none."""
+        """Select, of rows of navigable cells, those that have none right below: the floor proper; all where that is none."""
         lowest = rows[~self.navigable.contains(self.navigable.cells[rows].astype(np.int64) - (0, 0, 1))]
         return lowest if len(lowest) else rows
 
     def _find_meeting(self, room: int, other: int, rows: Array) -> Array:
-        """EDGE_DTYPE, the doors and openings where two parts of what was one room (`rows` of its floor) meet."""
+        """Return, as EDGE_DTYPE, the doors and openings where two parts of what was one room (`rows` of its floor) meet."""
         cells = self.navigable.select_cells(rows)
         label = (self.floor_room[rows] == other).astype(np.int32)
         none = np.zeros(len(rows), np.int32)
@@ -390,7 +390,7 @@ def part_columns(columns: Array, grid: VoxelGrid, line: Array) -> Array | None:
 
 
 def _keep_connected(side: Array, part: Array, one: Array, other: Array) -> Array:
-    """The side of each part of a room, -1 unknown, so that each side hangs together.
+    """Return the side of each part of a room, -1 unknown, so that each side hangs together.
 
     A line that is too long cuts off corners. Of the parts on a side the largest stays; others go with the largest of the other
     side where they meet it across the line.

@@ -179,7 +179,7 @@ class Edit:
                 raise InputError(f"{self.op}: {name} must be {requirement}, not {json.dumps(value, default=str)[:60]}")
 
     def to_json(self) -> dict[str, Any]:
-        """As plain values, in the order of a line."""
+        """Return plain values, in the order of a line."""
         return {"id": self.id, "time": self.time, "by": self.by, "op": self.op, **self.values}
 
     @staticmethod
@@ -357,7 +357,7 @@ def select_effective(edits: Iterable[Edit]) -> list[Edit]:
 
 
 def _find_undone(edits: Iterable[Edit]) -> dict[str, None]:
-    """Ids of the edits that are taken back, in the order in which they were."""
+    """Return the ids of the edits that are taken back, in the order in which they were."""
     undone: dict[str, None] = {}
     for edit in edits:
         if edit.op == "undo":

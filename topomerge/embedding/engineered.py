@@ -59,7 +59,7 @@ def compute_raw_features(map: TopometricMap) -> Array:
 
 
 def scale_features(values: Array, scaling: str) -> Array:
-    """Features scaled by the statistics of the training set: columns are the first of `FEATURES`."""
+    """Scale features by the statistics of the training set: columns are the first of `FEATURES`."""
     if scaling == "none":
         return values
     mean, spread, differences = _load_statistics()
@@ -72,7 +72,7 @@ def scale_features(values: Array, scaling: str) -> Array:
 
 
 def _load_statistics() -> tuple[Array, Array, Array]:
-    """Mean (D,), standard deviation (D,) and covariance (D, D) of the differences between two views of a room."""
+    """Load the mean (D,), standard deviation (D,) and covariance (D, D) of the differences between two views of a room."""
     scale = read_weights_json("topomerge.embedding", "engineered.json")
     if tuple(scale["features"]) != FEATURES:
         raise InputError("engineered.json is of other features: run train.py task=feature_scale export=package")
@@ -110,7 +110,7 @@ def compute_thesis_features(cells: Array, edge: float) -> Array:
 
 
 def _measure_smallest_rectangle(columns: Array) -> float:
-    """Area, in cells, of the smallest rectangle about columns (n, 2)."""
+    """Measure the area, in cells, of the smallest rectangle about columns (n, 2)."""
     first = np.flatnonzero(np.diff(columns[:, 0], prepend=-1))  # columns ascend: of each row only the ends can be corners
     ends = columns[np.concatenate([first, np.append(first[1:], len(columns)) - 1])]
     corners = (ends[:, None] + np.array([(0, 0), (1, 0), (0, 1), (1, 1)])[None]).reshape(-1, 2).astype(float)
@@ -122,7 +122,7 @@ def _measure_smallest_rectangle(columns: Array) -> float:
 
 
 def measure_roughness(points: Array) -> float:
-    """Mean distance (m) of points (n, 3) to the plane of their 32 nearest; of at most 500 of them, evenly spread."""
+    """Measure the mean distance (m) of points (n, 3) to the plane of their 32 nearest; of at most 500 of them, evenly spread."""
     if len(points) < 4:
         return 0.0
     sample = points[np.linspace(0, len(points) - 1, min(ROUGHNESS_CELLS, len(points))).astype(int)]
@@ -230,7 +230,7 @@ def compute_point_spectra(points: Array) -> Array:
 
 
 def _sample_points(points: Array) -> Array:
-    """Evenly spread over the points, which are in the order of their place."""
+    """Sample evenly over the points, which are in the order of their place."""
     return points[:, np.linspace(0, points.shape[1] - 1, min(SAMPLED_POINTS, points.shape[1])).astype(int)]
 
 
@@ -320,7 +320,7 @@ def _average_rows(rows: Array, around: list[Array]) -> Array:
 
 
 def _describe_unions(descriptor: Descriptor, map: TopometricMap, around: list[Array], rows: Array) -> Array:
-    """Descriptor of each union; rooms with the same surroundings share the work."""
+    """Return the descriptor of each union; rooms with the same surroundings share the work."""
     by_rooms: dict[tuple[int, ...], Array] = {}
     out = np.zeros_like(rows)
     for room, rooms in enumerate(around):

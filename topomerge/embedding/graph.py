@@ -112,7 +112,7 @@ def count_columns(tensor: str) -> int:
 
 
 def find_column(tensor: str, feature: str) -> int:
-    """Place of a feature among the columns of a tensor."""
+    """Return the place of a feature among the columns of a tensor."""
     return TABLES[tensor].index(feature)
 
 
@@ -231,13 +231,14 @@ def rescale_graph(arrays: Mapping[str, Array], scale: float) -> dict[str, Array]
 
 
 def _group_rows(labels: Array, count: int) -> list[Array]:
-    """Rows of each label 0..count-1, ascending."""
+    """Return the rows of each label 0..count-1, ascending."""
     order = np.argsort(labels, kind="stable")
     return np.split(order, np.searchsorted(labels[order], np.arange(count + 1)))[1:-1]
 
 
 def _measure_floors(map: TopometricMap) -> tuple[Array, Array, Array]:
-    """Height (m) of each room's floor and its standard deviation; (R, 2) sides of the rectangle with its spread."""
+    """Measure the height (m) of each room's floor and its standard deviation, and the (R, 2) sides of the rectangle with its
+    spread."""
     count = len(map.rooms)
     heights, spread, sides = np.zeros(count), np.zeros(count), np.zeros((count, 2))
     rows = select_lowest_of_column(map.navigable)
@@ -270,7 +271,7 @@ def _compute_room_features(map: TopometricMap, index: Array, doors: Array, sprea
 
 
 def _sample_room_points(map: TopometricMap, floors: Array, number: int) -> Array:
-    """Cells of each room spread evenly over their Morton order; a room of fewer cells repeats them."""
+    """Sample the cells of each room evenly over their Morton order; a room of fewer cells repeats them."""
     out = np.zeros((len(map.rooms), number, 3), np.float32)
     for r, rows in enumerate(_group_rows(map.room, len(map.rooms))):
         cells = map.grid.cells[rows] if len(rows) else map.navigable.cells[map.navigable_room == r]
@@ -311,7 +312,7 @@ def _compute_door_features(middle: Array, index: Array, doors: Array, pairs: Arr
 
 
 def _compute_angle(a: Array, b: Array) -> tuple[Array, Array]:
-    """Sine and cosine of the angle from a to b, counter-clockwise; 0 and 1 where one of them has no length."""
+    """Return the sine and cosine of the angle from a to b, counter-clockwise; 0 and 1 where one of them has no length."""
     product = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
     fine = product > 1e-9
     safe = np.where(fine, product, 1.0)
@@ -325,8 +326,8 @@ KIND_COLUMNS = [find_column("edge_attr", kind) for kind in EDGE_KINDS]
 
 
 def add_proximity_edges(graph: Mapping[str, Array], reach: float) -> dict[str, Array]:
-    """`edge_index`, `edge_attr` and `edge_pos` with an edge between any two rooms of a storey whose middles
-    are at most `reach` (m, seen from above) apart.
+    """Return `edge_index`, `edge_attr` and `edge_pos` with an edge between any two rooms of a storey whose middles are at most
+    `reach` (m, seen from above) apart.
 
     Its features are the distance and the climb; it is of no kind. Ways back stay half of all edges behind the ways there.
     """

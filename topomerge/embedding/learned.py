@@ -200,7 +200,7 @@ def _open_unchanged(path: Path, digest: str, stamps: tuple[tuple[int, int], ...]
 
 
 def _read_stamp(path: Path) -> tuple[int, int]:
-    """Date and size of a file; zeros where there is none, which who opens it explains."""
+    """Return the date and size of a file; zeros where there is none, which who opens it explains."""
     status = path.stat() if path.exists() else None
     return (status.st_mtime_ns, status.st_size) if status else (0, 0)
 
@@ -240,7 +240,8 @@ class LearnedEmbedder:
         return self.temperature * self.embed_graph(self.build_views(map)[0])[1]
 
     def compute_probabilities(self, a: TopometricMap, b: TopometricMap) -> tuple[Array, Array]:
-        """That each room of a (R_a, R_b + 1) is each of b, in the last place none of them; and of b likewise (R_b, R_a + 1)."""
+        """Compute the probabilities that each room of a (R_a, R_b + 1) is each of b, in the last place none of them; and of b
+        likewise (R_b, R_a + 1)."""
         (ea, da), (eb, db) = (self.embed_views(self.build_views(m)) for m in (a, b))
         logits = compute_similarity(ea, eb) / self.temperature
         return softmax(np.column_stack([logits, da])), softmax(np.column_stack([logits.T, db]))

@@ -187,7 +187,7 @@ def _check_sizes(network: Network) -> None:
 
 
 def build_network(table: Mapping[str, Any], known: bool = True) -> Network:
-    """From what `dataclasses.asdict` gave.
+    """Build a network from what `dataclasses.asdict` gave.
 
     Args:
         known: its encoders must be; False: an exported network brings them along.
@@ -209,7 +209,7 @@ def _fill_dataclass(kind: type, table: Any, where: str) -> Any:
 
 
 def _check_values(kind: type, table: Any, where: str) -> dict[str, Any]:
-    """The values of a dataclass' fields, if each is of the type of its default."""
+    """Return the values of a dataclass' fields, if each is of the type of its default."""
     if not isinstance(table, Mapping):
         raise InputError(f"{where.rstrip('.') or 'network'} must be a table of keys, not {table!r}")
     defaults = asdict(kind())

@@ -76,7 +76,7 @@ def compute_room_features(x: Array, dustbin: Array, heights: Array) -> Array:
 
 
 def get_rows(rows: Rows) -> Array:
-    """(R, D), or (R, 4, D) of rows for quarter turns."""
+    """Return (R, D), or (R, 4, D) of rows for quarter turns."""
     return rows.rows if isinstance(rows, TurnedRows) else rows
 
 
@@ -152,7 +152,7 @@ def compute_shares(log_evidence: Array) -> Array:
 
 
 def _score_turn(turn: Turn) -> tuple[float, complex]:
-    """Logarithm of the evidence of a turn, and the shift that explains most of it."""
+    """Return the logarithm of the evidence of a turn, and the shift that explains most of it."""
     cosine, shifts = turn.cosine, turn.displacements
     most = min(PARTNERS * sum(cosine.shape), MOST_PAIRS, cosine.size)
     rooms = np.unravel_index(np.argpartition(-cosine, most - 1, axis=None)[:most], cosine.shape)

@@ -20,7 +20,7 @@ DENSE_UNKNOWNS = 400  # from so many unknowns on the sparse solver is quicker
 
 
 def build_graph_laplacian(cells: Array) -> Laplacian:
-    """L = D - A of the 6-neighbourhood of cells (n, 3), with masses of 1 (thesis): eigenvalues have no unit."""
+    """Build L = D - A of the 6-neighbourhood of cells (n, 3), with masses of 1 (thesis): eigenvalues have no unit."""
     grid = VoxelGrid.from_cells(cells - cells.min(axis=0))
     first, second = [], []
     for step in CELL_STEPS:
@@ -31,7 +31,8 @@ def build_graph_laplacian(cells: Array) -> Laplacian:
 
 
 def build_surface_laplacian(points: Array) -> Laplacian:
-    """Laplace-Beltrami operator of a sampled surface (n, 3), in 1/m2: Voronoi cells in the tangent planes of the points.
+    """Build the Laplace-Beltrami operator of a sampled surface (n, 3), in 1/m2: Voronoi cells in the tangent planes of the
+    points.
 
     On a flat sample the weights are the cotangents of its Delaunay triangulation, as in the finite elements of ShapeDNA (Reuter
     et al. 2006); where two points see their common side differently, the mean is taken. Borders are free (Neumann).
@@ -57,7 +58,8 @@ def _build_stiffness(first: Array, second: Array, weight: Array | None, count: i
 
 @limit_blas_threads
 def compute_smallest_eigenvalues(laplacian: Laplacian, number: int) -> Array:
-    """Up to `number` smallest eigenvalues above 0, ascending, of the largest connected part. Needs memory for n times `number`.
+    """Compute up to `number` smallest eigenvalues above 0, ascending, of the largest connected part. Needs memory for n times
+    `number`.
 
     Shift-invert about a point just below 0 (the matrix itself is singular), with one thread: more of them only get in each
     other's way here.
@@ -142,7 +144,8 @@ def compute_spectrum(cells: Array, edge: float, laplacian: str, values: int, spa
 
 
 def thin_points(points: Array, spacing: float) -> Array:
-    """Middle of the points (n, 3) in each cube of a grid that is laid over them; all points if hardly any would be left."""
+    """Return the middle of the points (n, 3) in each cube of a grid that is laid over them; all points if hardly any would be
+    left."""
     cube = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64)
     first, of = _find_firsts(cube)
     if len(first) < SHAPE_LEAST_CELLS:
@@ -152,8 +155,8 @@ def thin_points(points: Array, spacing: float) -> Array:
 
 
 def _find_firsts(cells: Array) -> tuple[Array, Array]:
-    """First row of each different cell (n, 3), in the order of x, y, z, and the number of its cell for each row: as `np.unique`
-    of rows, which takes ten times as long."""
+    """Return the first row of each different cell (n, 3), in the order of x, y, z, and the number of its cell for each row: as
+    `np.unique` of rows, which takes ten times as long."""
     low = cells.min(axis=0)
     wide = (np.ptp(cells, axis=0) + 1).astype(np.int64)
     x, y, z = (cells - low).astype(np.int64).T
@@ -170,6 +173,6 @@ def normalise_spectra(values: Array, how: str) -> Array:
 
 
 def _fit_slope(values: Array) -> Array:
-    """Slope of the line through the origin that fits value over number: on a surface 4 pi / area, by Weyl's law."""
+    """Return the slope of the line through the origin that fits value over number: on a surface 4 pi / area, by Weyl's law."""
     number = np.arange(1, values.shape[1] + 1)
     return (values @ number) / (number @ number)

@@ -95,8 +95,8 @@ def _name_arrays(drawn: Sheet) -> dict[str, Array]:
 
 
 def _rasterise_storey(map: TopometricMap, storey: int, near: float, scale: float, tilt: float) -> Sheet:
-    """One storey by itself, turned by the direction of its walls that is no more than pi/4 from another, rad, and the tilt;
-    anchors of other storeys' rooms mean nothing."""
+    """Rasterise one storey by itself, turned by the direction of its walls that is no more than pi/4 from another, rad, and the
+    tilt; anchors of other storeys' rooms mean nothing."""
     grid, nav = map.grid, map.navigable
     masks, ceiling = _classify_columns(map, storey)
     # Within 1 degree of the truth in 51 of 52 validation pairs: so crops have the same direction in both maps (docs/adr/0016).
@@ -126,8 +126,8 @@ def _rasterise_storey(map: TopometricMap, storey: int, near: float, scale: float
 
 
 def _classify_columns(map: TopometricMap, storey: int) -> tuple[tuple[Array, ...], Array]:
-    """Which columns (nx, ny) of a storey's cells are walls, low things, high things, and seen at all; and how high above the
-    floor, m, the highest cell of each stands that may be a ceiling, -inf where none does."""
+    """Return which columns (nx, ny) of a storey's cells are walls, low things, high things, and seen at all; and how high above
+    the floor, m, the highest cell of each stands that may be a ceiling, -inf where none does."""
     grid, (floor, limit) = map.grid, _measure_levels(map, storey)
     ix, iy = np.ascontiguousarray(grid.cells[:, :2].T.astype(np.int64))
     z = grid.origin[2] + (grid.cells[:, 2] + 0.5) * grid.edge - floor
@@ -143,7 +143,7 @@ def _classify_columns(map: TopometricMap, storey: int) -> tuple[tuple[Array, ...
 
 
 def _measure_levels(map: TopometricMap, storey: int) -> tuple[float, float]:
-    """Height of a storey's floor, m, and how far above it the storey ends."""
+    """Measure the height of a storey's floor, m, and how far above it the storey ends."""
     row = map.storeys[storey]
     floor = float(row["floor"]) if np.isfinite(row["floor"]) else float(row["ceiling"]) - USUAL_HEIGHT
     above = map.storeys["floor"][map.storeys["floor"] > floor + UPRIGHT]
@@ -177,7 +177,7 @@ def _locate_room_doors(map: TopometricMap) -> Array:
 
 
 def _rotate_points(points: Array, turn: float) -> Array:
-    """Points (n, 2) of the map's frame in that of its walls."""
+    """Rotate points (n, 2) of the map's frame into that of its walls."""
     c, s = np.cos(turn), np.sin(turn)
     out: Array = points @ np.array([[c, -s], [s, c]])
     return out
@@ -193,7 +193,8 @@ def _compute_spacing(edge: float) -> float:
 
 
 def _sample_column_points(origin: Array, columns: Array, edge: float, turn: float) -> Array:
-    """Points of columns (n, 2), no farther apart than `BIN`, in the frame of the walls: those of a column behind each other."""
+    """Return points of columns (n, 2), no farther apart than `BIN`, in the frame of the walls: those of a column behind each
+    other."""
     spacing = _compute_spacing(edge)
     steps = (np.arange(round(edge / spacing)) + 0.5) * spacing - edge / 2
     grid = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -217,7 +218,7 @@ class _Raster:
         return np.bincount(self.find_pixels(points), weight, self.size[0] * self.size[1]).reshape(self.size)
 
     def compute_share(self, points: Array, spacing: float) -> Array:
-        """0 to 255: how much of a pixel points cover that stand so far apart."""
+        """Compute how much of a pixel, 0 to 255, points cover that stand so far apart."""
         return np.minimum(self.count(points) * (spacing / SHEET_PIXEL) ** 2 / FULL_SHARE, 1.0) * 255
 
     def compute_mean(self, points: Array, values: Array) -> Array:
@@ -246,7 +247,8 @@ class _Raster:
 
 
 def _build_raster(points: Array) -> _Raster:
-    """Pixels that hold points (n, 2), m, with their middle in their own, so that a turned map has the same pixels, turned."""
+    """Return the pixels that hold points (n, 2), m, with their middle in their own, so that a turned map has the same pixels,
+    turned."""
     points = points if len(points) else np.zeros((1, 2))
     size = np.floor(np.ptp(points, axis=0) / SHEET_PIXEL).astype(int) + 1
     middle = (points.min(axis=0) + points.max(axis=0)) / 2

@@ -57,7 +57,7 @@ def cut_crops(map_sheet: Mapping[str, Array], part: str = CROP_PART, rooms: Arra
 
 
 def _cut(map_sheet: Mapping[str, Array], middles: Array, number: Array, side: int, step: int = 1) -> Array:
-    """(n, side, side, len(CROP_PLANES)) uint8 crops about places (n, 2) of the sheet, pixels, that show the rooms (n,).
+    """Cut (n, side, side, len(CROP_PLANES)) uint8 crops about places (n, 2) of the sheet, pixels, that show the rooms (n,).
 
     Args:
         step: pixels of the sheet on a side of each of theirs, which are means.

@@ -185,7 +185,7 @@ def load_set(folder: Path) -> AtlasSet:
 
 
 def errors(atlas_set: AtlasSet, result: AtlasResult) -> dict[int, tuple[float, float] | None]:
-    """Error of each map in its component's first map, m and rad; None for maps of two buildings in one component."""
+    """Return the error of each map in its component's first map, m and rad; None for maps of two buildings in one component."""
     out: dict[int, tuple[float, float] | None] = {}
     sensors: Any = atlas_set.about["sensors"]
     places: Any = atlas_set.about.get("places", [0] * len(atlas_set.files))

@@ -43,7 +43,8 @@ class Bending(Protocol):
 
 
 def measure_displacements(bent: DriftedPair, side: int, pose: Sim3, bending: Bending | None = None) -> tuple[Array, Array]:
-    """Places of a map in the building's frame (n, 3), and by how much (n, 3) m, in the frame of map a, they are laid beside it.
+    """Return places of a map in the building's frame (n, 3), and by how much (n, 3) m, in the frame of map a, they are laid
+    beside it.
 
     Args:
         side: 0: map a, which stays where it is; 1: map b, laid by `pose`.
@@ -57,7 +58,7 @@ def measure_displacements(bent: DriftedPair, side: int, pose: Sim3, bending: Ben
 def measure_room_errors(
     bent: DriftedPair, pose: Sim3, bendings: Sequence[Bending | None] = (None, None)
 ) -> list[dict[str, float]]:
-    """Of each room that both surveyors were in: how far (m, horizontally) and by how many degrees b's lies off a's.
+    """Measure, of each room that both surveyors were in, how far (m, horizontally) and by how many degrees b's lies off a's.
 
     The mean displacement and the turn that fits best, over the places of b that are near one of a in the same room; rooms of
     which both show less than `LEAST_COMMON` are left out.
@@ -78,7 +79,8 @@ def measure_room_errors(
 
 
 def fit_shift_and_turn(points: Array, off: Array) -> tuple[float, float]:
-    """Length of the mean (m), and turn (degrees) of the rigid move that explains displacements (n, 2) of points (n, 2) best."""
+    """Return the length of the mean (m), and turn (degrees) of the rigid move that explains displacements (n, 2) of points (n, 2)
+    best."""
     mean = off.mean(axis=0)
     rel = (points - points.mean(axis=0)) @ (1, 1j)
     turned = rel + (off - mean) @ (1, 1j)
@@ -86,7 +88,7 @@ def fit_shift_and_turn(points: Array, off: Array) -> tuple[float, float]:
 
 
 def within(rooms: Sequence[dict[str, float]], limits: tuple[float, float] = ROOM_LIMITS) -> bool:
-    """Is every room within m and degrees?"""
+    """Return whether every room is within m and degrees."""
     return all(r["shift"] <= limits[0] and r["turn"] <= limits[1] for r in rooms)
 
 
@@ -183,14 +185,14 @@ def rooms(rows: Sequence[Row], key: str, value: str) -> tuple[list[float], list[
 
 
 def format_median(rows: Sequence[Row], key: str, value: str, digits: int) -> str:
-    """Median over rooms."""
+    """Format the median over rooms."""
     values, groups = rooms(rows, key, value)
     return format_with_interval(lambda k: float(np.median(np.array(values)[k])), groups, digits) if values else "–"
 
 
 def format_room_cells(rows: Sequence[Row], key: str = "named") -> list[object]:
-    """Pairs, those whose rigid pose is wrong, shares with every shared room within the limits, and medians of rooms: each before
-    and after bending."""
+    """Format the pairs, those whose rigid pose is wrong, shares with every shared room within the limits, and medians of rooms:
+    each before and after bending."""
     rows = [r for r in rows if r["rooms"] or r["err"] is None]  # pairs without a room in common say nothing
 
     def all_right(name: str) -> Callable[[Row], bool]:
@@ -222,7 +224,7 @@ def tabulate(rows: Sequence[Row], settings: TaskSettings) -> dict[str, str]:
 
 
 def format_straight(rows: Sequence[Row]) -> str:
-    """How much worse pairs without drift become."""
+    """Tell how much worse pairs without drift become."""
     rows = [r for r in rows if r["rooms"] and r.get("named")]
     worse = [1000 * (np.mean([x["shift"] for x in r["named"]]) - np.mean([x["shift"] for x in r["rooms"]])) for r in rows]
     if not worse:
@@ -236,7 +238,7 @@ def format_straight(rows: Sequence[Row]) -> str:
 
 
 def seconds(rows: Sequence[Row]) -> str:
-    """Time of bending over that of the rigid registration."""
+    """Measure the time of bending over that of the rigid registration."""
     times = [r["seconds"] for r in rows if "bend" in r["seconds"]]
     if not times:
         return ""

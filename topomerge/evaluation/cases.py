@@ -140,7 +140,7 @@ def dev() -> list[Case]:
 
 
 def simulate_scan() -> list[Case]:
-    """Every kind of building by every sensor."""
+    """List every kind of building by every sensor."""
     return [
         Case(f"by {sensor}", "procedural", kind, sensor, TEST + 10 * i + 2, rooms=ROOM_NUMBERS)
         for sensor in CASE_SENSORS
@@ -165,7 +165,7 @@ def hard() -> list[Case]:
 
 
 def plans() -> list[Case]:
-    """Real plans, erected and scanned."""
+    """List real plans, erected and scanned."""
     r2v = (
         "00/0b/0513fae730eaf65b98f9580d024d/0001",
         "00/0e/4a5243dead16df7eab33ef0d3a69/0001",
@@ -182,7 +182,7 @@ def plans() -> list[Case]:
 
 
 def grids() -> list[Case]:
-    """Robots' grids with true rooms: IPA's eight, bare and furnished, raised and erected and scanned; the floors of GDC."""
+    """List robots' grids with true rooms: IPA's eight, bare and furnished, raised and erected and scanned; the floors of GDC."""
     out = [Case("grids, bare", "ipa", name) for name in IPA]
     out += [Case("grids, furnished", "ipa", f"{name}_furnitures") for name in IPA]
     for k, (title, difficulty) in enumerate((("grids scanned, bare", BARE), ("grids scanned, furnished", {}))):
@@ -192,7 +192,7 @@ def grids() -> list[Case]:
 
 
 def ifc() -> list[Case]:
-    """Building models scanned from inside."""
+    """List building models scanned from inside."""
     names = ("ExampleHOM", "LargeBuilding", "TallBuilding", "duplex", "Office_A_20110811")
     out = [Case("models", "ifc", name, "tls", TEST) for name in names]
     return out + [Case("models", "ifc", name, "depth", TEST, rooms=20) for name in ("duplex", "Office_A_20110811")]
@@ -213,12 +213,12 @@ def pairs() -> list[Case]:
 
 
 def homes() -> list[Case]:
-    """Real homes as vacuum robots drew them, against the robots' own rooms: for development."""
+    """List real homes as vacuum robots drew them, against the robots' own rooms: for development."""
     return [Case("homes of vacuum robots", "home", name) for name in HOMES]
 
 
 def look() -> list[Case]:
-    """Real maps without truth: for the eye."""
+    """List real maps without truth: for the eye."""
     return [Case("by eye", "file", name) for name in LOOK]
 
 

@@ -158,7 +158,7 @@ def straighten_truth(drawing: Drawing) -> Drawing:
 
 
 def _is_read(text: Any, found: Sequence[Any], drawing: Drawing) -> bool:
-    """Was the name read, in its room?"""
+    """Return whether the name was read, in its room."""
     for one in found:
         column, row = (int(v) for v in one.place)
         at = drawing.rooms[min(row, len(drawing.rooms) - 1), min(column, drawing.rooms.shape[1] - 1)]
@@ -220,7 +220,7 @@ def _joins_two_rooms(rooms: Array, middle: Array, resolution: float) -> bool:
 
 
 def score_walls(occupied: Array, drawing: Drawing, zoom: float) -> float:
-    """F1 of the pixels of walls and windows that lie within 0.1 m of true ones, and the other way round."""
+    """Compute the F1 of the pixels of walls and windows that lie within 0.1 m of true ones, and the other way round."""
     h, w = drawing.classes.shape
     rows, columns = np.clip((np.arange(h) * zoom).astype(int), 0, occupied.shape[0] - 1), np.arange(w) * zoom
     found = occupied[rows][:, np.clip(columns.astype(int), 0, occupied.shape[1] - 1)]
@@ -247,7 +247,7 @@ def tabulate(rows: Sequence[Row], settings: TaskSettings) -> dict[str, str]:
 
 
 def summarise(rows: Sequence[Row]) -> list[str]:
-    """Means of the measures, and shares of counts."""
+    """Return the means of the measures, and shares of counts."""
     out = [write_mean(rows, key) for key in ("iou", "clear", "precision", "recall", "walls")]
     for key in ("found", "right", "names", "names_legible", "scale", "scale_legible"):
         counts = [row[key] if isinstance(row[key], list) else [int(row[key]), 1] for row in rows if key in row]

@@ -166,7 +166,7 @@ def correct_to_truth(map: TopometricMap, truth: FloorTruth) -> tuple[list[Edit],
 def _iter_better(
     map: TopometricMap, truth: FloorTruth, candidates: Iterator[Edit], before: float, always: bool
 ) -> Iterator[tuple[Edit, TopometricMap]]:
-    """Those of some edits that apply and bring the rooms nearer to the truth, with the map that each makes."""
+    """Yield those of some edits that apply and bring the rooms nearer to the truth, with the map that each makes."""
     for edit in candidates:
         done = apply_edits(map, [edit])
         if done.applied and (always or _sum_overlap(done.map, truth) >= before + LEAST_GAIN):
@@ -174,7 +174,7 @@ def _iter_better(
 
 
 def _sum_overlap(map: TopometricMap, truth: FloorTruth) -> float:
-    """Sum of the IoU of the true rooms that are expected."""
+    """Return the sum of the IoU of the true rooms that are expected."""
     scores = evaluate_map(map, truth)
     return float(scores.rooms.iou * scores.true_rooms) if scores.true_rooms else 0.0
 
@@ -195,7 +195,7 @@ def _count_overlap(map: TopometricMap, truth: FloorTruth) -> tuple[Array, Array,
 
 
 def _iter_splits(map: TopometricMap, truth: FloorTruth) -> Iterator[Edit]:
-    """Cuts of found rooms that hold pieces of several true ones, those first whose second piece is largest."""
+    """Yield cuts of found rooms that hold pieces of several true ones, those first whose second piece is largest."""
     shared, areas, _ = _count_overlap(map, truth)
     large = (shared >= LEAST_PIECE) & (shared >= PIECE_SHARE * areas[:, None]) & (areas[:, None] > 0)
     rooms = np.flatnonzero(large.sum(axis=0) > 1)
@@ -235,8 +235,8 @@ def _propose_lines(truth: FloorTruth, room: Array, true: Array) -> list[Array]:
 
 
 def _find_cuts(along: Array, label: Array) -> list[tuple[float, int]]:
-    """Where to cut places along a direction so that few pieces lie on both sides, and how many cells lie wrong then; one cut for
-    each two pieces that follow each other."""
+    """Return where to cut places along a direction so that few pieces lie on both sides, and how many cells lie wrong then; one
+    cut for each two pieces that follow each other."""
     names = sorted(np.unique(label).tolist(), key=lambda t: float(np.median(along[label == t])))
     cuts = []
     for k in range(1, len(names)):
@@ -250,7 +250,7 @@ def _find_cuts(along: Array, label: Array) -> list[tuple[float, int]]:
 
 
 def _iter_joins(map: TopometricMap, truth: FloorTruth) -> Iterator[Edit]:
-    """Found rooms that lie mostly in one true room."""
+    """Yield found rooms that lie mostly in one true room."""
     shared, areas, of_found = _count_overlap(map, truth)
     for t in np.flatnonzero(areas > 0).tolist():
         pieces = [r for r in range(len(of_found)) if shared[t, r] > max(0.5 * of_found[r], LEAST_FRAGMENT)]
@@ -259,7 +259,7 @@ def _iter_joins(map: TopometricMap, truth: FloorTruth) -> Iterator[Edit]:
 
 
 def _iter_outsides(map: TopometricMap, truth: FloorTruth) -> Iterator[Edit]:
-    """Found rooms that count but lie in no true one: a user says that they are outside."""
+    """Yield found rooms that count but lie in no true one: a user says that they are outside."""
     shared, _, of_found = _count_overlap(map, truth)
     count = ~(map.rooms["glimpsed"] | (map.rooms["outside"] > 0.5)) & (of_found >= LEAST_SEEN_AREA)
     if not bool(truth.complete):
@@ -269,7 +269,7 @@ def _iter_outsides(map: TopometricMap, truth: FloorTruth) -> Iterator[Edit]:
 
 
 def _list_door_edits(map: TopometricMap, truth: FloorTruth) -> list[Edit]:
-    """Doors that are moved, added and deleted."""
+    """List the doors that are moved, added and deleted."""
     shared, areas, _ = _count_overlap(map, truth)
     own = shared.argmax(axis=1)  # the found room of each true one
     ends = truth.doors[:, :2].astype(np.int64)

@@ -75,7 +75,7 @@ def _create_figure(columns: int) -> tuple[Any, Any]:
 
 
 def _add_legend(ax: Any) -> None:
-    """Below the axes, where it hides nothing; none where nothing is drawn, as of merges that were not asked for."""
+    """Add a legend below the axes, where it hides nothing; none where nothing is drawn, as of merges that were not asked for."""
     if ax.get_legend_handles_labels()[0]:
         ax.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2, frameon=False)
 
@@ -92,7 +92,8 @@ def _collect_values(rows: Sequence[Row], key: str) -> list[Any]:
 
 
 def _draw_reliability(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]) -> Any:
-    """Share that was right against the probability that was told, over bins of equal mass; merges by where the maps come from."""
+    """Draw the share that was right against the probability that was told, over bins of equal mass; merges by where the maps come
+    from."""
     by_origin = _group_rows(select_last_variant(merges), "origin")
     sets = [("merges", {n: ([r["probability"] for r in s], [r["near"] for r in s]) for n, s in by_origin.items()})]
     rows_with_probability = [m for m in matches if m["k"] == 0 and m["method"] in ("consistent", "mutual")]
@@ -119,7 +120,7 @@ def _draw_reliability(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequ
 
 
 def _draw_overlap(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]) -> Any:
-    """Recall of rooms and merges by the share of rooms in common."""
+    """Draw the recall of rooms and merges by the share of rooms in common."""
     bins = [name for _, name in OVERLAPS]
     if not any(r["overlap"] in bins for r in ranks):
         return None
@@ -146,7 +147,7 @@ def _draw_overlap(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence
 
 
 def _draw_precision_recall(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]) -> Any:
-    """Precision against recall of matches, as the least probability that is taken falls; dots: methods that tell none."""
+    """Draw precision against recall of matches, as the least probability that is taken falls; dots: methods that tell none."""
     if not matches:
         return None
     figure, (ax,) = _create_figure(1)

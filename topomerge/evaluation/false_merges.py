@@ -53,7 +53,8 @@ NEGATIVE_HEADS = (
 
 
 def is_good(row: Row, limits: tuple[float, float] = (0.5, 5.0)) -> bool:
-    """Right within m and degrees; a slice or a drawing on the wrong storey is not. Maps of two places have no right pose."""
+    """Return whether a pose is right within m and degrees; a slice or a drawing on the wrong storey is not. Maps of two places
+    have no right pose."""
     return bool(is_hypothesis_right(row.get("err"), row["sensors"], limits))
 
 
@@ -77,23 +78,23 @@ def classify_negative(row: Row) -> str:
 
 
 def is_broken(row: Row) -> bool:
-    """Is what is called true known to be wrong? Of a drawing of a map's own building of which the map shows nothing the
-    generator gave a twin's frame."""
+    """Return whether what is called true is known to be wrong. Of a drawing of a map's own building of which the map shows
+    nothing the generator gave a twin's frame."""
     return bool(row["kind"] == "overlap" and row.get("common", 1) < 1 and "drawing" in row["sensors"])
 
 
 def is_tellable(row: Row) -> bool:
-    """Could anybody tell the two places apart by what the maps show? Else the right answer is to abstain."""
+    """Return whether anybody could tell the two places apart by what the maps show. Else the right answer is to abstain."""
     return bool(row["tellable"]) if "tellable" in row else bool(is_distinguishable(row))
 
 
 def is_false_merge(row: Row) -> bool:
-    """Believed, and not at a right pose."""
+    """Return whether a pair is believed, and not at a right pose."""
     return bool(row["believed"]) and not is_good(row)
 
 
 def measure_hit_buildings(rows: Sequence[Row]) -> dict[str, float]:
-    """Physical building of map a -> share of its pairs that were merged falsely."""
+    """Map each physical building of map a to the share of its pairs that were merged falsely."""
     of: dict[str, list[bool]] = {}
     for r in rows:
         of.setdefault(get_physical_building(r), []).append(is_false_merge(r))
@@ -179,7 +180,7 @@ def format_headline(rows: Sequence[Row]) -> str:
 
 
 def classify_origin(row: Row) -> str:
-    """Where the maps of a pair are from: one of `ORIGINS`; a real plan beside a procedural building is a real plan.
+    """Tell where the maps of a pair are from: one of `ORIGINS`; a real plan beside a procedural building is a real plan.
 
     Look-alikes stand apart: a set of pairs that are all made to deceive says nothing of how sure a probability is elsewhere.
     """
@@ -192,8 +193,8 @@ def classify_origin(row: Row) -> str:
 
 
 def compute_calibration(rows: Sequence[Row]) -> Calibration:
-    """`calibration` of the probabilities of pairs, in ten bins, or fewer where a bin of those above the mass near zero would have
-    fewer than `PER_BIN`."""
+    """Compute the `calibration` of the probabilities of pairs, in ten bins, or fewer where a bin of those above the mass near
+    zero would have fewer than `PER_BIN`."""
     above = sum(r["probability"] >= NEAR_ZERO for r in rows)
     return measure_calibration([r["probability"] for r in rows], [is_good(r) for r in rows], min(max(above // PER_BIN, 1), 10))
 

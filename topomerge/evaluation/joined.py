@@ -85,7 +85,7 @@ def extract_with_truth(maker: DriftedPairMaker, side: int, factor: float) -> tup
 
 
 def compute_scores(map: TopometricMap, truth: FloorTruth) -> dict[str, float]:
-    """Mean IoU of rooms and F1 of doors."""
+    """Compute the mean IoU of rooms and the F1 of doors."""
     verdict = evaluate_map(map, truth)
     p, r = verdict.doors.precision, verdict.doors.recall
     return {"iou": verdict.rooms.iou, "doors": 2 * p * r / (p + r) if p + r > 0 else 0.0 if p == p and r == r else float("nan")}

@@ -332,7 +332,7 @@ def _register_pair(pair: GridPair, landmarks: tuple[Landmarks, Landmarks]) -> Ro
 
 
 def is_false(row: Row) -> bool:
-    """Is a pair believed at a wrong pose?"""
+    """Return whether a pair is believed at a wrong pose."""
     return bool(row["believed"] and not row["right"])
 
 
@@ -456,7 +456,7 @@ def draw_sign(text: str, height: int, angle: float, rng: np.random.Generator) ->
 
 
 def _find_homography(corners: Array, w: int, h: int) -> tuple[float, ...]:
-    """Coefficients of Pillow's perspective: from places of the picture to those of the sign."""
+    """Return the coefficients of Pillow's perspective: from places of the picture to those of the sign."""
     rows, values = [], []
     for (x, y), (u, v) in zip(corners, ((0, 0), (w, 0), (w, h), (0, h)), strict=True):
         rows += [[x, y, 1, 0, 0, 0, -u * x, -u * y], [0, 0, 0, x, y, 1, -v * x, -v * y]]

@@ -67,7 +67,7 @@ def tabulate_merging(merges: Sequence[Row], key: str, settings: Evaluation) -> T
 
 
 def _group_distinct(merges: Sequence[Row]) -> dict[str, list[Row]]:
-    """Rows by way of merging; ways whose merges come out alike are one, with the seconds of the last of them."""
+    """Group rows by way of merging; ways whose merges come out alike are one, with the seconds of the last of them."""
     names: dict[object, list[str]] = {}
     rows: dict[object, list[Row]] = {}
     for name, these in group_by_variant(merges).items():
@@ -78,14 +78,14 @@ def _group_distinct(merges: Sequence[Row]) -> dict[str, list[Row]]:
 
 
 def _format_wrong(rows: Sequence[Row]) -> str:
-    """Merges that are wrong, and in how many buildings, with the exact interval in per cent."""
+    """Tell how many merges are wrong, and in how many buildings, with the exact interval in per cent."""
     hit, buildings, low, high = count_hit_buildings(rows, "false")
     count = str(sum(r["false"] for r in rows))
     return f"{count}; {hit} of {buildings} buildings [{100 * low:.1f}, {100 * high:.1f}] %" if buildings > 1 else count
 
 
 def tabulate_sites(merges: Sequence[Row]) -> Table:
-    """Real pairs by physical building, in numbers of pairs."""
+    """Tabulate real pairs by physical building, in numbers of pairs."""
     rows = []
     for site, these in group_by(merges, "building").items():
         for independent, title in INDEPENDENCE.items():
@@ -148,7 +148,7 @@ def tabulate_descriptor_effect(merges: Sequence[Row]) -> Table:
 
 
 def _measure_pose_difference(a: Sequence[float], b: Sequence[float]) -> tuple[float, float]:
-    """m and degrees between two places; where only one way has a pose, they are infinitely far apart."""
+    """Measure the metres and degrees between two places; where only one way has a pose, they are infinitely far apart."""
     if not a or not b:
         return (0.0, 0.0) if a == b else (np.inf, np.inf)
     return float(np.linalg.norm(np.subtract(a[:3], b[:3]))), abs((a[3] - b[3] + 180) % 360 - 180)
@@ -169,17 +169,17 @@ def tabulate_reliability(matches: Sequence[Row], merges: Sequence[Row]) -> Table
 
 
 def _collect_match_predictions(rows: Sequence[Row]) -> tuple[list[float], list[bool]]:
-    """Probability of each match of rows, and whether it is right."""
+    """Collect the probability of each match of rows, and whether it is right."""
     return [p for r in rows for p in r["chance"]], [g for r in rows for g in r["good"]]
 
 
 def _collect_merge_predictions(rows: Sequence[Row]) -> tuple[list[float], list[bool]]:
-    """Probability of each merge, and whether its pose is right."""
+    """Collect the probability of each merge, and whether its pose is right."""
     return [r["probability"] for r in rows], [bool(r["near"]) for r in rows]
 
 
 def _iter_calibration_rows(what: str, rows: Sequence[Row], of: Predictions) -> Iterator[list[str]]:
-    """A line for each origin that there are any of."""
+    """Yield a line for each origin that there are any of."""
     for origin in PLACE_ORIGINS:
         p, right = of([r for r in rows if r["origin"] == origin])
         if len(p):
@@ -193,7 +193,7 @@ def _iter_calibration_rows(what: str, rows: Sequence[Row], of: Predictions) -> I
 
 
 def _format_calibration(c: Calibration) -> list[str]:
-    """Number, mean probability, share that is right, expected calibration error and what chance makes of it."""
+    """Format the number, mean probability, share that is right, expected calibration error and what chance makes of it."""
     number = int(c.count.sum())
     means = (float((x * c.count).sum() / number) for x in (c.probability, c.right))
     return [str(number), *(f"{m:.2f}" for m in means), f"{c.error:.3f}", f"{c.by_chance:.3f}"]
@@ -213,19 +213,19 @@ NEGATIVE_SETS = ("strangers", "drawn_strangers", "real_strangers", "lookalikes",
 
 
 def modality(row: Row) -> str:
-    """Kind of a pair by what its maps show."""
+    """Return the kind of a pair by what its maps show."""
     if "drawing" in row["sensors"]:
         return "with a floor plan"
     return "with a slice" if "laser2d" in row["sensors"] or "phone" in row["sensors"] else "3D–3D"
 
 
 def format_share(rows: Sequence[Row], hit: Callable[[Row], bool]) -> str:
-    """Per cent with its interval over physical buildings (`format_interval`)."""
+    """Format per cent with its interval over physical buildings (`format_interval`)."""
     return format_interval(np.array([float(hit(r)) for r in rows]), np.array([get_physical_building(r) for r in rows]), 0, 100.0)
 
 
 def format_measures(rows: Sequence[Row]) -> list[object]:
-    """Number, right, fine, believed among the right ones, believed and wrong, seconds."""
+    """Format the number, right, fine, believed among the right ones, believed and wrong, seconds."""
     true = [r for r in rows if is_good(r)]
     wrong = sum(r["believed"] and r["answered"] and not is_good(r) for r in rows)
     seconds = float(np.median([r["seconds"] for r in rows]))
@@ -243,13 +243,13 @@ def select_positives(rows: Sequence[Row]) -> list[Row]:
 
 
 def describe_source(row: Row) -> str:
-    """Where a simulated pair is from, in words."""
+    """Tell where a simulated pair is from, in words."""
     names = {"procedural": "procedural buildings", "campus": "schools (real plans)", "r2v": "flats (real plans)"}
     return names.get(str(row["source"]), str(row["source"]))
 
 
 def describe_pairs(rows: Sequence[Row]) -> str:
-    """How many pairs of how many buildings the recipe gives, by source."""
+    """Tell how many pairs of how many buildings the recipe gives, by source."""
     count = Counter(describe_source(r) for r in rows)
     each = [
         f"{n} of {len({get_physical_building(r) for r in rows if describe_source(r) == s})} {s}" for s, n in count.most_common()
@@ -294,7 +294,7 @@ def merged(mine: Sequence[Row], drawn: Sequence[Row]) -> list[str]:
 
 
 def tabulate_real(rows: Sequence[Row]) -> str:
-    """Real pairs by source and what they show."""
+    """Tabulate real pairs by source and what they show."""
     out = []
     names = [f"{r['source']} {' to '.join(sorted(set(r['sensors']), reverse=True))}" for r in rows]
     for name in sorted(set(names)):
@@ -312,7 +312,7 @@ def tabulate_real(rows: Sequence[Row]) -> str:
 
 
 def format_misnamed(not_to_merge: Sequence[Row]) -> str:
-    """How many pairs that the generator draws as two buildings are of one."""
+    """Tell how many pairs that the generator draws as two buildings are of one."""
     drawn = [r for r in not_to_merge if r["kind"] == "other-building"]
     same = [r for r in drawn if r["negative"] == "other storey"]
     plans = sum(r["building"] == r["other"] for r in same)
@@ -400,7 +400,7 @@ def count_real(rows: Sequence[Row], split: str) -> tuple[str, str] | None:
 
 
 def is_independent(row: Row) -> bool:
-    """Are the maps of a real pair of two captures (`datasets.real.sources.find_captures`)?"""
+    """Return whether the maps of a real pair are of two captures (`datasets.real.sources.find_captures`)."""
     one, other = find_captures(str(row["source"]), row["name"].split("/", 1)[1])
     return one != other
 

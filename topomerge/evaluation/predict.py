@@ -93,7 +93,7 @@ def describe_maps(
 
 
 def digest_descriptor_code(name: str) -> str:
-    """Digest of the code and data that the descriptors of a name, alone or joined with surroundings, come from."""
+    """Compute the digest of the code and data that the descriptors of a name, alone or joined with surroundings, come from."""
     return compute_code_digest(EMBEDDERS[name].__module__, "topomerge.embedding.engineered")
 
 
@@ -112,7 +112,8 @@ class DescriptorCache:
         self.folder, self.source = folder, source
 
     def get_rows(self, m: TopometricMap, options: Mapping[str, Any], steps: int) -> tuple[Array, float]:
-        """(R, (steps + 1) D) the rooms' own and those of their joined surroundings; and the seconds that they took."""
+        """Return (R, (steps + 1) D), the rooms' own rows and those of their joined surroundings; and the seconds that they
+        took."""
         digest = hashlib.sha256(self.source.read_bytes()).hexdigest()
         inputs = json.dumps(
             [digest, convert_to_plain(dict(options)), steps, digest_descriptor_code(str(options["name"]))], sort_keys=True
@@ -165,12 +166,12 @@ def predict(path: Path, target: Path, settings: Evaluation) -> str:
 
 
 def has_merges(variant: Variant, settings: Evaluation) -> bool:
-    """Does this variant merge maps, too?"""
+    """Return whether this variant merges maps, too."""
     return settings.merge and (bool(variant.run) or (variant.descriptor in settings.mergers and variant.k == 0))
 
 
 def match_rooms(variant: Variant, method: str, maps: Maps, rows: tuple[Rows, Rows], free: bool = False) -> dict[str, Array]:
-    """`rooms` (M, 2), `probability` (M,) and `seconds` of a method; `free`: the second map has a scale of its own."""
+    """Return `rooms` (M, 2), `probability` (M,) and `seconds` of a method; `free`: the second map has a scale of its own."""
     began = time.process_time()
     if method == "mutual":
         rooms, probability = (

@@ -141,7 +141,7 @@ def format_partners(pairs: Sequence[EvaluationPair], rows: Sequence[tuple[Rows, 
 
 
 def table(results: Sequence[tuple[str, Sequence[Search]]], maps: int, buildings: int, rooms: int) -> str:
-    """Named results as Markdown."""
+    """Return named results as Markdown."""
     groups = np.array([r.building for r in results[0][1]])
     by_chance = [1 - (1 - 1 / buildings) ** n for n in FIRST]
     lines = [

@@ -164,7 +164,7 @@ def measure_case(case: Case, preset: str, scans: Path, data: Path | None, pictur
 
 
 def count_marks(map: TopometricMap, marks: Mapping[str, Sequence[tuple[float, float]]]) -> dict[str, dict[str, int]]:
-    """Count of each kind of marked places how many lie in a room, in what is outside or only looked into, and in no room.
+    """Count, of each kind of marked places, how many lie in a room, in what is outside or only looked into, and in no room.
 
     Args:
         marks: kind -> places (x, y), m.
@@ -293,7 +293,7 @@ def list_failures(rows: Sequence[Row]) -> str:
 
 
 def compute_headline(rows: Sequence[Row], settings: Settings) -> dict[str, tuple[str, str]]:
-    """Mean IoU of the sets that the README shows."""
+    """Compute the mean IoU of the sets that the README shows."""
     out = {}
     for name, figure in HEADLINES.items():
         these = [r for r in rows if r["set"] == name and r["preset"] == "default" and "iou" in r]

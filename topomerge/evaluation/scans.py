@@ -249,7 +249,8 @@ def simulate_case(case: Case, building: Building) -> Scan:
 
 
 def _select_visited(case: Case, building: Building) -> Array:
-    """Rooms that the surveyor goes into: those asked for, and of several parts of a building the one with most rooms."""
+    """Select the rooms that the surveyor goes into: those asked for, and of several parts of a building the one with most
+    rooms."""
     rng = np.random.default_rng([case.seed, 2])
     if case.day:
         return sample_two_parts(building, case.rooms, COMMON, rng)[case.day - 1]

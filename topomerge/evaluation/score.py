@@ -135,7 +135,7 @@ def classify_modality(sensors: Sequence[str]) -> str:
 
 
 def classify_overlap(share: float, kind: str = "overlap") -> str:
-    """Name of the bin that a share of rooms in common falls in; of hard negatives their kind."""
+    """Return the name of the bin that a share of rooms in common falls in; of hard negatives their kind."""
     return kind if kind != "overlap" else next(name for limit, name in OVERLAPS if share <= limit)
 
 
@@ -173,7 +173,7 @@ def _find_true_pair(pair: EvaluationPair, i: int, j: int) -> tuple[int, int]:
 
 
 def find_shared_rooms(pair: EvaluationPair) -> dict[tuple[int, int], list[tuple[int, int]]]:
-    """True rooms that both maps have -> matches of their pieces."""
+    """Map true rooms that both maps have to the matches of their pieces."""
     out: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for i, j in pair.matches.tolist():
         out.setdefault(_find_true_pair(pair, i, j), []).append((i, j))
@@ -198,9 +198,9 @@ def rank_partners(cost: Array, matches: Array) -> tuple[Array, Array]:
 
 
 def count_ranks(pair: EvaluationPair, cost: Array) -> Row:
-    """`queries`: rooms of either map with a true partner in the other; `first`, `five`: whose partner ranks first, within five;
-    `reciprocal`: sum of 1 / rank; each also with and without a twin, and where neither room was looked into only (`_whole`), or
-    one was (`_glimpsed`). `chance`: first ones to be expected of a draw."""
+    """Count `queries`: rooms of either map with a true partner in the other; `first`, `five`: whose partner ranks first, within
+    five; `reciprocal`: sum of 1 / rank; each also with and without a twin, and where neither room was looked into only
+    (`_whole`), or one was (`_glimpsed`). `chance`: first ones to be expected of a draw."""
     rank, twin, entered, by_chance = [], [], [], 0.0
     for side, c, m in ((0, cost, pair.matches), (1, cost.T, pair.matches[:, ::-1])):
         rooms, room_ranks = rank_partners(c, m)
@@ -220,8 +220,8 @@ def count_ranks(pair: EvaluationPair, cost: Array) -> Row:
 
 
 def count_ranks_after(pair: EvaluationPair, cost: Array, agreed: Array | None) -> Row:
-    """`first`, `first_single` and `five` as of `count_ranks`, each with `_after`: of a ranking in which the matches (M, 2) that
-    one transform explains come first, and the descriptor ranks what they leave; nan where that was not run."""
+    """Count `first`, `first_single` and `five` as of `count_ranks`, each with `_after`: of a ranking in which the matches (M, 2)
+    that one transform explains come first, and the descriptor ranks what they leave; nan where that was not run."""
     names = ("first", "first_single", "five")
     if agreed is None:
         return {f"{name}_after": np.nan for name in names}
@@ -232,23 +232,23 @@ def count_ranks_after(pair: EvaluationPair, cost: Array, agreed: Array | None) -
 
 
 def measure_pose_error(pose: Sim3, truth: Sim3, anchor: Array) -> tuple[float, float, float]:
-    """Error at a point of b: horizontal and vertical, m, and of the yaw, degrees."""
+    """Measure the error at a point of b: horizontal and vertical, m, and of the yaw, degrees."""
     off = (pose.apply(anchor[None]) - truth.apply(anchor[None]))[0]
     turned = abs((pose.yaw - truth.yaw + np.pi) % (2 * np.pi) - np.pi)
     return float(np.hypot(*off[:2])), float(abs(off[2])), float(np.degrees(turned))
 
 
 def is_within(error: tuple[float, float, float], flat: bool, limits: tuple[float, float]) -> bool:
-    """Is a pose right? A slice says nothing of its height, but must lie on its storey (`metrics.is_pose_right`)."""
+    """Return whether a pose is right. A slice says nothing of its height, but must lie on its storey
+    (`metrics.is_pose_right`)."""
     return is_pose_right(error, flat, limits)
 
 
 def count_merges(pair: EvaluationPair, verdict: Mapping[str, Any], floors: Sequence[Array] = ()) -> Row:
-    """Of a pair: `near`, `fine`: the best pose is right within 0.5 m and 5 degrees, 0.1 m and 1 degree; `merged`: believed and
-    near; `false`: believed and not; `refused`: right but not believed; `mergeable`: the maps have something in common;
+    """Count, of a pair: `near`, `fine`: the best pose is right within 0.5 m and 5 degrees, 0.1 m and 1 degree; `merged`: believed
+    and near; `false`: believed and not; `refused`: right but not believed; `mergeable`: the maps have something in common;
     `every_room`: it puts, not bent, every shared room within 0.1 m of its true place; `find_rooms_near`: so many of the
-    `rooms_shared`;
-    `place`: where it puts the middle of what both saw, m, and its yaw, degrees.
+    `rooms_shared`; `place`: where it puts the middle of what both saw, m, and its yaw, degrees.
 
     Args:
         floors: (n, 3) points of b on the floor of each shared room.

@@ -70,7 +70,7 @@ def commit() -> str:
 
 
 def list_blocks(text: str) -> list[str]:
-    """Versions of the blocks of a page."""
+    """List the versions of the blocks of a page."""
     return re.findall(r"(?m)^## \d{4}-\d\d-\d\d \d\d:\d\d UTC: version (\S+?)(?:,|$)", text)
 
 
@@ -106,7 +106,7 @@ def append_text(page: Path, text: str) -> None:
 
 
 def parse_public_sets(values: Sequence[str]) -> list[tuple[str, Path]]:
-    """Sources and folders of SOURCE=FOLDER.
+    """Parse the sources and folders of SOURCE=FOLDER.
 
     Raises:
         InputError: not of this form, or no such folder.
@@ -137,7 +137,7 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def measure_and_append(arguments: Sequence[str]) -> None:
-    """The whole run."""
+    """Make the whole run."""
     options = parse_arguments(arguments)
     page = options.page or (None if options.small else PAGE)
     if page:

@@ -69,7 +69,7 @@ def rank_building_rooms(kind: str, seed: int, sensors: tuple[str, str]) -> list[
 
 
 def count_pair_ranks(pair: Pair, place: str) -> list[Row]:
-    """Counts of a pair's rooms, a row for each embedder; none where no room has a partner."""
+    """Return the counts of a pair's rooms, a row for each embedder; none where no room has a partner."""
     maps = [extract(cloud, voxel_size=0.1) for cloud in (pair.a, pair.b)]
     judged = build_evaluation_pair(pair, maps)
     if not len(judged.matches):
@@ -139,7 +139,7 @@ class SealedItem:
 
 
 def list_items(split: str, data: Path | None, public: Sequence[tuple[str, Path]], small: bool) -> list[SealedItem]:
-    """All that is measured, the longest first.
+    """List all that is measured, the longest first.
 
     Args:
         split: of the procedural buildings.
@@ -201,13 +201,13 @@ def _build_room_row(scan: Any, place: str) -> Row:
 
 
 def list_sealed_plans(data: Path) -> list[tuple[Path, str]]:
-    """Folders and names of the sealed line maps; a mall's hall takes minutes to scan, and is left for another time."""
+    """List the folders and names of the sealed line maps; a mall's hall takes minutes to scan, and is left for another time."""
     folder = data / SEALED_FOLDERS["utexas"][0]
     return [(folder, n) for n in list_plan_names(folder) if is_sealed("utexas", n)] if folder.is_dir() else []
 
 
 def _load_plan(folder: Path, name: str) -> tuple[str, Any]:
-    """Source of a plan and the building that is made of it.
+    """Return the source of a plan and the building that is made of it.
 
     Raises:
         InputError: it can't be read.
@@ -263,7 +263,7 @@ def measure_public_pairs(source: str, folder: Path) -> list[Row]:
 
 
 def measure_robot_pairs(data: Path) -> list[Row]:
-    """Halves of each sealed grid of known scale, and halves of grids of two places."""
+    """Measure halves of each sealed grid of known scale, and halves of grids of two places."""
     halves, out = [], []
     for number, (name, flats) in enumerate(load_robot_halves(data).items()):
         if isinstance(flats, str):
@@ -381,7 +381,7 @@ def iter_room_table(rooms: Sequence[Row]) -> Iterator[str]:
 
 
 def iter_merge_table(rows: Sequence[Row]) -> Iterator[str]:
-    """Merges by kind of pair."""
+    """Yield merges by kind of pair."""
     yield "| merges | pairs | buildings | right | 0.1 m, 1° | right and believed | believed, wrong | such buildings, 95 % |"
     yield "|" + "---|" * 8
     for group, some in group_by_key(rows, classify_merge):
@@ -394,7 +394,7 @@ def iter_merge_table(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def group_by_key(rows: Sequence[Row], key: Callable[[Row], str]) -> list[tuple[str, list[Row]]]:
-    """Groups of rows in the order in which they come."""
+    """Group rows in the order in which they come."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         groups.setdefault(key(row), []).append(row)

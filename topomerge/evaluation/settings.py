@@ -146,7 +146,7 @@ def check(settings: Evaluation) -> None:
 
 
 def iter_variants(settings: Evaluation) -> Iterator[Variant]:
-    """Everything that describes rooms: each descriptor at each k (with k = 0 there is one context), then each run."""
+    """Yield everything that describes rooms: each descriptor at each k (with k = 0 there is one context), then each run."""
     for name in settings.only:
         for k in settings.k:
             for how in settings.context if k else settings.context[:1]:

@@ -137,8 +137,8 @@ def compute_gain(rows: Sequence[Row], others: Sequence[Row], metric: str, rounds
 
 
 def _estimate_interval(counts: Mapping[Any, Array], rounds: int, measured: Callable[[Any], Array]) -> tuple[int, float, float]:
-    """Buildings in which anything was counted, and the ends of the interval over them: of draws, or of fewer than eight their
-    range.
+    """Estimate the number of buildings in which anything was counted, and the ends of the interval over them: of draws, or of
+    fewer than eight their range.
 
     Args:
         counts: (buildings,) each.
@@ -159,8 +159,8 @@ def _estimate_interval(counts: Mapping[Any, Array], rounds: int, measured: Calla
 
 
 def count_hit_buildings(rows: Sequence[Row], count: str) -> tuple[int, int, float, float]:
-    """Buildings with a row that has any of a count, all buildings, and the ends of the exact 95 % interval of their share: for
-    what is rare, as wrong merges are."""
+    """Count the buildings with a row that has any of a count, all buildings, and the ends of the exact 95 % interval of their
+    share: for what is rare, as wrong merges are."""
     buildings = {r["building"] for r in rows}
     hit = {r["building"] for r in rows if r[count]}
     return len(hit), len(buildings), *compute_exact_interval(len(hit), len(buildings))
@@ -227,7 +227,7 @@ def _escape_latex(text: str) -> str:
 
 
 def format_value(v: Value, interval: bool = True) -> str:
-    """0.52 [0.47, 0.58], or of fewer than eight buildings 0.52, 0.47–0.58 (4 buildings); – where nothing was counted."""
+    """Return 0.52 [0.47, 0.58], or of fewer than eight buildings 0.52, 0.47–0.58 (4 buildings); – where nothing was counted."""
     if not np.isfinite(v.value):
         return "–"
     if not interval or v.counted < 2:
@@ -279,7 +279,8 @@ def group_by_variant(rows: Sequence[Row], key: Callable[[Row], str] = lambda r: 
 
 
 def tabulate_matching(matches: Sequence[Row], settings: Evaluation) -> Table:
-    """Precision, recall and F1 of each descriptor and method where maps share rooms; how many matches there are where not."""
+    """Tabulate precision, recall and F1 of each descriptor and method where maps share rooms; how many matches there are where
+    not."""
     rows = []
     for name, variant_rows in group_by_variant(matches).items():
         for method, these in group_by_variant(variant_rows, lambda r: r["method"]).items():
@@ -294,7 +295,7 @@ def tabulate_matching(matches: Sequence[Row], settings: Evaluation) -> Table:
 
 
 def tabulate_methods(matches: Sequence[Row], settings: Evaluation) -> Table:
-    """Precision, recall and F1 of the methods beside each other, a line a descriptor: the thesis' table, with recall."""
+    """Tabulate precision, recall and F1 of the methods beside each other, a line a descriptor: the thesis' table, with recall."""
     methods = list(dict.fromkeys(m["method"] for m in matches))
     rows = []
     for name, variant_rows in group_by_variant(split_shared(matches)[0]).items():
@@ -314,7 +315,7 @@ def split_shared(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
 
 
 def tabulate_groups(ranks: Sequence[Row], matches: Sequence[Row], key: str, settings: Evaluation) -> Table:
-    """recall@1, and F1 of each method, for each group and descriptor without context or trained one."""
+    """Tabulate recall@1, and F1 of each method, for each group and descriptor without context or trained one."""
     rows = []
     matches_by_group = group_by(matches, key)
     for group, group_rows in group_by(ranks, key).items():
@@ -335,7 +336,7 @@ def _list_methods(matches: Sequence[Row]) -> list[str]:
 
 
 def iter_long_rows(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row], settings: Evaluation) -> Iterator[Row]:
-    """Every metric of every group, one a row, for other tools."""
+    """Yield every metric of every group, one a row, for other tools."""
     for rows, metrics in ((ranks, (*RANKING, *AFTER)), (matches, MATCHING), (merges, (*MERGING, "false"))):
         for (variant, method), variant_rows in _group_by_variant_and_method(rows).items():
             for key in ("all", *BY):
@@ -355,7 +356,7 @@ def _group_by_variant_and_method(rows: Sequence[Row]) -> dict[tuple[str, str], l
 
 
 def write_csv(rows: Sequence[Row], path: Path) -> None:
-    """Rows with the same keys; lists are left out."""
+    """Write rows with the same keys; lists are left out."""
     if not rows:
         return
     names = [n for n in rows[0] if not isinstance(rows[0][n], list)]

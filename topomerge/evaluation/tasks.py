@@ -104,13 +104,13 @@ class EvaluationModule(Protocol):
         """Measure what is missing; all rows."""
 
     def tabulate(self, rows: Sequence[Row], settings: Any) -> dict[str, str]:
-        """Tables by the name of their block."""
+        """Return the tables by the name of their block."""
 
     def list_inputs(self, settings: Any) -> list[str]:
         """Return names of what is measured."""
 
     def compute_headline(self, rows: Sequence[Row], settings: Any) -> dict[str, tuple[str, str]]:
-        """Figures for the README: name -> (value, of what)."""
+        """Compute the figures for the README: name -> (value, of what)."""
 
 
 @dataclass(frozen=True)
@@ -356,7 +356,7 @@ def convert_to_upright(matrix: Array, pair: GridPair) -> Sim3 | None:
 
 @cache
 def map_other_buildings(split: str) -> dict[tuple[int, int], str]:
-    """Of pairs of two buildings, by set and number: the name of the second one, which the files do not tell."""
+    """Return, of pairs of two buildings, by set and number, the name of the second one, which the files do not tell."""
     items, _ = draw_grid_items(read_recipe(split).data)
     out = {}
     for k in items:

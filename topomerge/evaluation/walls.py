@@ -94,7 +94,7 @@ def score_walls(scan: Scan, map: TopometricMap) -> Row:
 
 
 def measure_storey(scan: Scan, map: TopometricMap, structure: Any, level: int) -> dict[str, Array]:
-    """Of each place on our faces and on the true ones, and of each door, what is measured."""
+    """Return what is measured of each place on our faces and on the true ones, and of each door."""
     truth = scan.truth
     assert truth is not None
     floor = float(truth.floors[level])
@@ -238,7 +238,7 @@ def check_openings(scan: Scan, map: TopometricMap, structure: Any, floor: float)
 def measure_overlaps(
     scan: Scan, map: TopometricMap, structure: Any, true: list[shapely.Polygon], floor: float
 ) -> dict[str, Array]:
-    """(n,) IoU of each visited room with the outline, and with the floor, that overlaps it most."""
+    """Measure the (n,) IoU of each visited room with the outline, and with the floor, that overlaps it most."""
     from topomerge.structure.floors import build_floor_polygons
 
     out = {}

@@ -111,9 +111,9 @@ def add_walked_doors(map: TopometricMap, places: Array) -> tuple[TopometricMap, 
 
 
 def _find_shut_door(map: TopometricMap, places: Array, strange: Sequence[Crossing]) -> Array:
-    """EDGE_DTYPE, one shut door or none: where all changes of rooms through walls are, if that is one thin place away from other
-    doors and the way is on floors everywhere. A way that is of another building, or drifted, leads through walls elsewhere, too;
-    a wrong door is worse than a missing one."""
+    """Return, as EDGE_DTYPE, one shut door or none: where all changes of rooms through walls are, if that is one thin place away
+    from other doors and the way is on floors everywhere. A way that is of another building, or drifted, leads through walls
+    elsewhere, too; a wrong door is worse than a missing one."""
     none = np.zeros(0, EDGE_DTYPE)
     if not strange or np.mean(find_rooms_under(map, _select_finite(places)) >= 0) < ON_FLOORS:
         return none
@@ -138,8 +138,8 @@ def _find_shut_door(map: TopometricMap, places: Array, strange: Sequence[Crossin
 
 
 def find_room_changes(map: TopometricMap, places: Array) -> list[Crossing]:
-    """Rooms (the smaller number first) between which a sensor was carried, with the last place in the one and the first in the
-    other, m. Places above no floor are passed over; a way ends where the next place is farther than `WAY_STEP`."""
+    """Find the rooms (the smaller number first) between which a sensor was carried, with the last place in the one and the first
+    in the other, m. Places above no floor are passed over; a way ends where the next place is farther than `WAY_STEP`."""
     places = _select_finite(places)
     room = find_rooms_under(map, places)
     changes = []
@@ -180,7 +180,7 @@ def _select_finite(places: Array) -> Array:
 
 
 def _find_edge_at(edges: Array, rooms: tuple[int, int], place: Array) -> int:
-    """Row of the edge between two rooms that is nearest to a place, within reach; -1 none."""
+    """Return the row of the edge between two rooms that is nearest to a place, within reach; -1 none."""
     own = np.flatnonzero((np.sort(edges["rooms"], axis=1) == rooms).all(axis=1))
     if not len(own):
         return -1

@@ -38,7 +38,8 @@ def compute_cell_means(grid: VoxelGrid) -> Array:
 
 
 def add_means(grid: VoxelGrid, points: Array, counts: Array | None = None) -> VoxelGrid:
-    """The grid with the property ``offset`` of points (N, 3), m, that each stand for so many points; others are left out."""
+    """Return the grid with the property ``offset`` of points (N, 3), m, that each stand for so many points; others are left
+    out."""
     points = np.asarray(points, np.float64)
     parts = [grid.find_rows(grid.locate(points[k : k + LOCATED])) for k in range(0, len(points), LOCATED)]  # several copies each
     rows = np.concatenate(parts) if parts else np.zeros(0, np.int64)
@@ -162,7 +163,7 @@ def label_groups(cells: Array, block: int, least: int = 1) -> Array:
 
 
 def _squeeze_keys(keys: Array) -> Array:
-    """Numbers from 1, in the same order, of which those stay neighbours that were: gaps take no more than one."""
+    """Return numbers from 1, in the same order, of which those stay neighbours that were: gaps take no more than one."""
     values, inverse = np.unique(keys, return_inverse=True)
     steps = np.minimum(np.diff(values, prepend=values[0] - 1), 2)
     return np.asarray(np.cumsum(steps)[inverse.ravel()])
@@ -178,7 +179,7 @@ def _is_not_stray(cells: Array, edge: float) -> Array:
 
 
 def _columns(cells: Array) -> float:
-    """Columns of the rectangle around cells, with the margin that a plan has."""
+    """Count the columns of the rectangle around cells, with the margin that a plan has."""
     size = np.ptp(cells[:, :2], axis=0) + 1 + 2 * PLACE_MARGIN
     return float(size[0]) * float(size[1])
 
@@ -204,7 +205,8 @@ def _count_neighbours(grid: VoxelGrid) -> Array:
 
 
 def coarsen_until_dense(grid: VoxelGrid, neighbours: float, warnings: list[str]) -> VoxelGrid:
-    """The grid with cells so large that surfaces hold together: doubled until the median cell has as many neighbours (of 26).
+    """Return the grid with cells so large that surfaces hold together: doubled until the median cell has as many neighbours (of
+    26).
 
     Cells that would be too large to find doors are not made.
 

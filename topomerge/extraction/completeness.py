@@ -62,7 +62,7 @@ def measure_completeness(grid: VoxelGrid, navigable: VoxelGrid, label: Array, co
 
 
 def _build_wall_kernel(edge: float, body: float) -> Kernel:
-    """Where the wall beside the outline of a floor may stand."""
+    """Build the kernel of where the wall beside the outline of a floor may stand."""
     reach = int(np.ceil((body / 2 + WALL_DISTANCE) / edge))
     steps = np.arange(-reach, reach + 1)
     heights = np.arange(int(WALL_SIGHT[0] / edge), int(WALL_SIGHT[1] / edge) + 1)

@@ -102,7 +102,7 @@ def _build_ball(radius: float, axes: int, edge: float, with_origin: bool) -> Ker
 
 
 def _count_layers(height: float, edge: float) -> int:
-    """Cells that it takes to cover a length: sizes are rounded up, so that a body never fits where it should not."""
+    """Count the cells that it takes to cover a length: sizes are rounded up, so that a body never fits where it should not."""
     if not (edge > 0 and 0 < height < np.inf):
         raise ValueError(f"sizes of a kernel must be above 0 m, not {height} with an edge of {edge}")
     return int(np.ceil(height / edge - LENGTH_SLACK))

@@ -117,7 +117,7 @@ def compute_inputs(plan: Array, shown: Array) -> Array:
 
 
 def _find_shown_doors(storeys: Sequence[SegmentedStorey], walls: StoreyWalls) -> dict[Pair, float]:
-    """Log odds of the surest doorway that walls show between each two segments, none below 0."""
+    """Return the log odds of the surest doorway that walls show between each two segments, none below 0."""
     edges, first = [np.zeros(0, EDGE_DTYPE)], 0
     for storey in storeys:
         edges.append(_edges_of(storey, first))
@@ -132,7 +132,7 @@ def _find_shown_doors(storeys: Sequence[SegmentedStorey], walls: StoreyWalls) ->
 
 
 def _edges_of(storey: SegmentedStorey, first: int) -> Array:
-    """EDGE_DTYPE of a storey's passages, between segments numbered from `first` on."""
+    """Return the EDGE_DTYPE of a storey's passages, between segments numbered from `first` on."""
     out = np.zeros(len(storey.passages), EDGE_DTYPE)
     if not len(out):
         return out

@@ -100,13 +100,13 @@ def fit_patches(points: Array) -> Array:
 
 
 def _sample_points(points: Array) -> Array:
-    """Every n-th point, float64, without what is not finite."""
+    """Return every n-th point, float64, without what is not finite."""
     sample = np.asarray(points[:: max(len(points) // SAMPLE, 1)], np.float64)
     return sample[np.isfinite(sample).all(axis=1)]
 
 
 def _fit_planes(points: Array, edge: float) -> Array:
-    """The normals of the planes in cubes of one edge length, m; points lie around the origin."""
+    """Return the normals of the planes in cubes of one edge length, m; points lie around the origin."""
     sums = sum_in_cubes(points, edge)
     sums = sums[sums[:, 0] >= LEAST_POINTS]
     moments = sums[:, 1:] / sums[:, :1]
@@ -156,7 +156,7 @@ def _refine_up(normals: Array, up: Array) -> Array:
 
 
 def _measure_wall_lean(normals: Array, up: Array, tilt: float) -> _Wall:
-    """How far the walls lean that would lean with a cloud that is tilted to a direction."""
+    """Measure how far the walls lean that would lean with a cloud that is tilted to a direction."""
     side = up[:2] / np.linalg.norm(up[:2])
     towards = normals[:, :2] @ side
     steep = np.sin(np.radians(WALL_REACH + tilt))
@@ -204,7 +204,8 @@ class LevelledChunks:
             yield self._level(chunk)
 
     def _is_settled(self, held: Sequence[PointCloud]) -> bool:
-        """Do the first chunks show enough floors, ceilings and walls to say which way is up, or are they all that is held?"""
+        """Return whether the first chunks show enough floors, ceilings and walls to say which way is up, or are all that is
+        held."""
         points = np.concatenate([_sample_chunk(chunk) for chunk in held])
         low, high = np.nanquantile(points[:, 2], SLICE_QUANTILES) if len(points) else (0.0, 0.0)
         normals = fit_patches(points) if high - low > SLICE_HEIGHT else np.zeros((0, 3))
@@ -262,5 +263,5 @@ def transform_grid(grid: VoxelGrid, matrix: Array) -> VoxelGrid:
 
 
 def _sample_chunk(chunk: PointCloud) -> Array:
-    """Some points of a chunk in the file's coordinates, float64."""
+    """Sample some points of a chunk in the file's coordinates, float64."""
     return np.asarray(chunk.points[:: max(len(chunk) // SAMPLE, 1)] + chunk.shift, np.float64)

@@ -13,7 +13,7 @@ from topomerge.types import Array, VoxelGrid
 
 
 def label_components(grid: VoxelGrid, neighbourhood: Kernel | None = None, group: Array | None = None) -> Array:
-    """Component of each cell: two cells share one if a path of neighbours joins them (seeds 2.3.3).
+    """Return the component of each cell: two cells share one if a path of neighbours joins them (seeds 2.3.3).
 
     Args:
         grid: the cells.
@@ -29,7 +29,7 @@ def label_components(grid: VoxelGrid, neighbourhood: Kernel | None = None, group
 
 
 def spread_labels(grid: VoxelGrid, labels: Array, steps: int | None = None, neighbourhood: Kernel | None = None) -> Array:
-    """Labels of cells that have none (-1) taken from the nearest labelled cell, counted in steps between neighbours.
+    """Give cells that have none (-1) the label of the nearest labelled cell, counted in steps between neighbours.
 
     Args:
         steps: how far labels may travel; no limit by default.
@@ -133,7 +133,7 @@ def bridge_gaps(grid: VoxelGrid, standing: VoxelGrid, stick: Kernel, reach: floa
 
 
 def _find_steps(values: Array) -> Array:
-    """Where the sorted values change."""
+    """Return where the sorted values change."""
     return np.flatnonzero(np.diff(np.sort(values))) + 1
 
 
@@ -158,8 +158,8 @@ def _find_closing_columns(columns: Array, radius: float) -> Array:
 
 
 def _near(mask: Array, radius: float) -> Array:
-    """Pixels at most `radius` pixels from one of the mask: the lines of a disc laid over each other, which for a few pixels is
-    many times faster than a distance transform."""
+    """Return the pixels at most `radius` pixels from one of the mask: the lines of a disc laid over each other, which for a few
+    pixels is many times faster than a distance transform."""
     reach = int(radius)
     wider, widest = mask.copy(), [mask]  # pixels with one of the mask at most so far in their row
     for step in range(1, reach + 1):

@@ -80,22 +80,22 @@ def select_floor_components(grid: VoxelGrid, occupied: VoxelGrid | None = None) 
 
 
 def _count_columns(grid: VoxelGrid, component: Array, count: int) -> Array:
-    """Number of columns (x, y) that each component covers."""
+    """Return the number of columns (x, y) that each component covers."""
     columns = grid.shape[0] * grid.shape[1]
     keys = np.unique((component * grid.shape[0] + grid.cells[:, 0]) * grid.shape[1] + grid.cells[:, 1])
     return np.bincount(keys // columns, minlength=count)
 
 
 def _has_ceiling(occupied: VoxelGrid, cells: Array) -> bool:
-    """Was something seen above much of a floor (k, 3)?"""
+    """Return whether something was seen above much of a floor (k, 3)."""
     start, far = max(int(CEILING_FROM / occupied.edge), 1), int(HIGHEST_CEILING / occupied.edge)
     above = find_first_occupied(*occupied._bricks, np.ascontiguousarray(cells, np.int64), start, 1, far)
     return bool((above > 0).mean() > COVERED_SHARE)
 
 
 def _is_on_furniture(top: Array, floors: Array, below: cKDTree, reach: float) -> bool:
-    """Do the cells `top` (k, 3) lie a table's height above the floor around them, at most `reach` away? All in m; `below`
-    searches the floors' plan.
+    """Return whether the cells `top` (k, 3) lie a table's height above the floor around them, at most `reach` away. All in m;
+    `below` searches the floors' plan.
 
     Only a floor that is larger than the top counts: it is the one that goes around it.
     """
@@ -126,8 +126,8 @@ OFF_LEVEL = 2  # cells: nearer ones are of the floor itself
 
 
 def has_floor(grid: VoxelGrid, navigable: VoxelGrid, body_height: float) -> bool:
-    """Was a floor seen? Without one, what one could stand on is the upper side of the ceiling: it has nothing above, and walls
-    hang from it, or most columns begin high over the lowest ones around."""
+    """Return whether a floor was seen. Without one, what one could stand on is the upper side of the ceiling: it has nothing
+    above, and walls hang from it, or most columns begin high over the lowest ones around."""
     lowest = select_lowest_of_column(navigable)
     covered = (measure_floor_to_ceiling(grid, navigable, body_height, lowest) > 0).mean()
     if covered > FLOOR_COVERED_SHARE:
@@ -150,13 +150,13 @@ def _measure_above_floor(grid: VoxelGrid, floor: Array) -> Array:
 
 
 def has_ceiling(grid: VoxelGrid) -> bool:
-    """Does enough lie so high above the lowest points that it may be a ceiling?"""
+    """Return whether enough lies so high above the lowest points that it may be a ceiling."""
     return bool(_find_under_ceiling(grid)[0].sum() * grid.edge**2 >= LEAST_CEILING_AREA)
 
 
 def add_assumed_floor(grid: VoxelGrid, rays: tuple[Array, Array] | None = None) -> VoxelGrid:
-    """The grid with a floor under whatever seems to be a ceiling: at the lowest points around, or so far below the ceiling that
-    one can stand; where the places of the sensor are known, as far below them as it is usually carried.
+    """Return the grid with a floor under whatever seems to be a ceiling: at the lowest points around, or so far below the ceiling
+    that one can stand; where the places of the sensor are known, as far below them as it is usually carried.
 
     Args:
         rays: (k, 3) places of the sensor and (k, 3) of what it saw, m, where they are known.
@@ -198,7 +198,7 @@ def _find_under_ceiling(grid: VoxelGrid, overhead: float = OVERHEAD) -> tuple[Ar
 
 
 def _add_floor_cells(grid: VoxelGrid, columns: Array, level: int) -> VoxelGrid:
-    """The grid with a floor at `level` in these columns; a level below the grid moves its origin."""
+    """Add a floor at `level` to the grid in these columns; a level below the grid moves its origin."""
     down = max(-level, 0)
     shift = np.array([0, 0, down])
     floor = np.column_stack([columns, np.full(len(columns), level + down)])
@@ -217,7 +217,8 @@ LARGEST_VOLUME = 400_000_000  # free cells
 
 
 def find_free_space(scan: Scan, navigable: VoxelGrid, range: float) -> VoxelGrid | None:
-    """Cells that are empty: by the file, crossed by the sensor's rays, or where its places are unknown, seen through from views.
+    """Find the cells that are empty: by the file, crossed by the sensor's rays, or where its places are unknown, seen through
+    from views.
 
     Args:
         scan: occupied cells, with the rays and the free cells that its file knows.
@@ -240,8 +241,8 @@ def find_free_space(scan: Scan, navigable: VoxelGrid, range: float) -> VoxelGrid
 
 
 def add_crossed_cells(scan: Scan) -> Scan:
-    """The scan with the cells that its rays crossed, twice as long as those of its grid, where the places of the sensor are known
-    and the volume is not too large to be carved."""
+    """Add to the scan the cells that its rays crossed, twice as long as those of its grid, where the places of the sensor are
+    known and the volume is not too large to be carved."""
     if scan.rays is None or scan.crossed is not None:
         return scan
     crossed = _allocate_crossed(scan.grid)
@@ -295,7 +296,7 @@ def select_tile_views(grid: VoxelGrid, navigable: VoxelGrid, spacing: float) -> 
 
 
 def _select_tile_maxima(grid: VoxelGrid, distance: Array, spacing: float) -> Array:
-    """Ascending rows of the cell of each tile with the largest distance."""
+    """Return the ascending rows of the cell of each tile with the largest distance."""
     size = max(round(spacing / grid.edge), 1)
     layer = max(round(2.0 / grid.edge), 1)
     tile = grid.cells // (size, size, layer)
@@ -321,7 +322,7 @@ PLAN_ADVICE = "check the map's resolution, its thresholds and negate, and that i
 
 
 def compute_navigable_volume(scan: Scan, p: SharedParameters) -> tuple[Scan, VoxelGrid]:
-    """Standing room, joined upwards over steps, in connected parts (seeds 2.3).
+    """Compute the standing room, joined upwards over steps, in connected parts (seeds 2.3).
 
     Returns:
         The scan, with an assumed floor where none was seen and the parameters allow it; the navigable cells.
@@ -343,7 +344,7 @@ def compute_navigable_volume(scan: Scan, p: SharedParameters) -> tuple[Scan, Vox
 
 
 def _compute_navigable(grid: VoxelGrid, p: SharedParameters, places: Array = NOWHERE) -> VoxelGrid:
-    """The steps of 2.3 in their order; those between them are beyond the thesis (docs/adr/0003)."""
+    """Take the steps of 2.3 in their order; those between them are beyond the thesis (docs/adr/0003)."""
     body = _build_stick_kernel(grid.edge, p)
     # Points that fly in door openings shut nine of ten doors of simulated scans (docs/adr/0003).
     if p.noise:

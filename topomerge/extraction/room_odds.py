@@ -164,7 +164,7 @@ def _find_rooms_below(map: TopometricMap, places: Array) -> Array:
 
 
 def _iter_storey_floors(map: TopometricMap) -> Iterator[_StoreyFloor]:
-    """The storeys that have rooms, lowest first."""
+    """Yield the storeys that have rooms, lowest first."""
     factor = max(round(SIGHT_CELL / map.grid.edge), 1)
     rows = select_lowest_of_column(map.navigable)
     rows = rows[map.navigable_room[rows] >= 0]
@@ -191,7 +191,7 @@ def _iter_storey_floors(map: TopometricMap) -> Iterator[_StoreyFloor]:
 
 
 def _iter_windows(storey: _StoreyFloor) -> Iterator[tuple[int, tuple[slice, slice]]]:
-    """Each room of a storey with the part of the raster from where others look into it."""
+    """Yield each room of a storey with the part of the raster from where others look into it."""
     pad = round(VIEWPOINTS / storey.edge)
     for room, box in enumerate(ndimage.find_objects(storey.room + 1)):
         if box is not None:
@@ -236,7 +236,8 @@ def _find_box(mask: Array, margin: int) -> tuple[tuple[slice, slice], Array]:
 
 
 def measure_thin_share(own: Array, edge: float) -> float:
-    """Share of a room's columns (nx, ny) that are farther than `THIN_REACH` from what is `THIN_HALF_WIDTH` from its outline."""
+    """Measure the share of a room's columns (nx, ny) that are farther than `THIN_REACH` from what is `THIN_HALF_WIDTH` from its
+    outline."""
     wide = edt.edt(np.pad(own, 1).view(np.uint8), parallel=1)[1:-1, 1:-1] * edge >= THIN_HALF_WIDTH
     if not wide.any():
         return 1.0
@@ -257,7 +258,7 @@ class _Hulls:
         self.hulls = {n: shapely.convex_hull(shapely.linestrings(ring)) for n, ring in rings.items()}
 
     def measure_share_between(self, room: int) -> float:
-        """Of a room's columns, those within the convex hull of all other rooms."""
+        """Measure the share of a room's columns within the convex hull of all other rooms."""
         others = [hull for n, hull in self.hulls.items() if n != room]
         if not others:
             return 0.0

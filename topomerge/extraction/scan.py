@@ -129,7 +129,7 @@ def _build_cloud(points: Array) -> PointCloud:
 
 @contextmanager
 def add_reasons(warnings: Sequence[str]) -> Iterator[None]:
-    """Adds to an error of the input what looked wrong before it: that is often the reason."""
+    """Add to an error of the input what looked wrong before it: that is often the reason."""
     try:
         yield
     except InputError as error:
@@ -182,7 +182,7 @@ class _Chunks:
 
 
 def _select_rays(cloud: PointCloud, poses: Array, pose_of: Array) -> tuple[Array, Array]:
-    """Places of the sensor and of what it saw, m: an even selection of the points whose pose is known."""
+    """Return places of the sensor and of what it saw, m: an even selection of the points whose pose is known."""
     rows = np.arange(0, len(cloud), max(len(cloud) // MOST_RAYS, 1))
     rows = rows[pose_of[rows] >= 0]
     return poses[pose_of[rows], :3, 3], cloud.points[rows] + cloud.shift

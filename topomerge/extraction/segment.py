@@ -208,7 +208,7 @@ def log_odds(probability: Array) -> Array:
 
 
 def _coarsen(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, factor: int) -> tuple[VoxelGrid, VoxelGrid, Array]:
-    """Both grids with cells `factor` times as long, and the storey of each navigable one: the lowest of those in it."""
+    """Return both grids with cells `factor` times as long, and the storey of each navigable one: the lowest of those in it."""
     if factor == 1:
         return grid, navigable, storey
     coarse = navigable.coarsen(factor)
@@ -218,7 +218,7 @@ def _coarsen(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, factor: int) 
 
 
 def _is_upper_side(top: Array, below: Array) -> bool:
-    """Is a storey with nothing above it the ceiling of one below? A floor lies a slab above that."""
+    """Return whether a storey with nothing above it is the ceiling of one below. A floor lies a slab above that."""
     return bool(np.isnan(top["ceiling"]) and (np.abs(below["ceiling"] - top["floor"]) < THINNEST_SLAB).any())
 
 
@@ -256,7 +256,7 @@ class GrowingRooms:
         return self.queue[0][1]
 
     def merge(self, pair: Pair) -> None:
-        """The second becomes part of the first."""
+        """Make the second part of the first."""
         room, absorbed = pair
         del self.passages[pair], self.door_probability[pair]
         self.of_region[self.of_region == absorbed] = room

@@ -31,7 +31,7 @@ COLUMNS_AROUND = 0.3  # m
 
 
 def raise_slice(scan: Scan) -> Scan:
-    """A scan that is a slice gets walls over its columns, and a floor; any other stays as it is, but for the walls of a raised
+    """Give a scan that is a slice walls over its columns, and a floor; leave any other as it is, but for the walls of a raised
     plan, at which nobody needs to look closely.
 
     Raises:
@@ -47,7 +47,7 @@ def raise_slice(scan: Scan) -> Scan:
 
 
 def is_slice(grid: VoxelGrid) -> bool:
-    """Is the scan flat, but for single points?"""
+    """Return whether the scan is flat, but for single points."""
     if not len(grid):
         return False
     low, high = _measure_extent(grid)
@@ -55,7 +55,7 @@ def is_slice(grid: VoxelGrid) -> bool:
 
 
 def is_floor(grid: VoxelGrid) -> bool:
-    """Does what is flat fill areas, as a floor does, rather than lines, as the walls in a slice do?"""
+    """Return whether what is flat fills areas, as a floor does, rather than lines, as the walls in a slice do."""
     seen = np.zeros(grid.shape[:2], bool)
     seen[tuple(grid.cells[:, :2].T)] = True
     size = 2 * round(WALL_THICKNESS / 2 / grid.edge) + 1
@@ -65,7 +65,8 @@ def is_floor(grid: VoxelGrid) -> bool:
 
 
 def is_raised(grid: VoxelGrid) -> bool:
-    """Was the scan a plan, of which every wall was raised alike? Then there are neither lintels nor leaves nor recesses."""
+    """Return whether the scan was a plan, of which every wall was raised alike. Then there are neither lintels nor leaves nor
+    recesses."""
     if not len(grid):
         return False
     low, high = _measure_extent(grid)
@@ -86,7 +87,7 @@ def _measure_extent(grid: VoxelGrid) -> tuple[int, int]:
 
 
 def _extrude_slice(grid: VoxelGrid, rays: tuple[Array, Array] | None) -> VoxelGrid:
-    """Walls over the columns of a slice, and a floor where the sensor looked, or where walls are around.
+    """Build walls over the columns of a slice, and a floor where the sensor looked, or where walls are around.
 
     Args:
         grid: occupied cells.

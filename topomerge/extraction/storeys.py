@@ -24,8 +24,8 @@ LEVEL_SHARE = 0.5  # of a floor that lies within a cell of its level; flights, w
 
 
 def find_storeys(navigable: VoxelGrid, floor_to_ceiling: Array) -> tuple[Array, Array]:
-    """Peaks of the height histogram of the floor, at least 1.9 m apart. What hangs below the ceiling of the storey below, and is
-    not level, is none: stairs with a landing in a hall through two storeys, and what glass mirrors.
+    """Return the peaks of the height histogram of the floor, at least 1.9 m apart. What hangs below the ceiling of the storey
+    below, and is not level, is none: stairs with a landing in a hall through two storeys, and what glass mirrors.
 
     Args:
         navigable: the navigable volume.
@@ -76,8 +76,8 @@ def _find_stacked_level(navigable: VoxelGrid, lowest: Array, storey: Array, floo
 def _assign_storeys(
     navigable: VoxelGrid, lowest: Array, floors: list[int], floor_to_ceiling: Array
 ) -> tuple[Array, Array, Array]:
-    """The storeys of floors at these levels (ascending), the storey of each navigable cell, and how much of a storey's floor,
-    m2, lies at its level."""
+    """Return the storeys of floors at these levels (ascending), the storey of each navigable cell, and how much of a storey's
+    floor, m2, lies at its level."""
     halfway = (np.array(floors[:-1]) + np.array(floors[1:])) / 2
     cut = (np.abs(navigable.cells[lowest, 2] - halfway[:, None]) <= 1.5).sum(axis=1) * navigable.edge**2
     halfway += np.where(cut >= GALLERY_LEAST_AREA, HALF_LEVEL / navigable.edge, 0)  # half a level up lies a floor of its own
@@ -104,7 +104,8 @@ def measure_floor_to_ceiling(grid: VoxelGrid, navigable: VoxelGrid, body_height:
 
 
 def estimate_ceiling_height(above: Array) -> float:
-    """Median of the heights above a floor, 0 where less than a third of it has something above: lintels are no ceiling."""
+    """Return the median of the heights above a floor, 0 where less than a third of it has something above: lintels are no
+    ceiling."""
     seen = above[above > 0]
     return float(np.median(seen)) if len(seen) * 3 >= len(above) > 0 else 0.0
 

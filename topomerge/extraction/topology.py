@@ -77,7 +77,7 @@ def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceilin
 
 
 def _add_stairs(edges: Array, floor: Floor) -> None:
-    """Where the stairs of the given edges begin and end, and which of them are ramps.
+    """Add where the stairs of the given edges begin and end, and which of them are ramps.
 
     A stair is the connected part of the floor that lies on no storey's level and at which the two rooms meet.
     """
@@ -106,7 +106,7 @@ def _add_stairs(edges: Array, floor: Floor) -> None:
 
 
 def _measure_steepness(places: Array) -> float:
-    """Climb of a floor, m per m: the median over tiles of 0.6 m."""
+    """Measure the climb of a floor, m per m: the median over tiles of 0.6 m."""
     tile = np.floor(places[:, :2] / 0.6).astype(np.int64)
     _, of = np.unique(tile, axis=0, return_inverse=True)
     of = of.ravel()
@@ -128,7 +128,7 @@ def _select_distinct_doors(edges: list[tuple[Any, ...]]) -> list[tuple[Any, ...]
 def _edge(
     navigable: VoxelGrid, room: Array, rows: Array, storey_of_room: Array, floor_to_ceiling: Array, body: float
 ) -> tuple[Any, ...]:
-    """One row of EDGE_DTYPE from the cells (`rows`) of two rooms that touch."""
+    """Build one row of EDGE_DTYPE from the cells (`rows`) of two rooms that touch."""
     pair = np.unique(room[rows])
     cells = navigable.cells[rows]
     middle, along, span = _extent(_find_columns(cells))
@@ -155,7 +155,7 @@ def _edge(
 
 
 def _find_rows_under(navigable: VoxelGrid, middle: Array, contact: Array) -> Array:
-    """Rows of the navigable cells in the middle of a passage, at the height of the contact."""
+    """Return the rows of the navigable cells in the middle of a passage, at the height of the contact."""
     reach, rise = int(0.25 / navigable.edge), int(LEVEL_HEIGHT / navigable.edge)
     low = np.rint([*middle, contact[:, 2].mean()]).astype(np.int64) - (reach, reach, rise)
     window = np.argwhere(np.ones((2 * reach + 1, 2 * reach + 1, 2 * rise + 1), bool)) + low
@@ -172,7 +172,7 @@ def _find_columns(cells: Array) -> Array:
 
 
 def _extent(plan: Array) -> tuple[Array, Array, float]:
-    """Middle, direction and length (cells) of a strip of columns."""
+    """Return the middle, direction and length (cells) of a strip of columns."""
     middle = plan.mean(axis=0)
     along = np.array([1.0, 0.0])
     if len(plan) > 2:
@@ -181,7 +181,8 @@ def _extent(plan: Array) -> tuple[Array, Array, float]:
 
 
 def _find_narrowest_place(navigable: VoxelGrid, room: Array, pair: Array, contact: Array) -> tuple[Array, Array, float] | None:
-    """Middle, direction and width (cells) of the narrowest place on the widest way between two rooms, near their contact.
+    """Return the middle, direction and width (cells) of the narrowest place on the widest way between two rooms, near their
+    contact.
 
     Borders between clusters of views lie somewhere near a door, not in it; the floor itself is narrowest in the door.
     """
@@ -212,8 +213,8 @@ def _find_narrowest_place(navigable: VoxelGrid, room: Array, pair: Array, contac
 
 
 def _split_at_pass(clearance: Array, first: int, second: int) -> tuple[Array, Array, Array] | None:
-    """The parts of the first and of the second of two columns where the widest body passes that does not get from the one to the
-    other, and the part of both where the next smaller one does; None where none or all do."""
+    """Return the parts of the first and of the second of two columns where the widest body passes that does not get from the one
+    to the other, and the part of both where the next smaller one does; None where none or all do."""
     levels = np.unique(clearance[clearance > 0])[::-1]
 
     def parts_at(k: int) -> tuple[Array, int, int]:
@@ -258,7 +259,7 @@ def _find_middle_cell(first: Array, second: Array, way: Array) -> Array | None:
 
 
 def _across(free: Array, clearance: Array, saddle: Array, low: Array) -> tuple[Array, Array, float]:
-    """Middle, direction and width of the passage at `saddle`: from its nearest wall straight to the one opposite."""
+    """Return the middle, direction and width of the passage at `saddle`: from its nearest wall straight to the one opposite."""
     reach = int(np.ceil(clearance[tuple(saddle)])) + 1  # within which the nearest wall lies
     low_corner = np.maximum(saddle + 1 - reach, 0)
     around = np.pad(free, 1)[low_corner[0] : saddle[0] + reach + 2, low_corner[1] : saddle[1] + reach + 2]
@@ -388,8 +389,8 @@ def measure_room(
 
 
 def _measure_area(columns: Array, edge: float, body_width: float) -> float:
-    """m2 of floor: the navigable columns, the strip along the walls in which the body does not fit, and half a cell more along
-    the boundary, because a wall's face lies on average in the middle of its cell."""
+    """Measure the floor, m2: the navigable columns, the strip along the walls in which the body does not fit, and half a cell
+    more along the boundary, because a wall's face lies on average in the middle of its cell."""
     reach = int(np.ceil(body_width / edge - 1e-6)) // 2
     low = columns.min(axis=0) - reach - 1
     plan = np.zeros(columns.max(axis=0) - low + reach + 2, bool)

@@ -138,7 +138,7 @@ def _choose_origin(points: Array, shift: Array, edge: float) -> Array | None:
 
 
 def _unite_cells(parts: list[_Cells]) -> _Cells:
-    """Cells that may be in several parts, each once."""
+    """Return the cells, which may be in several parts, each once."""
     cells, counts, sums = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     cells, row = np.unique(cells, axis=0, return_inverse=True)
     total = (np.bincount(row.ravel(), weights, len(cells)).astype(np.int64) for weights in (counts, *sums.T))
@@ -155,8 +155,8 @@ def voxelise(
     warnings: list[str] | None = None,
     fine: LatticeCells | None = None,
 ) -> VoxelGrid:
-    """Occupied cells of a point cloud, with the properties ``count``, the number of points in each, and ``offset``, where in it
-    they lie on average (`cell_means`).
+    """Return the occupied cells of a point cloud, with the properties ``count``, the number of points in each, and ``offset``,
+    where in it they lie on average (`cell_means`).
 
     V_min is a multiple of the edge length, so the cells of a cloud do not depend on what else is in the file or on its order.
 

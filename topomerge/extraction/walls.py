@@ -90,7 +90,7 @@ def relabel_walls(walls: StoreyWalls, number: Array) -> StoreyWalls:
 
 
 def _faces_of(grid: VoxelGrid, rasters: RasterisedStoreys, storey: SegmentedStorey, first: int) -> list[tuple[object, ...]]:
-    """Rows of FACE_DTYPE of a storey's segments, which are numbered from `first` on."""
+    """Return the rows of FACE_DTYPE of a storey's segments, which are numbered from `first` on."""
     plan = storey.plan
     far, nearest = ndimage.distance_transform_edt(storey.segment < 0, return_indices=True)
     segment = np.where(far * plan.edge <= WALL_REACH, storey.segment[tuple(nearest)], -1)

@@ -244,7 +244,7 @@ class Bridge:
             self._tell_all([{"event": "full", "robots": [robot.name], "points": len(growing.points)}])
 
     def _find_pose(self, robot: RobotTopics, frame: str, when: float) -> FramePose | None:
-        """Where a frame of a robot stood, in that in which its map grows."""
+        """Return where a frame of a robot stood, in that in which its map grows."""
         growing, books = self.merger.get_robot(robot.name), self._own_books[robot.name]
         top = growing.frame if len(growing.poses) >= SETTLED else ""
         found = find_pose(books, frame or f"{robot.name} sensor", when, top)
@@ -287,7 +287,7 @@ def read_grid(message: Message) -> PointCloud:
 
 
 def _build_transform(parent: str, child: str, pose: Any) -> dict[str, Any]:
-    """A TransformStamped as JSON."""
+    """Build a TransformStamped as JSON."""
     x, y, z = pose.translation
     turn = {"x": 0.0, "y": 0.0, "z": float(np.sin(pose.yaw / 2)), "w": float(np.cos(pose.yaw / 2))}
     header = {"stamp": {"sec": int(time.time()), "nanosec": 0}, "frame_id": parent}

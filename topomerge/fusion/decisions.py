@@ -89,7 +89,7 @@ def _list_poses_near(a: Prepared, b: Prepared, start: Sim3) -> list[Sim3]:
 
 
 def _find_near_yaws(a: Prepared, b: Prepared, yaw: float) -> list[float]:
-    """Directions, rad, in which the walls of both maps are parallel, of those near a yaw."""
+    """Return the directions, rad, in which the walls of both maps are parallel, of those near a yaw."""
     walls = find_yaw_candidates(a.storeys[0].profile, b.storeys[0].profile) if a.storeys and b.storeys else []
     return [y for y in walls if abs(wrap_yaw(y - yaw)) <= SNAP_YAW]
 
@@ -153,7 +153,7 @@ def _get_map(map: TopometricMap | Prepared) -> TopometricMap:
 
 
 def _lay_on(yaw: float, place: Array, target: Array, height: float) -> Sim3:
-    """The pose that turns by a yaw and takes one place (2,) m to another."""
+    """Return the pose that turns by a yaw and takes one place (2,) m to another."""
     turned = Sim3(yaw).apply(np.array([[*place, 0.0]]))[0]
     return Sim3(yaw, (float(target[0] - turned[0]), float(target[1] - turned[1]), height))
 

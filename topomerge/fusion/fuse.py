@@ -126,7 +126,7 @@ class _Part:
 
 
 def _choose_edge(parts: Sequence[_Part]) -> float:
-    """m, of the joined cells: of the first map, unless another one's are clearly finer."""
+    """Choose the edge, m, of the joined cells: of the first map, unless another one's are clearly finer."""
     edge = parts[0].edge
     for part in parts:
         if not part.assumed and part.edge < ALIKE_EDGES * edge:
@@ -248,7 +248,7 @@ class _JoinedCells:
 def _build_joined(
     joined: _JoinedCells, placed_cells: Sequence[tuple[TopometricMap, PlacedCells]], parts: Sequence[PlacedPart], name: str
 ) -> TopometricMap:
-    """Rooms and narrowings of what was joined, and doors where rooms were cut anew.
+    """Build the map of rooms and narrowings of what was joined, and doors where rooms were cut anew.
 
     Args:
         placed_cells: the maps, with the cells that their floor fills.
@@ -294,7 +294,7 @@ def _build_free_space(joined: _JoinedCells, grid: VoxelGrid, base: Array) -> Vox
 
 
 def _carry_rooms(grid: VoxelGrid, label: Array, floors: Sequence[PartFloor], parts: Sequence[PlacedPart]) -> TopometricMap:
-    """The joined map with the rooms of its parts, and those that were cut anew; doors only of these.
+    """Return the joined map with the rooms of its parts, and those that were cut anew; doors only of these.
 
     Args:
         label: (n,) room of a part of each cell, numbered through all parts, -1 none.

@@ -118,7 +118,7 @@ class Extent:
 
     @classmethod
     def from_map(cls, map: TopometricMap) -> Extent:
-        """That of a map."""
+        """Return the extent of a map."""
         cells, edge = map.grid.cells, map.grid.edge
         return cls(map.source, len(cells), float(np.hypot(*np.ptp(cells[:, :2], axis=0))) * edge if len(cells) else 0.0, edge)
 
@@ -155,7 +155,7 @@ def check_units(one: TopometricMap | Extent, other: TopometricMap | Extent) -> N
 
 
 def check_pair(a: TopometricMap, b: TopometricMap, scale: str) -> None:
-    """All that is asked of two maps.
+    """Check all that is asked of two maps.
 
     Raises:
         InputError: a map without cells, one map twice, maps in different units.
@@ -187,7 +187,7 @@ def format_no_rooms_warning(name: str) -> str:
 
 
 def _estimate_storey_height(map: TopometricMap) -> float:
-    """m, median floor to ceiling; 0 where none was seen."""
+    """Estimate the median floor to ceiling, m; 0 where none was seen."""
     heights = map.storeys["ceiling"] - map.storeys["floor"]
     heights = heights[np.isfinite(heights)]
     return float(np.median(heights)) if len(heights) else 0.0

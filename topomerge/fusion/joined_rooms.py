@@ -279,7 +279,8 @@ def _find_unknown_borders(columns: _Columns, owner: Array, group: Array, part_of
 
 
 def _carry_over(columns: _Columns, floors: Sequence[PartFloor], member: Array, owner: Array) -> tuple[CutFloor, Array]:
-    """The floor on which the parts agree, without labels and completeness, and which area each area of the parts became, -1 none.
+    """Return the floor on which the parts agree, without labels and completeness, and which area each area of the parts became,
+    -1 none.
 
     Args:
         member: (n,) room of the joined map of each room of the parts, -1: it is cut anew.
@@ -305,7 +306,7 @@ def _carry_over(columns: _Columns, floors: Sequence[PartFloor], member: Array, o
 
 
 def _add_fresh_rooms(cut: CutFloor, columns: _Columns, owner: Array, parts: Sequence[PartRooms]) -> CutFloor:
-    """The floor with the rooms that are cut anew, where no column has an owner."""
+    """Add to the floor the rooms that are cut anew, where no column has an owner."""
     grid, navigable = columns.grid, columns.navigable
     redone = owner[columns.column] < 0
     near = np.zeros((grid.shape[0], grid.shape[1]), bool)

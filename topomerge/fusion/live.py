@@ -39,16 +39,18 @@ LONGEST_NAME = 60
 
 @dataclass(frozen=True)
 class LiveSettings:
-    """Args:
-    cell: m, of which one point is held.
-    most_points: of a robot; what comes later is left out, and told.
-    most_robots: at most.
-    step, turn: m and rad that a robot moves on between scans that are taken.
-    reach: m; what a scan shows farther away is left out.
-    least_points: of a robot, before its map is made.
-    join: probability from which on two maps are joined; `keep`: below which they are parted again.
-    open: … above which the next observation is named that would settle it.
-    moved: m; a join whose pose moves by more is another one.
+    """Settings of joining maps while robots drive.
+
+    Args:
+        cell: m, of which one point is held.
+        most_points: of a robot; what comes later is left out, and told.
+        most_robots: at most.
+        step, turn: m and rad that a robot moves on between scans that are taken.
+        reach: m; what a scan shows farther away is left out.
+        least_points: of a robot, before its map is made.
+        join: probability from which on two maps are joined; `keep`: below which they are parted again.
+        open: … above which the next observation is named that would settle it.
+        moved: m; a join whose pose moves by more is another one.
     """
 
     cell: float = 0.05
@@ -329,7 +331,7 @@ class LiveMerger:
         return out
 
     def _name_frames(self) -> dict[str, str]:
-        """Names of the robots' frames, no two alike."""
+        """Return the names of the robots' frames, no two alike."""
         number = Counter(robot.frame for robot in self.robots.values())
         alike = {name: f"{name}/{robot.frame}" for name, robot in self.robots.items() if number[robot.frame] > 1}
         if alike and self.links and not self._warned:

@@ -279,7 +279,7 @@ def place_pair(maps: Sequence[TopometricMap], config: MergeConfig, prepared: Seq
 
 
 def _explain_pair(registration: Registration, threshold: float, config: MergeConfig) -> str:
-    """One sentence: what was decided by hand, or the verdict."""
+    """Say in one sentence what was decided by hand, or the verdict."""
     if (0, 1) not in config.decided:
         return explain_verdict(registration, threshold, config.force)
     text = "not merged: rejected by hand" if config.decided[0, 1] is None else "merged: accepted by hand"
@@ -300,7 +300,7 @@ def _find_observations(a: TopometricMap, b: TopometricMap, registration: Registr
 
 
 def _iter_rigid_reasons(registration: Registration) -> Iterator[str]:
-    """Why maps that could have been bent were not."""
+    """Yield why maps that could have been bent were not."""
     if registration.bend is not None and registration.bend.reason not in ("", NEITHER_BENDS):
         yield f"the maps were not bent: {registration.bend.reason}"
 
@@ -332,7 +332,7 @@ def _place_set(maps: Sequence[TopometricMap], config: MergeConfig) -> MergeResul
 
 
 def _list_decided(maps: Sequence[TopometricMap], config: MergeConfig) -> RegistrationsByPair:
-    """Registrations of the pairs that somebody decided: one certain hypothesis, or none."""
+    """List the registrations of the pairs that somebody decided: one certain hypothesis, or none."""
     keys = [hash_map(map) for map in maps] if config.decided else []
     registrations: RegistrationsByPair = {}
     for (i, j), pose in config.decided.items():
@@ -361,7 +361,8 @@ def _join(result: MergeResult) -> MergeResult:
 def _iter_room_matches(
     maps: Sequence[TopometricMap], pair: tuple[int, int], pose: Sim3, merge_probability: float, bends: Mapping[int, Deformation]
 ) -> Iterator[RoomMatch]:
-    """Rooms of two maps that lie in each other; a match is as probable as the merge times `compute_match_probability`."""
+    """Yield the rooms of two maps that lie in each other; a match is as probable as the merge times
+    `compute_match_probability`."""
     a, b = maps[pair[0]], maps[pair[1]]
     rooms, shared_floor = match_common_rooms(a, b, pose, (bends.get(pair[0]), bends.get(pair[1])))
     probabilities = merge_probability * compute_match_probability(a, b, rooms, shared_floor)
@@ -378,7 +379,8 @@ def _split_seconds(seconds: Mapping[str, float], total: float) -> dict[str, floa
 
 
 def _propose_room_poses(a: TopometricMap, b: TopometricMap, config: MergeConfig, describe: _TimedDescriptor) -> list[Sim3]:
-    """Poses T_ab of matched rooms: under which sets of them lie on each other, or (`poses` "surfaces") of each by itself."""
+    """Propose the poses T_ab of matched rooms: under which sets of them lie on each other, or (`poses` "surfaces") of each by
+    itself."""
     if not len(a.rooms) or not len(b.rooms):
         return []
     if compute_registration_order(b) < compute_registration_order(a):  # as registration: nothing may depend on which comes first
@@ -390,7 +392,7 @@ def _propose_room_poses(a: TopometricMap, b: TopometricMap, config: MergeConfig,
 
 
 def _propose_surface_poses(a: TopometricMap, b: TopometricMap, matching: Matching) -> list[Sim3]:
-    """Poses T_ab of the pairs of rooms that any hypothesis holds, each pair by its surfaces."""
+    """Propose the poses T_ab of the pairs of rooms that any hypothesis holds, each pair by its surfaces."""
     probabilities: dict[tuple[int, ...], float] = {}
     for h in matching.alternatives:
         for pair in h.rooms.tolist():

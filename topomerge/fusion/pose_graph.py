@@ -134,7 +134,7 @@ def _moved(pose: Sim3, step: Array) -> Sim3:
 def iter_map_sets(
     count: int, joining: Collection[tuple[int, int]], of_pairs: Mapping[tuple[int, int], Of]
 ) -> Iterator[tuple[tuple[int, ...], dict[tuple[int, int], Of]]]:
-    """Sets of maps that pairs join, directly or by others, each with what there is of the pairs within it.
+    """Yield sets of maps that pairs join, directly or by others, each with what there is of the pairs within it.
 
     Args:
         count: of the maps.
@@ -213,7 +213,7 @@ class Assembler:
         return whole
 
     def _assemble(self) -> Assembly:
-        """`build`, of all maps at once."""
+        """Run `build`, of all maps at once."""
         banned: set[tuple[int, int]] = set()
         while True:  # ends: each time one more pair is banned
             assembly = self._grow(banned)
@@ -228,7 +228,7 @@ class Assembler:
         return assembly
 
     def _list_candidates(self, banned: set[tuple[int, int]]) -> list[tuple[tuple[int, int], PoseHypothesis]]:
-        """Hypotheses that could be believed if everything else spoke for them, most probable first."""
+        """List the hypotheses that could be believed if everything else spoke for them, most probable first."""
         candidates = [(pair, h) for pair, hs in self.hypotheses.items() if pair not in banned for h in hs]
         candidates = [(pair, h) for pair, h in candidates if self.evidence.bound_log_odds(pair, h) >= self.limit]
         return sorted(candidates, key=lambda e: (-e[1].log_odds, e[0]))
@@ -261,7 +261,7 @@ class Assembler:
         assembly.components.append(self.settle(joined, assembly.links)[0])
 
     def _rescore_links(self, assembly: Assembly) -> list[Link]:
-        """The links as they are seen now that everything is in its place."""
+        """Return the links as they are seen now that everything is in its place."""
         return [self._rescore(assembly, link) for link in assembly.links]
 
     def _rescore(self, assembly: Assembly, link: Link) -> Link:
@@ -269,7 +269,7 @@ class Assembler:
         return self.evidence.score_link(a, b, link.maps, link.hypothesis, Sim3())
 
     def _iter_contradicted(self, assembly: Assembly) -> Iterator[tuple[tuple[int, int], PoseHypothesis]]:
-        """Best hypotheses of pairs that lie elsewhere in their component."""
+        """Yield the best hypotheses of pairs that lie elsewhere in their component."""
         for (i, j), hypotheses in sorted(self.hypotheses.items()):
             poses = assembly.find_component(i)
             if not hypotheses or j not in poses or hypotheses[0].probability < BELIEVED:
@@ -305,7 +305,7 @@ class Assembler:
                     yield link, then, (a, b)
 
     def _list_rejected(self, assembly: Assembly) -> list[Link]:
-        """Hypotheses that were believed by themselves and contradict the rest."""
+        """List the hypotheses that were believed by themselves and contradict the rest."""
         rejected = [
             Link(pair, h, -h.log_odds, self._find_weakest_link(assembly, pair)) for pair, h in self._iter_contradicted(assembly)
         ]
@@ -348,7 +348,7 @@ class Assembler:
                     yield Measured((i, j), pose, self.checks.locate_place(i, j, pose), weight)
 
     def _is_supported(self, i: int, j: int, pose: Sim3, check: Check) -> bool:
-        """Does a pair (i < j) speak for T_ij, by its walls or by its own registration?"""
+        """Return whether a pair (i < j) speaks for T_ij, by its walls or by its own registration."""
         best = next(iter(self.hypotheses.get((i, j), ())), None)
         same = best is not None and self.evidence.is_same_pose(i, j, best.transform, pose)
         return check.log_odds > 0 or (same and best is not None and compute_support(best.log_odds) > 0)

@@ -54,7 +54,7 @@ def resample_cells(grid: VoxelGrid, placement: Placement | Sim3, origin: Array, 
 
 
 def _find_filled_cells(grid: VoxelGrid, chosen: slice, placement: Placement, origin: Array, edge: float) -> tuple[Array, Array]:
-    """`resampled` of some cells; cells may come twice."""
+    """Return `resampled` of some cells; cells may come twice."""
     pose, ratio = placement.pose, placement.pose.scale * grid.edge / edge
     wide = ratio * _find_stretch(placement.bend) * np.sqrt(0.5) + pose.scale * _find_slant(placement.bend, grid.edge) / edge
     places = grid.compute_centroids(grid.cells[chosen])
@@ -90,7 +90,7 @@ def _linearise(bend: Deformation | None, cells: Array, places: Array, grid: Voxe
 
 
 def _linearise_places(bend: Deformation, places: Array, grid: VoxelGrid) -> tuple[Array, Array]:
-    """`_linearise`, place by place."""
+    """Run `_linearise` place by place."""
     bent = bend.apply(places)
     steps = np.eye(3) * JACOBIAN_STEP
     x, y, z = ((bend.apply(places + step) - bent)[:, :2] / JACOBIAN_STEP for step in steps)
@@ -119,7 +119,7 @@ def _find_columns(cells: Array) -> tuple[Array, Array]:
 
 
 def _find_stretch(bend: Deformation | None) -> float:
-    """By what factor a length in the plane grows at most, the scale of the pose apart."""
+    """Return by what factor a length in the plane grows at most, the scale of the pose apart."""
     steep = 0.0
     for field in bend.fields if bend is not None else ():
         if field is not None:
@@ -129,7 +129,8 @@ def _find_stretch(bend: Deformation | None) -> float:
 
 
 def _find_slant(bend: Deformation | None, edge: float) -> float:
-    """m in the plane by which the ends of a cell as high as `edge` part from its middle, between storeys that move apart."""
+    """Return the distance, m in the plane, by which the ends of a cell as high as `edge` part from its middle, between storeys
+    that move apart."""
     if bend is None or len(bend.floors) < 2:
         return 0.0
     return 2 * bend.farthest * min(edge / (2 * BETWEEN_STOREYS), 1.0)

@@ -247,7 +247,7 @@ class MergeResult:
 
 
 def serialise_merge(result: MergeResult) -> dict[str, Any]:
-    """`merge.json` as plain values: see docs/outputs.md. Numbers are not rounded: national grids need all digits."""
+    """Return `merge.json` as plain values: see docs/outputs.md. Numbers are not rounded: national grids need all digits."""
     registration = result.registration
     rmse = registration.features.get("rmse", float("nan")) if registration else float("nan")
     residuals = result.atlas.residuals if result.atlas else {1: rmse}

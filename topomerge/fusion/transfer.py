@@ -46,7 +46,7 @@ def transform_part(part: TopometricMap, placement: Placement) -> PlacedPart:
 
 
 def _transform_edges(edges: Array, placement: Placement) -> Array:
-    """EDGE_DTYPE as they lie in the joined map."""
+    """Return edges, EDGE_DTYPE, as they lie in the joined map."""
     moved = edges.copy()
     for name in ("centre", "lower", "upper") if len(edges) else ():
         moved[name] = placement.transform_points(moved[name])
@@ -91,8 +91,8 @@ def add_carried_odds(joined: TopometricMap, tables: Sequence[Array], member: Arr
 
 
 def add_part_doors(joined: TopometricMap, parts: Iterable[PlacedPart]) -> TopometricMap:
-    """The joined map with those doors and openings of its parts that it lacks, without those that its parts deny, and each as the
-    part saw it that is surest of it.
+    """Return the joined map with those doors and openings of its parts that it lacks, without those that its parts deny, and each
+    as the part saw it that is surest of it.
 
     Args:
         parts: as they lie in it.
@@ -144,13 +144,13 @@ class _PlacedFloor:
         return cls(tree, room, doors["centre"], doors[between])
 
     def has_both_sides(self, edge: Array) -> bool:
-        """Has it floor on both sides of an edge of the joined map?"""
+        """Return whether it has floor on both sides of an edge of the joined map."""
         near = self.room[self.floor.query_ball_point(edge["centre"], DOOR_SIDE)]
         return all(int((near == room).sum()) >= LEAST_FLOOR for room in edge["rooms"])
 
 
 def _is_confirmed(edge: Array, parts: Sequence[_PlacedFloor]) -> bool:
-    """Has a part a door there, or did none see both sides?"""
+    """Return whether a part has a door there, or none saw both sides."""
     at = np.concatenate([part.centres for part in parts])
     if (np.linalg.norm(at - edge["centre"], axis=1) < ONE_DOOR).any():
         return True
@@ -158,7 +158,8 @@ def _is_confirmed(edge: Array, parts: Sequence[_PlacedFloor]) -> bool:
 
 
 def _adopt_doors(edges: Array, doors: Array) -> Array:
-    """Doors of the joined map as the surest of the parts' doors that are the same has them; its sureness is the higher one."""
+    """Return the doors of the joined map as the surest of the parts' doors that are the same has them; its sureness is the higher
+    one."""
     edges = edges.copy()
     for edge in edges:
         if edge["kind"] not in LEVEL_KINDS:
@@ -174,15 +175,15 @@ def _adopt_doors(edges: Array, doors: Array) -> Array:
 
 
 def _is_among_edges(edges: Array, door: Array) -> bool:
-    """Is a door among edges, between the same rooms and near enough?"""
+    """Return whether a door is among edges, between the same rooms and near enough."""
     same = (np.sort(edges["rooms"], axis=1) == door["rooms"]).all(axis=1)
     apart = np.linalg.norm(edges["centre"][same] - door["centre"], axis=1)
     return bool((apart <= max(ONE_DOOR, float(door["width"]) / 2)).any())
 
 
 def add_part_odds(joined: TopometricMap, parts: Sequence[PartRooms]) -> TopometricMap:
-    """The joined map with the probability that each room was entered, and with what was only glimpsed, as its parts say: that of
-    the part in which somebody was most likely there; as the joined map has it where no part has enough of its floor."""
+    """Return the joined map with the probability that each room was entered, and with what was only glimpsed, as its parts say:
+    that of the part in which somebody was most likely there; as the joined map has it where no part has enough of its floor."""
     if not len(joined.rooms):
         return joined
     count = len(joined.rooms)
@@ -275,7 +276,8 @@ def add_joined_landmarks(joined: TopometricMap, parts: Mapping[int, PlacedLandma
 
 
 def _assign_joined_rooms(joined: TopometricMap, part: PlacedLandmarks) -> Landmarks:
-    """Landmarks of a part with rooms and storeys of the joined map: by their position; without one by the room that they had."""
+    """Return the landmarks of a part with rooms and storeys of the joined map: by their position; without one by the room that
+    they had."""
     table = part.landmarks.table.copy()
     known = np.isfinite(table["position"]).all(axis=1)
     room = np.append(vote_rooms(part.rooms.room, find_rooms_at(joined, part.rooms.places), part.total), -1)[table["room"]]

@@ -49,7 +49,7 @@ def _read_npy(path: Path) -> Iterator[Piece]:
 
 
 def _read_header(path: Path, stream: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype]:
-    """Shape and type of an npy stream of `size` bytes, checked before anything is allocated."""
+    """Read the shape and type of an npy stream of `size` bytes, checked before anything is allocated."""
     try:
         version = np.lib.format.read_magic(stream)
         reader = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -92,7 +92,7 @@ def _read_npz(path: Path) -> Piece:
 
 
 def _read_member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Array:
-    """One array of an archive. The size that the archive states bounds what is unpacked."""
+    """Read one array of an archive. The size that the archive states bounds what is unpacked."""
     swollen = info.file_size > MODEST and info.file_size > RATIO * max(info.compress_size, 1)
     if info.file_size > LARGEST_ARRAY or swollen:
         raise InputError(f"{path}: {info.filename} would unpack to {info.file_size:,} bytes; refused, save it unpacked")

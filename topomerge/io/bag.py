@@ -91,7 +91,7 @@ def _read_camera(bag: Bag, topic: Topic) -> Camera:
 
 
 def _decode_camera(bag: Bag, beside: Topic) -> Camera:
-    """The camera of a topic of CameraInfo."""
+    """Return the camera of a topic of CameraInfo."""
     message = next(bag.iter_messages([beside]))
     info = message.content
     projection, matrix = (np.asarray(getattr(info, name, getattr(info, name.lower(), ())), float) for name in "PK")
@@ -124,7 +124,7 @@ def _decode_image(path: Path, message: Message) -> tuple[Array, float]:
 
 
 def _decode_compressed_image(path: Path, message: Message) -> tuple[Array, float]:
-    """The same of a CompressedImage."""
+    """Decode the same of a CompressedImage."""
     image = message.content
     if not image.format.startswith("16UC1") or "rvl" in image.format.lower():
         advice = "record the plain images, or unpack them (image_transport republish)"
@@ -369,7 +369,7 @@ def _read_first_frame(bag: Bag, topic: Topic) -> str:
 
 
 def _read_map(bag: Bag, topic: Topic, options: ReadOptions) -> Iterator[Piece]:
-    """Walls and floor of the newest map of a topic."""
+    """Yield walls and floor of the newest map of a topic."""
     newest: Message | None = None
     for message in bag.iter_messages([topic]):
         newest = message
@@ -384,7 +384,7 @@ def _read_map(bag: Bag, topic: Topic, options: ReadOptions) -> Iterator[Piece]:
 
 
 def _iter_scans(bag: Bag, topic: Topic, decode: Decoder, poses: SensorPoses) -> Iterator[PosedScan]:
-    """The scans of a topic, one at a time; those without a pose are left out, and counted in the warnings of the poses.
+    """Yield the scans of a topic, one at a time; those without a pose are left out, and counted in the warnings of the poses.
 
     Raises:
         InputError: the clock was set back, or no scan has a pose.

@@ -116,7 +116,7 @@ def measure_bag_size(files: list[Path]) -> int:
 
 
 def _check_chunk_size(data: bytes, promised: int) -> bytes:
-    """The data of a chunk whose header promises no more bytes than it may have."""
+    """Return the data of a chunk whose header promises no more bytes than it may have."""
     if promised > min(max(MODEST_CHUNK, CHUNK_RATIO * len(data)), LARGEST_CHUNK):
         raise UnpackingError(f"a chunk of {len(data):,} bytes promises {promised:,}")
     return data
@@ -135,7 +135,7 @@ class _LimitedFile:
         self.stream.close()
 
     def read(self, count: int = -1) -> bytes:
-        """At most so many bytes."""
+        """Read at most so many bytes."""
         data: bytes = self.stream.read(min(count, PART) if count >= 0 else PART)
         self.left -= len(data)
         if self.left < 0:
@@ -283,7 +283,7 @@ class Bag:
             yield Message(message.topic, message.number, message.recorded, content)
 
     def _iter_recorded(self, streams: list[Any]) -> Iterator[tuple[Any, int, bytes]]:
-        """Connection, time (ns) and bytes of the messages of some streams, in the order of their times."""
+        """Yield connection, time (ns) and bytes of the messages of some streams, in the order of their times."""
         merged = merge(*streams, key=lambda m: m[1])
         while True:
             with _convert_index_errors(self.path):
@@ -307,7 +307,7 @@ def _format_reason(path: Path, error: Exception) -> str:
 
 @contextmanager
 def _convert_index_errors(path: Path) -> Iterator[None]:
-    """Turns what the library says of a bag whose index it can't follow into an error that says what helps."""
+    """Turn what the library says of a bag whose index it can't follow into an error that says what helps."""
     try:
         yield
     except (InputError, OSError, MemoryError):
@@ -350,7 +350,7 @@ def _open_readers(path: Path) -> list[Any]:
 
 
 def _start(file: Path) -> bytes:
-    """The first bytes, which name the format."""
+    """Return the first bytes, which name the format."""
     with file.open("rb") as stream:
         return stream.read(32)
 
@@ -436,7 +436,8 @@ def decode_laser_scan(path: Path, message: Message) -> tuple[Array, Array | None
 
 
 def decode_occupancy_grid(path: Path, message: Message) -> tuple[tuple[Array, Array], Plan]:
-    """Brightness (h, w) in 0..1, where nothing is known (h, w), and what else a map_server file says, of an OccupancyGrid.
+    """Return the brightness (h, w) in 0..1, where nothing is known (h, w), and what else a map_server file says, of an
+    OccupancyGrid.
 
     Raises:
         InputError: a size that does not fit its cells, or numbers that are not finite.

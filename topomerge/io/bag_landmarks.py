@@ -230,7 +230,7 @@ def find_radio_readings(content: Any, depth: int = 3) -> Iterator[tuple[str, flo
 
 
 def _unwrap(value: Any) -> Any:
-    """The value of a message of std_msgs, or of an array of a single number."""
+    """Return the value of a message of std_msgs, or of an array of a single number."""
     return getattr(value, "data", value)
 
 
@@ -318,7 +318,7 @@ class LandmarkReader:
         self.pictures.read_picture(Picture(image, camera, depth, small, pose, time))
 
     def _read_tags(self, message: Message) -> None:
-        """Tags whose place the message or tf states, else the points of the bag at their corners."""
+        """Read the tags whose place the message or tf states, else the points of the bag at their corners."""
         header, time = message.content.header, get_time(message)
         camera = self.locate(str(header.frame_id), time)
         for tag in message.content.detections:
@@ -338,7 +338,7 @@ class LandmarkReader:
             self._add(Sighting("tag", value, place[0], place[1], 1.0, place[2], time, message.number))
 
     def _place_corners(self, tag: Any, frame: str, pose: Array | None) -> tuple[Array, float, float] | None:
-        """Where a tag stands by its corners on a picture."""
+        """Return where a tag stands by its corners on a picture."""
         camera = self._find_frame_camera(frame)
         if camera is None or camera.size is None or pose is None:
             return None

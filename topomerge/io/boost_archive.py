@@ -46,7 +46,7 @@ class ArchiveLayout:
 
 @cache
 def _split(text: str) -> tuple[str, ...]:
-    """The arguments of a template."""
+    """Return the arguments of a template."""
     parts, depth, start = [], 0, 0
     for k, letter in enumerate(text):
         depth += (letter == "<") - (letter == ">")
@@ -111,7 +111,7 @@ class BinaryArchive:
         return self.data[self.at - count : self.at]
 
     def _move_block(self, form: str, count: int, values: Any = None) -> Array:
-        """Numbers that lie behind each other."""
+        """Move numbers that lie behind each other."""
         kind = np.dtype(form)
         if self.like:
             self.out += np.asarray(values, kind).tobytes()
@@ -149,7 +149,7 @@ class BinaryArchive:
         return self.counted[kind]
 
     def _enter(self, kind: str, value: Any) -> tuple[int, bool]:
-        """The number of an object, and whether it is new."""
+        """Return the number of an object, and whether it is new."""
         held = len(self.objects)
         number = int(self._move_number("<u4", self.entered.get((id(value), kind), held)))
         if number > held:
@@ -160,7 +160,7 @@ class BinaryArchive:
         return number, number == held
 
     def _move(self, kind: str, value: Any) -> Passing:
-        """A member of any type."""
+        """Move a member of any type."""
         if kind in NUMBERS:
             return self._move_number(NUMBERS[kind], value)
         if kind == "str":
@@ -214,7 +214,7 @@ class BinaryArchive:
         return (yield self._fill(kind, number, value))
 
     def _fill(self, kind: str, number: int | None, value: Any) -> Passing:
-        """The content of an object, a pair or a list."""
+        """Fill in the content of an object, a pair or a list."""
         head, _, rest = kind.partition("<")
         inner = _split(rest[:-1]) if head in ("vector", "map", "pair") else ()
         if head == "vector":
@@ -260,7 +260,7 @@ class BinaryArchive:
         return out
 
     def _move_array(self, kind: str, members: Members, values: Any) -> Passing:
-        """An array, whose length other members tell, or the end of the file."""
+        """Move an array, whose length other members tell, or the end of the file."""
         of, *sizes = kind.replace("]", "").split("[")
         if of == "f8" and sizes == ["3", "3"]:
             rows = range(self._move_count(3, 3))

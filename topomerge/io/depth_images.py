@@ -74,7 +74,7 @@ def _transform_scan(scan: PosedScan) -> PosedScan:
 
 
 def _build_piece(batch: list[PosedScan], before: int) -> Piece:
-    """One piece of placed scans; `before` poses were handed over already."""
+    """Build one piece of placed scans; `before` poses were handed over already."""
     poses = [s.pose for s in batch if s.pose is not None]
     numbers, number = [], before
     for scan in batch:

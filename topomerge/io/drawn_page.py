@@ -107,7 +107,8 @@ def is_robot_grid(picture: Array) -> bool:
 
 
 def compute_levels(picture: Array) -> Array:
-    """(h, w) uint16, the mean of red, green and blue of a picture (h, w, 3) uint8, rounded: thirds are never halves."""
+    """Compute the levels (h, w) uint16, the mean of red, green and blue of a picture (h, w, 3) uint8, rounded: thirds are never
+    halves."""
     total = picture[..., 0].astype(np.uint16)
     total += picture[..., 1]
     total += picture[..., 2]
@@ -207,7 +208,7 @@ def compute_threshold(values: Array) -> float:
 
 
 def _find_quadrilateral(mask: Array, bright: Array) -> Array | None:
-    """The corners of the largest part of a mask (h, w), where that is the page of a drawing."""
+    """Return the corners of the largest part of a mask (h, w), where that is the page of a drawing."""
     import shapely
 
     label, count = ndimage.label(ndimage.binary_opening(mask, iterations=2))
@@ -269,7 +270,7 @@ def cut_sheet(picture: Array, corners: Array) -> tuple[Array, Array]:
 
 
 def _estimate_foreshortening(corners: Array, shape: tuple[int, ...]) -> float:
-    """By how much wider a page is than its sides are long on the picture, for their height (a camera of usual lens)."""
+    """Estimate by how much wider a page is than its sides are long on the picture, for their height (a camera of usual lens)."""
     half = float(np.hypot(shape[0], shape[1])) / 2
     points = np.column_stack([(corners - np.array(shape[::-1]) / 2) / half, np.ones(4)])
     sides = [np.cross(points[k], points[(k + 1) % 4]) for k in range(4)]
@@ -409,7 +410,7 @@ def find_lines(bright: Array, flip: bool, least: float, strong: float = STRONG) 
 
 
 def _fit_pencil(x: Array, y: Array, slope: Array, length: Array) -> tuple[float, float]:
-    """Slope in the middle, and how fast it changes, of lines that meet in a point: slope = a + b (slope x - y)."""
+    """Fit the slope in the middle, and how fast it changes, of lines that meet in a point: slope = a + b (slope x - y)."""
     order = np.argsort(slope)
     share = np.cumsum(length[order])
     fit = np.array([slope[order][np.searchsorted(share, share[-1] / 2)], 0.0])

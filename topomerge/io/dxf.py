@@ -315,7 +315,7 @@ def is_swing(arc: Array) -> bool:
 
 
 def _flatten(entity: Any, matrix: Any) -> Iterator[Array]:
-    """The (n, 2) points of each line of an entity, in the model's frame; none of those that are not finite."""
+    """Yield the (n, 2) points of each line of an entity, in the model's frame; none of those that are not finite."""
     from ezdxf.path import from_hatch, make_path
 
     try:

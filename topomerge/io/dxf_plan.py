@@ -178,7 +178,7 @@ def _find_window_hulls(lines: list[Line]) -> list[Array]:
 
 
 def _fill_narrow(drawn: Array, pixel: float) -> Array:
-    """Walls with what is between their lines: where no disc of the thickest wall fits."""
+    """Return the walls with what is between their lines: where no disc of the thickest wall fits."""
     radius = THICKEST_NARROW / 2 / pixel
     core = ndimage.distance_transform_edt(~drawn) > radius
     reached = ndimage.distance_transform_edt(~core) <= radius + 1.5
@@ -215,7 +215,7 @@ def find_gaps(raster: _LineRaster, occupied: Array, swings: list[Swing], leaves:
 
 
 def _runs_along(points: Array, start: Array, end: Array) -> bool:
-    """Does a line have a point near each end of another?"""
+    """Return whether a line has a point near each end of another."""
     away = [float(np.linalg.norm(points - place, axis=1).min()) for place in (start, end)]
     return max(away) < LEAF_THICKNESS
 

@@ -84,7 +84,7 @@ def _read_pose(header: Any) -> Array:
 
 
 def _iter_scan_blocks(path: Path, file: Any, header: Any) -> Iterator[tuple[Array, Array | None, Array | None, int]]:
-    """Blocks of one scan: points in the scanner's frame, colours, intensities, and how many rows were read."""
+    """Yield blocks of one scan: points in the scanner's frame, colours, intensities, and how many rows were read."""
     fields = set(header.point_fields)
     axes = next((a for a in (CARTESIAN, SPHERICAL) if fields >= set(a)), None)
     if axes is None:

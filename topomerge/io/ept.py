@@ -82,7 +82,7 @@ def _read_layout(file: Path) -> EptLayout:
 
 
 def _iter_nodes(folder: Path, deepest: int) -> Iterator[tuple[str, int]]:
-    """Key and number of points of each node that has some. Files of the hierarchy are read when their turn comes."""
+    """Yield the key and number of points of each node that has some. Files of the hierarchy are read when their turn comes."""
     pages, seen = [ROOT_KEY], {ROOT_KEY}
     while pages:
         page = pages.pop()
@@ -122,7 +122,7 @@ def _build_length_error(node: Path, count: int) -> InputError:
 
 
 def _decompress_node(node: Path, room: int) -> bytes:
-    """The bytes of a file under Zstandard, one more than there is room for at most."""
+    """Return the bytes of a file under Zstandard, one more than there is room for at most."""
     try:
         from compression import zstd  # type: ignore[import-not-found]
     except ImportError:

@@ -135,7 +135,7 @@ def warn_about(points: Array, up: str | None) -> list[str]:
 
 
 def _check_degrees(low: Array, high: Array) -> list[str]:
-    """Are x and y longitude and latitude, and only z a length?"""
+    """Return a warning where x and y are longitude and latitude, and only z is a length."""
     across, tall = float((high - low)[:2].max()), float(high[2] - low[2])
     on_earth = bool((np.abs((low, high))[:, :2] <= 180.0).all() and (np.abs((low, high))[:, :2].min(axis=1) <= 90.0).all())
     if not (0 < across <= DEGREES_ACROSS and tall >= DEGREES_TALLER * across and on_earth):

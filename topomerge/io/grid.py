@@ -58,7 +58,7 @@ def is_inverted(occupied: Array, free: Array, resolution: float) -> bool:
 
 
 def _measure_deep_share(mask: Array, resolution: float) -> float:
-    """Share of the pixels of a mask (h, w) that lie deeper in it than `BODY_RADIUS`."""
+    """Measure the share of the pixels of a mask (h, w) that lie deeper in it than `BODY_RADIUS`."""
     inside = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1][mask]
     return float((inside * resolution > BODY_RADIUS).mean())
 
@@ -287,7 +287,7 @@ def read_yaml(path: Path) -> Plan:
 
 
 def _is_nan(value: object) -> bool:
-    """Is it the number that is none, as YAML or as C++ writes it (-nan)?"""
+    """Return whether it is the number that is none, as YAML or as C++ writes it (-nan)."""
     try:
         return isinstance(value, str | float) and math.isnan(float(value))
     except ValueError:
@@ -472,7 +472,7 @@ def _flatten_mask(mask: Array) -> Array:
 
 
 def _iter_point_blocks(pixels: Array, shape: tuple[int, ...], plan: Plan, parts: int) -> Iterator[Array]:
-    """Blocks (n, 2) of metric points of pixels, parts² a pixel, at the centres of its parts."""
+    """Yield blocks (n, 2) of metric points of pixels, parts² a pixel, at the centres of its parts."""
     inner = (np.arange(parts) + 0.5) / parts
     dx, dy = (d.ravel() for d in np.meshgrid(inner, inner))
     x0, y0, yaw = plan.origin

@@ -53,7 +53,7 @@ def check_references(path: Path) -> None:
 
 
 def _count_deep_entities(owners: Array, targets: Array, count: int) -> int:
-    """Number of entities with more than DEEPEST references one behind the other below them."""
+    """Count the entities with more than DEEPEST references one behind the other below them."""
     waiting = np.bincount(owners, minlength=count)
     order = np.argsort(targets, kind="stable")
     ends = np.searchsorted(targets[order], np.arange(count + 1))
@@ -227,7 +227,7 @@ def _is_built(product: Any, doors: bool) -> bool:
 
 
 def _iter_shapes(model: Any, products: list[Any]) -> Iterator[tuple[int, Array, Array]]:
-    """(id, vertices (n, 3), faces (m, 3)) of products, in metres in the model's frame.
+    """Yield (id, vertices (n, 3), faces (m, 3)) of products, in metres in the model's frame.
 
     Flat bodies are made by the fast one of the library's two kernels, all others, and those in which it fails, by the slow one.
     """
@@ -239,7 +239,7 @@ def _iter_shapes(model: Any, products: list[Any]) -> Iterator[tuple[int, Array, 
 
 
 def _iter_shapes_by_kernel(model: Any, products: list[Any], kernel: Any) -> Iterator[tuple[int, Array, Array]]:
-    """The same by one kernel; what it cannot make is left out."""
+    """Yield the same by one kernel; what it cannot make is left out."""
     import ifcopenshell.geom
 
     settings = ifcopenshell.geom.settings()
@@ -262,7 +262,7 @@ def _iter_shapes_by_kernel(model: Any, products: list[Any], kernel: Any) -> Iter
 
 
 def _read_spaces(model: Any) -> list[tuple[Any, Array, Array]]:
-    """(space, vertices, faces) of every space with a shape, in the order of their ids."""
+    """Return (space, vertices, faces) of every space with a shape, in the order of their ids."""
     spaces = {s.id(): s for s in model.by_type("IfcSpace") if s.Representation}
     shapes = sorted(_iter_shapes(model, list(spaces.values())), key=lambda s: s[0])
     return [(spaces[element], vertices, faces) for element, vertices, faces in shapes]
@@ -271,7 +271,8 @@ def _read_spaces(model: Any) -> list[tuple[Any, Array, Array]]:
 def _sample_missing_floors(
     path: Path, spaces: list[tuple[Any, Array, Array]], shapes: list[tuple[Array, Array]], options: ReadOptions, first: int
 ) -> Iterator[Piece]:
-    """Floors of spaces on a level that has no slab: some models hold walls and ceilings only, and nobody could stand in them."""
+    """Yield the floors of spaces on a level that has no slab: some models hold walls and ceilings only, and nobody could stand in
+    them."""
     slabs = np.concatenate([_measure_level_areas(v, f, _find_level_faces(v, f)) for v, f in shapes])
     lows = [_find_floor_faces(v, f) for _, v, f in spaces]
     floors = [_measure_level_areas(v, f, low) for (_, v, f), low in zip(spaces, lows, strict=True)]
@@ -315,7 +316,7 @@ def _find_floor_faces(vertices: Array, faces: Array) -> Array:
 
 
 def _build_rooms(spaces: list[tuple[Any, Array, Array]]) -> tuple[TrueRoom, ...]:
-    """Every space with a shape, in the order of its storey and name."""
+    """Return every space with a shape, in the order of its storey and name."""
     outlined = []
     for space, vertices, faces in spaces:
         floor, ceiling = float(vertices[:, 2].min()), float(vertices[:, 2].max())
@@ -330,7 +331,7 @@ def _build_rooms(spaces: list[tuple[Any, Array, Array]]) -> tuple[TrueRoom, ...]
 
 
 def _find_landmarks(model: Any, rooms: tuple[TrueRoom, ...], source: str) -> Landmarks:
-    """Names of spaces, both the short and the long one, and annotations whose type is a kind of landmark."""
+    """Return the names of spaces, both the short and the long one, and annotations whose type is a kind of landmark."""
     import shapely
     from ifcopenshell.util.placement import get_local_placement
     from ifcopenshell.util.unit import calculate_unit_scale
@@ -350,7 +351,7 @@ def _find_landmarks(model: Any, rooms: tuple[TrueRoom, ...], source: str) -> Lan
 
 
 def _find_storey_id(space: Any) -> int:
-    """Id of the IfcBuildingStorey that a space belongs to, 0 where it belongs to none."""
+    """Return the id of the IfcBuildingStorey that a space belongs to, 0 where it belongs to none."""
     parent = space
     while parent is not None and not parent.is_a("IfcBuildingStorey"):
         parent = next((r.RelatingObject for r in parent.Decomposes), None)
@@ -358,7 +359,7 @@ def _find_storey_id(space: Any) -> int:
 
 
 def _number_storeys(spaces: list[tuple[int, float]]) -> list[int]:
-    """Number of the storey of each (storey id, floor height), the lowest storey with spaces being 0."""
+    """Return the number of the storey of each (storey id, floor height), the lowest storey with spaces being 0."""
     heights: dict[int, list[float]] = {}
     for storey, floor in spaces:
         heights.setdefault(storey, []).append(floor)
@@ -385,7 +386,7 @@ def trace_outline(vertices: Array, faces: Array) -> Array:
 
 
 def _find_boundary_loops(triangles: Array) -> list[list[int]]:
-    """Closed chains of the edges that only one of the triangles has."""
+    """Return the closed chains of the edges that only one of the triangles has."""
     edges = {(int(t[i]), int(t[(i + 1) % 3])) for t in triangles for i in range(3)}
     after: dict[int, list[int]] = {}
     for start, end in sorted(edges):

@@ -56,7 +56,7 @@ STOREY_GAP = 1.5  # m between the heights of places, from which on they are of t
 
 
 def _iter_place_pieces(path: Path, graph: Mapping[str, Any], options: ReadOptions) -> Iterator[Piece]:
-    """Walls and floor of each storey by its places, which say how far from them the nearest obstacle is."""
+    """Yield the walls and floor of each storey by its places, which say how far from them the nearest obstacle is."""
     places, edges = _parse_places(graph)
     if len(places) < FEWEST_PLACES or not (places[:, 3] > 0).any():
         raise InputError(

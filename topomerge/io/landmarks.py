@@ -86,7 +86,7 @@ def read_tables_beside(path: Path, poses: str | None, suffixes: Sequence[str]) -
 
 
 def _find_shared_table(path: Path, name: str) -> Path | None:
-    """The table beside a file that is named as in a folder of scans."""
+    """Return the table beside a file that is named as in a folder of scans."""
     shared = path.with_name(name)
     return shared if shared.is_file() and shared != path and not path.is_dir() else None
 
@@ -116,7 +116,7 @@ def count_lost(landmarks: Landmarks) -> int:
 
 
 def _is_alone(path: Path, suffixes: Sequence[str]) -> bool:
-    """Is nothing else in its folder that can be read, but for its companions and texts?"""
+    """Return whether nothing else in its folder can be read, but for its companions and texts."""
     others = [p for p in path.parent.iterdir() if p.suffix.lower() in suffixes and p.suffix.lower() != ".txt"]
     return all(p.stem == path.stem or is_landmark_file(p) for p in others)
 
@@ -406,7 +406,7 @@ def _parse_rows(path: Path, lines) -> list[tuple[float, str, float]]:  # type: i
 
 
 def _find_columns(header: Sequence[str]) -> list[int]:
-    """Columns of time, address and dBm by their names; empty where one of them is not named."""
+    """Return the columns of time, address and dBm by their names; empty where one of them is not named."""
     names = [word.lower() for word in header]
     found = [next((names.index(n) for n in possible if n in names), -1) for possible in RADIO_COLUMNS.values()]
     return found if min(found) >= 0 else []

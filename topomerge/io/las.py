@@ -98,7 +98,8 @@ def read_octree(path: Path) -> Octree | None:
 
 
 def iter_coarse_records(path: Path, octree: Octree, options: ReadOptions) -> Iterator[tuple[Any, Any, float]]:
-    """The header, the records of a node, and the share of the file that is read with it, for each node that is coarse enough.
+    """Yield the header, the records of a node, and the share of the file that is read with it, for each node that is coarse
+    enough.
 
     Raises:
         InputError: the octree does not fit the file.
@@ -128,7 +129,7 @@ def iter_coarse_records(path: Path, octree: Octree, options: ReadOptions) -> Ite
 
 
 def _iter_nodes(path: Path, stream: IO[bytes], octree: Octree, deepest: int) -> Iterator[tuple[int, int, int]]:
-    """Place, bytes and points of each node down to a level."""
+    """Yield the place, bytes and points of each node down to a level."""
     whole = left = path.stat().st_size
     pages, seen = [(octree.place, octree.size)], {octree.place}
     while pages:
@@ -251,8 +252,8 @@ def records(path: Path, fields: Any = None) -> Iterator[tuple[Any, Any, float]]:
 
 
 def _list_chunks(path: Path, header: Any) -> list[tuple[int, int]]:
-    """Points and bytes of each chunk, one behind the other in the file; none where they do not add up, or cannot be unpacked
-    side by side: then they are unpacked one by one, as far as they are whole."""
+    """List the points and bytes of each chunk, one behind the other in the file; none where they do not add up, or cannot be
+    unpacked side by side: then they are unpacked one by one, as far as they are whole."""
     import lazrs
 
     record = header.vlrs.get("LasZipVlr")[0].record_data_bytes()
@@ -272,7 +273,7 @@ def _list_chunks(path: Path, header: Any) -> list[tuple[int, int]]:
 
 
 def _iter_unpacked(path: Path, header: Any, chunks: Sequence[tuple[int, int]], fields: Any) -> Iterator[Any]:
-    """Blocks of records, of `BLOCK_POINTS` each as from one decoder, of which the chunks are unpacked side by side."""
+    """Yield blocks of records, of `BLOCK_POINTS` each as from one decoder, of which the chunks are unpacked side by side."""
     import lazrs
 
     record, size = header.vlrs.get("LasZipVlr")[0].record_data_bytes(), header.point_format.size
@@ -292,7 +293,7 @@ def _iter_unpacked(path: Path, header: Any, chunks: Sequence[tuple[int, int]], f
 
 
 def _group_chunks(chunks: Sequence[tuple[int, int]]) -> Iterator[list[tuple[int, int]]]:
-    """As many chunks at a time as a block has points, or one: the decoder's threads do not survive a fork, and one chunk is
+    """Yield as many chunks at a time as a block has points, or one: the decoder's threads do not survive a fork, and one chunk is
     unpacked without them."""
     _unpacking.setdefault("process", os.getpid())
     together = BLOCK_POINTS if _unpacking["process"] == os.getpid() else 0
@@ -336,7 +337,7 @@ def _check_head(path: Path) -> None:
 
 
 def _check_items(path: Path, start: int, record: int) -> bytes:
-    """The record of the compression.
+    """Return the record of the compression, once it is checked.
 
     Raises:
         InputError: its fields don't add up to a point of `record` bytes; the decoder would allocate them.

@@ -50,7 +50,7 @@ def describe_room(room: Any) -> list[str]:
 
 
 def _convert_to_strict_json(value: Any) -> Any:
-    """Rounded, and null for the numbers that JSON does not have."""
+    """Return a value with numbers rounded, and null for those that JSON does not have."""
     if isinstance(value, float):
         return round(value, DIGITS) if math.isfinite(value) else None
     if isinstance(value, dict):
@@ -106,7 +106,7 @@ def _build_window_entry(window: Any) -> dict[str, Any]:
 
 
 def format_json(listing: Mapping[str, Any]) -> str:
-    """Strict JSON with a line for each room, edge and storey, so that it can be read and compared."""
+    """Return strict JSON with a line for each room, edge and storey, so that it can be read and compared."""
     lines = []
     for key, value in listing.items():
         text = json.dumps(value, allow_nan=False, ensure_ascii=False)
@@ -145,7 +145,7 @@ def _format_count(count: int, word: str) -> str:
 
 
 def _list_neighbours(map: TopometricMap) -> list[list[str]]:
-    """For each room the rooms that it leads to; a second door to the same one is not told again."""
+    """List for each room the rooms that it leads to; a second door to the same one is not told again."""
     neighbours: list[dict[int, str]] = [{} for _ in map.rooms]
     for edge in map.edges:
         a, b = edge["rooms"].tolist()

@@ -47,8 +47,8 @@ CELL_ARRAYS = {"grid": ("room", "provenance"), "navigable": ("navigable_room", "
 
 
 def require_sane_counts(heads: Mapping[str, ArrayHeader]) -> None:
-    """Refuses what the arrays of a map declare, before any of them is unpacked: tables longer than the cells can fill, and rows
-    of cells that there are not.
+    """Refuse what the arrays of a map declare, before any of them is unpacked: tables longer than the cells can fill, and rows of
+    cells that there are not.
 
     Raises:
         KeyError: an array is missing.
@@ -80,7 +80,7 @@ def require_sane_counts(heads: Mapping[str, ArrayHeader]) -> None:
 
 
 def _require_rows(heads: Mapping[str, ArrayHeader]) -> None:
-    """Refuses arrays that have not one row for each cell, or more numbers in one than any property has."""
+    """Refuse arrays that have not one row for each cell, or more numbers in one than any property has."""
     for grid, of_cells in CELL_ARRAYS.items():
         if f"{grid}_cells" not in heads:
             continue
@@ -95,7 +95,7 @@ def _require_rows(heads: Mapping[str, ArrayHeader]) -> None:
 
 
 def require_compact_rooms(navigable: VoxelGrid, room: Array, rooms: int) -> None:
-    """Refuses rooms whose floor is strewn over the map: what draws a room goes through the rectangle around it.
+    """Refuse rooms whose floor is strewn over the map: what draws a room goes through the rectangle around it.
 
     Raises:
         ValueError: the rectangles have more columns than those of a building.
@@ -198,7 +198,7 @@ def _check_format(path: str | Path, heads: Mapping[str, ArrayHeader]) -> None:
 
 @contextmanager
 def _convert_map_errors(path: str | Path) -> Iterator[None]:
-    """Within, whatever is wrong with the arrays of a map becomes one line about its file."""
+    """Turn whatever is wrong with the arrays of a map, within, into one line about its file."""
     try:
         yield
     except KeyError as error:
@@ -209,7 +209,7 @@ def _convert_map_errors(path: str | Path) -> Iterator[None]:
 
 
 def _pack(name: str, grid: VoxelGrid) -> dict[str, Array]:
-    """A grid as arrays. Differences of neighbouring Morton codes are mostly 1, so they compress to about a bit."""
+    """Return a grid as arrays. Differences of neighbouring Morton codes are mostly 1, so they compress to about a bit."""
     deltas = np.diff(grid.codes, prepend=np.zeros(1, np.uint64))
     small = len(deltas) == 0 or deltas.max() < 1 << 32
     packed = {
@@ -311,7 +311,7 @@ def _read_windows(arrays: dict[str, Array]) -> Array:
 
 
 def _pack_landmarks(landmarks: Landmarks) -> dict[str, Array]:
-    """Landmarks as arrays: their table, and the strings that it counts as JSON."""
+    """Return landmarks as arrays: their table, and the strings that it counts as JSON."""
     strings = json.dumps([landmarks.values, landmarks.sources], separators=(",", ":")).encode()
     return {"landmarks": landmarks.table, "landmark_strings": np.frombuffer(strings, np.uint8)}
 
@@ -350,7 +350,7 @@ def _read_landmarks(arrays: dict[str, Array]) -> Landmarks:
 
 
 def _limit_warnings(messages: list[Any]) -> tuple[str, ...]:
-    """The first warnings, each one line of bounded length, and how many more there are."""
+    """Return the first warnings, each one line of bounded length, and how many more there are."""
     surplus = len(messages) - WARNING_LIMIT
     if surplus <= 1:  # one more takes no more room than the line that counts it, which may be that one
         surplus = 0

@@ -77,7 +77,7 @@ def _check_size(path: Path, triangles: Array, spacing: float, factor: float) -> 
 
 
 def _split_triangles(triangles: Array, numbers: Array, largest: float) -> tuple[Array, Array]:
-    """Triangles (m, 3, 3) and their numbers (m,), those above the largest area cut across their longest edges."""
+    """Return the triangles (m, 3, 3) and their numbers (m,), those above the largest area cut across their longest edges."""
     while (large := compute_areas(triangles) > largest).any():
         cut = triangles[large]
         edge = np.linalg.norm(np.roll(cut, -1, axis=1) - cut, axis=2).argmax(axis=1)
@@ -91,7 +91,7 @@ def _split_triangles(triangles: Array, numbers: Array, largest: float) -> tuple[
 
 
 def _load_parts(path: Path) -> list[tuple[Array, Array]]:
-    """(vertices, faces) of each part, placed in the scene."""
+    """Return (vertices, faces) of each part, placed in the scene."""
     import trimesh
 
     logging.getLogger("trimesh").setLevel(logging.ERROR)
@@ -164,7 +164,7 @@ def _check_gltf(path: Path, text: bytes, size: int) -> None:
 
 
 def _measure_linked_file(path: Path, uri: str) -> int:
-    """Bytes of a file that a scene names; 0 of data within the scene itself, and of a file that does not exist."""
+    """Return the bytes of a file that a scene names; 0 of data within the scene itself, and of a file that does not exist."""
     if uri.startswith("data:"):
         return 0
     file = (path.parent / uri).resolve()

@@ -49,7 +49,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
 
 
 def _split(path: Path, data: bytes, binary: bool) -> tuple[bytes, float, Array]:
-    """Kind of the tree, resolution (m) and the bytes of the nodes."""
+    """Return the kind of the tree, resolution (m) and the bytes of the nodes."""
     if not data.startswith(MAGICS[".bt" if binary else ".ot"]):
         what, writer = ("a binary OctoMap (.bt)", "writeBinary") if binary else ("a full OctoMap (.ot)", "write")
         raise InputError(f"{path}: is not {what}; write it with octomap's {writer}")

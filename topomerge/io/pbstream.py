@@ -354,7 +354,7 @@ def _build_landmarks(graph: PoseGraph, path: Path) -> Landmarks:
 
 
 def _draw_submaps(path: Path, submaps: Sequence[FlatSubmap]) -> tuple[Array, Array, grid.Plan]:
-    """Walls and floor (h, w), the lowest row first: each pixel has the mean probability of the submaps that know it."""
+    """Draw the walls and floor (h, w), the lowest row first: each pixel has the mean probability of the submaps that know it."""
     size = min(submap.resolution for submap in submaps)
     corners = np.concatenate([_list_corners(submap) for submap in submaps])
     low = np.floor(corners.min(axis=0) / size) * size - size

@@ -89,7 +89,7 @@ def read_header(path: Path) -> Header:
 
 
 def _build_dtype(names: list[str], sizes: list[int], kinds: list[str], counts: list[int]) -> np.dtype:
-    """Type of a row. Padding fields are all named "_", so names that repeat get a number."""
+    """Build the type of a row. Padding fields are all named "_", so names that repeat get a number."""
     columns = []
     for i, (name, size, kind, count) in enumerate(zip(names, sizes, kinds, counts, strict=True)):
         if (kind, size) not in PCD_TYPES or not 0 < count <= 1 << 16:

@@ -96,7 +96,7 @@ class PictureReader:
         return self.read < FIRST_PICTURES + MOST_PICTURES * done and self._measure_way(pose) >= 1
 
     def _measure_way(self, pose: Array) -> float:
-        """How far the camera moved since the nearest of the last pictures, in distances and angles between two."""
+        """Measure how far the camera moved since the nearest of the last pictures, in distances and angles between two."""
         moved = np.linalg.norm(self._views[:, :3, 3] - pose[:3, 3], axis=1) / KEY_DISTANCE
         cosine = (np.einsum("kij,ij->k", self._views[:, :3, :3], pose[:3, :3]) - 1) / 2
         lengths = np.maximum(moved, np.degrees(np.arccos(np.clip(cosine, -1, 1))) / KEY_ANGLE)

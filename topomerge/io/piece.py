@@ -295,7 +295,7 @@ def start_child(task: str) -> subprocess.Popen[bytes]:
 
 
 def _receive_piece(path: Path, kind: str, stream: IO[bytes]) -> Piece | None:
-    """The next piece, None after the last; an EOFError where the child is no more."""
+    """Return the next piece, None after the last; an EOFError where the child is no more."""
     line = stream.readline()
     if not line.endswith(b"\n"):
         raise EOFError
@@ -321,7 +321,7 @@ def _receive_array(stream: IO[bytes], kind: Any, shape: list[int]) -> Array:
 
 
 def main() -> None:
-    """The child: what it is to do stands behind its name."""
+    """Run the child; what it is to do stands behind its name."""
     module, path, options, seconds, room = json.loads(sys.argv[1])
     reader = importlib.import_module(f"topomerge.io.{module}")
     limit(room=room)

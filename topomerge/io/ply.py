@@ -208,7 +208,7 @@ def _read_ascii(path: Path, header: Header, before: list[Element], vertex: Eleme
 
 
 def _read_whole(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """Files with faces or with lists before the vertices: read by plyfile, the faces sampled."""
+    """Read files with faces or with lists before the vertices by plyfile, and sample the faces."""
     from plyfile import PlyData, PlyElementParseError, PlyHeaderParseError
 
     from topomerge.io.mesh import sample

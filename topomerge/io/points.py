@@ -77,7 +77,7 @@ class _Part:
 
 
 def _join(parts: list[_Part]) -> _Part:
-    """All parts as one and nothing left in the list. What a part lacks is black, without room, pose or intensity."""
+    """Return all parts as one and nothing left in the list. What a part lacks is black, without room, pose or intensity."""
     if len(parts) == 1:
         return parts.pop()
     rows = [len(p.points) for p in parts]

@@ -123,7 +123,7 @@ def _parse_attributes(file: Path, attributes: Any) -> tuple[str, np.dtype[Any] |
 
 
 def _iter_nodes(octree: Octree, deepest: int) -> Iterator[tuple[str, int]]:
-    """Name and number of points of each node; a file of the hierarchy is read when its turn comes."""
+    """Yield the name and number of points of each node; a file of the hierarchy is read when its turn comes."""
     if octree.listed:
         if len(dict(octree.listed)) < len(octree.listed):
             raise build_damage_error(octree.folder, POTREE_KIND, "a node is listed twice")
@@ -146,7 +146,8 @@ def _iter_nodes(octree: Octree, deepest: int) -> Iterator[tuple[str, int]]:
 
 
 def _iter_hierarchy(octree: Octree, root: str) -> Iterator[tuple[str, int, bool]]:
-    """Name, number of points, and whether it has a file of its own, of each node in a file of the hierarchy, by level."""
+    """Yield the name, number of points, and whether it has a file of its own, of each node in a file of the hierarchy, by
+    level."""
     file = _build_node_path(octree, root).with_suffix(".hrc")
     check_node(file)
     data = file.read_bytes()
@@ -168,7 +169,7 @@ def _iter_hierarchy(octree: Octree, root: str) -> Iterator[tuple[str, int, bool]
 
 
 def _build_node_path(octree: Octree, name: str) -> Path:
-    """Where the files of a node lie, without a suffix."""
+    """Return where the files of a node lie, without a suffix."""
     if octree.listed:
         return octree.folder / name
     parts = [name[1 + k * octree.step : 1 + (k + 1) * octree.step] for k in range((len(name) - 1) // octree.step)]

@@ -64,7 +64,7 @@ def _read_camera(path: Path) -> tuple[Camera, list[str]]:
 
 
 def _read_image_list(path: Path, name: str) -> list[tuple[float, Path]]:
-    """(time, file) of each image of a list, in ascending time.
+    """Return (time, file) of each image of a list, in ascending time.
 
     Raises:
         InputError: a line that is none, time that runs backwards, or a name outside of the folder.
@@ -91,7 +91,7 @@ def _read_image_list(path: Path, name: str) -> list[tuple[float, Path]]:
 def _iter_frames(
     path: Path, depths: list[tuple[float, Path]], colors: list[tuple[float, Path]], trajectory: Trajectory, camera: Camera
 ) -> Iterator[Frame]:
-    """One image after the other, without a pose where there is none near its time."""
+    """Yield one image after the other, without a pose where there is none near its time."""
     times = np.array([time for time, _ in depths])
     near = trajectory.measure_gap(times) <= LONGEST_GAP
     if not near.any():

@@ -69,7 +69,8 @@ def _match_layout(folder: Path) -> Layout | None:
 
 
 def _iter_replica(folder: Path) -> Iterator[Frame]:
-    """`results/depth000000.png`, `results/frame000000.jpg`, and line 1 of `traj.txt`; `cam_params.json` here or one above."""
+    """Read `results/depth000000.png`, `results/frame000000.jpg`, and line 1 of `traj.txt`; `cam_params.json` here or one
+    above."""
     camera = _read_replica_camera(folder)
     rows = [row for _, row in _read_rows(folder / "traj.txt", 16)]
     for file, done in _iter_images(folder / "results", "depth*.png"):
@@ -103,7 +104,7 @@ def _read_replica_camera(folder: Path) -> Camera:
 
 
 def _iter_scannet(folder: Path) -> Iterator[Frame]:
-    """`depth/0.png`, `pose/0.txt`, `color/0.jpg`, and `intrinsic/intrinsic_depth.txt`, as ScanNet's exporter writes them."""
+    """Read `depth/0.png`, `pose/0.txt`, `color/0.jpg`, and `intrinsic/intrinsic_depth.txt`, as ScanNet's exporter writes them."""
     camera = _read_matrix_camera(folder / "intrinsic" / "intrinsic_depth.txt")
     stated = folder / "intrinsic" / "intrinsic_color.txt"
     lens = _read_matrix_camera(stated) if stated.is_file() else None
@@ -113,7 +114,7 @@ def _iter_scannet(folder: Path) -> Iterator[Frame]:
 
 
 def _iter_3rscan(folder: Path) -> Iterator[Frame]:
-    """`frame-000000.depth.pgm`, `.pose.txt`, `.color.jpg`, and `_info.txt`, in the folder or in `sequence/`."""
+    """Read `frame-000000.depth.pgm`, `.pose.txt`, `.color.jpg`, and `_info.txt`, in the folder or in `sequence/`."""
     folder = folder if (folder / "_info.txt").is_file() else folder / "sequence"
     info = folder / "_info.txt"
     values = {name.strip(): text.split() for name, _, text in (line.partition("=") for line in _read_text(info).splitlines())}
@@ -143,7 +144,7 @@ def _parse_info_camera(info: Path, values: dict[str, list[str]], what: str) -> C
 
 
 def _iter_arkit(folder: Path) -> Iterator[Frame]:
-    """`lowres_depth/ID_TIME.png`, its calibration in `lowres_wide_intrinsics/ID_TIME.pincam`, and `lowres_wide.traj`.
+    """Read `lowres_depth/ID_TIME.png`, its calibration in `lowres_wide_intrinsics/ID_TIME.pincam`, and `lowres_wide.traj`.
 
     Depth that the device was least sure of (`confidence/` 0) is left out.
     """
@@ -169,7 +170,7 @@ def _iter_arkit(folder: Path) -> Iterator[Frame]:
 
 
 def _read_arkit_trajectory(path: Path) -> Trajectory:
-    """Poses of the camera out of those of the world in it: time, turn (axis times angle), place."""
+    """Read the poses of the camera out of those of the world in it: time, turn (axis times angle), place."""
     numbered = _read_rows(path, 7)
     rows = np.array([row for _, row in numbered])
     back = np.flatnonzero(np.diff(rows[:, 0]) < 0)
@@ -223,7 +224,7 @@ def _read_matrix(path: Path) -> Array:
 
 
 def _read_rows(path: Path, width: int) -> list[tuple[int, list[float]]]:
-    """(number, values) of each line of a trajectory."""
+    """Return (number, values) of each line of a trajectory."""
     _check_exists(path)
     rows = list(iter_number_rows(path, {width: path.name}))
     if not rows:
@@ -244,7 +245,7 @@ def _read_text(path: Path) -> str:
 
 
 def _iter_images(folder: Path, pattern: str) -> Iterator[tuple[Path, float]]:
-    """The files of a pattern in the order of their numbers, with the share that is read after each."""
+    """Yield the files of a pattern in the order of their numbers, with the share that is read after each."""
     shown = (p for p in folder.glob(pattern) if not p.name.startswith("."))  # macOS leaves "._" files beside those that it copies
     files = sorted(shown, key=lambda p: ([int(n) for n in re.findall(r"\d+", p.stem)], p.name))
     if not files:

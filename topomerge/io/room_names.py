@@ -80,7 +80,7 @@ def _find_in_json(path: Path, about: Any) -> Landmarks:
 
 
 def _iter_features(path: Path, about: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Rows of landmarks: features that are some, and the names of polygons that these do not say."""
+    """Yield the rows of landmarks: features that are some, and the names of polygons that these do not say."""
     shapes = [(feature.get("properties") or {}, feature.get("geometry")) for feature in about["features"]]
     own = [properties for properties, _ in shapes if properties.get("kind") == "landmark"]
     yield from ({**row, "kind": row["of"]} for row in own)
@@ -118,8 +118,8 @@ def _check_metres(path: Path, about: Mapping[str, Any], bounds: Any) -> None:
 
 
 def _iter_cells(path: Path) -> Iterator[dict[str, Any]]:
-    """Rows of the landmarks of IndoorGML (states of the layer that topomerge writes), and of the names of cells that they do not
-    say."""
+    """Yield the rows of the landmarks of IndoorGML (states of the layer that topomerge writes), and of the names of cells that
+    they do not say."""
     if path.stat().st_size > LARGEST_MAP_JSON:
         raise InputError(f"{path}: has more than {LARGEST_MAP_JSON >> 20} MB, too many for IndoorGML; give a part of it")
     text = path.read_bytes()
@@ -174,7 +174,7 @@ def _get_id(element: Any) -> str:
 
 
 def _find_middle(element: Any) -> Any:
-    """(3,) of the positions below an element: the middle from above, at the lowest one; None without any."""
+    """Return the mean (3,) of the positions below an element: the middle from above, at the lowest one; None without any."""
     numbers = [[float(v) for v in (pos.text or "").split()] for pos in element.iter() if _get_name(pos) == "pos"]
     places = np.array([[*row, 0.0][:3] for row in numbers if len(row) in (2, 3)])
     return None if not len(places) else np.array([*places[:, :2].mean(axis=0), places[:, 2].min()])

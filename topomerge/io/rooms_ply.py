@@ -34,7 +34,7 @@ def find_adjacent_rooms(map: TopometricMap) -> Array:
 
 
 def _find_touching_rooms(map: TopometricMap, axis: int) -> Array:
-    """Pairs of rooms that follow each other along an axis, seen from above, no further apart than `GAP`."""
+    """Return the pairs of rooms that follow each other along an axis, seen from above, no further apart than `GAP`."""
     inside = map.navigable_room >= 0
     room = map.navigable_room[inside].astype(np.int64)
     along, across = map.navigable.cells[inside][:, (axis, 1 - axis)].T.astype(np.int64)

@@ -254,7 +254,7 @@ def _iter_pieces(path: Path, base: sqlite3.Connection, options: ReadOptions) -> 
 
 
 def _read_pictures(path: Path, base: sqlite3.Connection, version: tuple[int, ...], poses: Poses, options: ReadOptions) -> Piece:
-    """Signs and tags on the pictures of a recording whose points are those of a laser."""
+    """Read the signs and tags on the pictures of a recording whose points are those of a laser."""
     reader = PictureReader(options.text, options.tag_size)
     if reader.reads_text:
         for frame in _iter_frames(path, base, version, poses, reader.is_due):
@@ -342,7 +342,7 @@ def _detect_kind(path: Path, base: sqlite3.Connection, version: tuple[int, ...])
 def _iter_scans(
     path: Path, base: sqlite3.Connection, version: tuple[int, ...], poses: Poses, flat: bool, warnings: list[str]
 ) -> Iterator[PosedScan]:
-    """The laser scans of all nodes that have a pose."""
+    """Yield the laser scans of all nodes that have a pose."""
     count, lost = base.execute("SELECT COUNT(*) FROM Data WHERE LENGTH(scan) > 4").fetchone()[0], 0
     rows = base.execute("SELECT id, scan_info, scan FROM Data WHERE LENGTH(scan) > 4 ORDER BY id")
     for number, (node, info, blob) in enumerate(rows, 1):
@@ -369,7 +369,7 @@ def _iter_frames(
     poses: Poses,
     is_due: Callable[[Array, float], bool] = lambda pose, done: True,
 ) -> Iterator[Frame | None]:
-    """The depth images of the nodes that are due; those of several cameras lie side by side in one image."""
+    """Yield the depth images of the nodes that are due; those of several cameras lie side by side in one image."""
     count = base.execute("SELECT COUNT(*) FROM Data WHERE LENGTH(depth) > 4").fetchone()[0]
     columns = "Data.id, Node.stamp, calibration, depth, image"
     rows = base.execute(f"SELECT {columns} FROM Data LEFT JOIN Node USING (id) WHERE LENGTH(depth) > 4 ORDER BY Data.id")
@@ -397,7 +397,7 @@ def _iter_frames(
 
 
 def _split_image(image: Array | None, count: int) -> list[Array | None]:
-    """An image of several cameras cut into that of each; None where there is none, or it can't be cut."""
+    """Cut an image of several cameras into that of each; None where there is none, or it can't be cut."""
     if image is None or image.shape[1] % count:
         return [None] * count
     return list(np.split(image, count, axis=1))
@@ -418,7 +418,7 @@ def _read_number(value: object) -> float:
 
 
 def _read_landmarks(path: Path, base: sqlite3.Connection, poses: Poses) -> Landmarks:
-    """Tags, labels, readings of radio and of pressure, where the graph puts their nodes."""
+    """Read the tags, labels, readings of radio and of pressure, where the graph puts their nodes."""
     tables = dict(base.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
     plain = {name for name, sql in tables.items() if not re.search(r"(?i)\bAS\b", str(sql))}
     columns = {f"{table}.{row[1]}" for table in plain & {"Node", "Data"} for row in base.execute(f"PRAGMA table_info({table})")}
@@ -435,7 +435,8 @@ def _read_landmarks(path: Path, base: sqlite3.Connection, poses: Poses) -> Landm
 
 
 def _read_readings(path: Path, base: sqlite3.Connection, columns: set[str]) -> list[tuple[str, int, float, float]]:
-    """Kind, node, value and time of each reading of radio (dBm) and of pressure (hPa); senders of radio are not known."""
+    """Return the kind, node, value and time of each reading of radio (dBm) and of pressure (hPa); senders of radio are not
+    known."""
     readings = []
     if "Node.env_sensors" in columns:
         for node, blob in base.execute("SELECT id, env_sensors FROM Node WHERE LENGTH(env_sensors) >= 24 ORDER BY id"):
@@ -470,7 +471,7 @@ def _read_labels(base: sqlite3.Connection, poses: Poses) -> Landmarks:
 
 
 def _read_tags(path: Path, base: sqlite3.Connection, poses: Poses, stated: bool) -> Landmarks:
-    """Tags that nodes saw, where the graph puts them, else where the nodes saw them."""
+    """Read the tags that nodes saw, where the graph puts them, else where the nodes saw them."""
     dictionary = None
     for (text,) in base.execute("SELECT parameters FROM Info LIMIT 1") if stated else ():
         dictionary = DICTIONARY.search(text if isinstance(text, str) else "")

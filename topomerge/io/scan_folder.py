@@ -143,7 +143,7 @@ def match_poses(folder: Path, scans: list[Path], trajectory: Trajectory, source:
 
 
 def _is_numbered(scan: Path) -> bool:
-    """Does the name end with a number that is no time?"""
+    """Return whether the name ends with a number that is no time."""
     match = NAME_TIME.search(scan.stem)
     return match is not None and match[1] is None and match[3].isdigit() and len(match[3]) <= INDEX_DIGITS
 
@@ -172,7 +172,7 @@ def _iter_posed_scans(scans: list[Path], poses: list[Array | None], options: Rea
 
 
 def _iter_viewpoint_scans(path: Path, scans: list[Path], options: ReadOptions) -> Iterator[PosedScan]:
-    """Scans in one frame, each with the place of the sensor in its own header."""
+    """Yield scans in one frame, each with the place of the sensor in its own header."""
     for number, scan in enumerate(scans, 1):
         pose = None
         for piece in _read_scan(scan, options):
@@ -187,7 +187,7 @@ def _iter_viewpoint_scans(path: Path, scans: list[Path], options: ReadOptions) -
 
 
 def _read_scan(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """Blocks of one scan, whose file an error names."""
+    """Yield the blocks of one scan, whose file an error names."""
     readers = {".ply": ply.read, ".pcd": pcd.read, ".bin": _read_bin}
     try:
         yield from readers[path.suffix.lower()](path, replace(options, poses=None))

@@ -110,7 +110,7 @@ def fuse_sightings(sightings: Sequence[Sighting], source: str) -> Landmarks:
 
 
 def _measure_distance(group: Sequence[Sighting], sighting: Sighting) -> float:
-    """How far a sighting is from those of one thing, m; inf: it is another."""
+    """Return how far a sighting is from those of one thing, m; inf: it is another."""
     first = group[0]
     distance = float(np.linalg.norm(np.median([s.position for s in group[-5:]], axis=0) - sighting.position))
     if first.kind != sighting.kind or (
@@ -129,7 +129,7 @@ def _measure_distance(group: Sequence[Sighting], sighting: Sighting) -> float:
 
 
 def _drop_fragments(groups: list[list[Sighting]]) -> list[list[Sighting]]:
-    """The things without texts that are parts of another one nearby, as pictures show that cut it off."""
+    """Drop the things without texts that are parts of another one nearby, as pictures show that cut it off."""
     from scipy.spatial import cKDTree
 
     texts = [number for number, group in enumerate(groups) if group[0].kind == "text"]
@@ -151,7 +151,7 @@ def _drop_fragments(groups: list[list[Sighting]]) -> list[list[Sighting]]:
 
 
 def _count_votes(group: Sequence[Sighting]) -> dict[str, float]:
-    """How surely each value was read, all sightings together."""
+    """Return how surely each value was read, all sightings together."""
     votes: dict[str, float] = {}
     for sighting in group:
         votes[sighting.value] = votes.get(sighting.value, 0.0) + sighting.confidence
@@ -178,7 +178,7 @@ def _build_fused(kind: str, groups: Sequence[Sequence[Sighting]], source: str) -
 
 
 def _average_positions(group: Sequence[Sighting]) -> tuple[Array, float]:
-    """The robust mean (3,) of the positions, and its uncertainty, m."""
+    """Return the robust mean (3,) of the positions, and its uncertainty, m."""
     positions, sigmas = np.array([s.position for s in group]), np.array([s.sigma for s in group])
     off = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
     kept = off <= np.maximum(3 * np.median(off), 2 * sigmas)

@@ -58,7 +58,7 @@ class StreamCounts:
 
 
 def normalise_type(name: str) -> str:
-    """Name of a type as ROS 2 writes it: ``sensor_msgs/msg/LaserScan``."""
+    """Return the name of a type as ROS 2 writes it: ``sensor_msgs/msg/LaserScan``."""
     parts = name.split("/")
     return f"{parts[0]}/msg/{parts[-1]}"
 
@@ -401,7 +401,7 @@ def _read_message(data: bytes, topics: Collection[str], channels: Mapping[int, t
 
 
 def _unpack_chunk(data: bytes) -> bytes:
-    """The records of a chunk.
+    """Return the records of a chunk.
 
     Raises:
         ValueError: too large, damaged, or packed in another way.

@@ -177,7 +177,7 @@ def find_svg_texts(root: xml.Element, size: tuple[float, float], zoom: float) ->
 
 
 def _find_lines(element: xml.Element, matrix: Array, height: float) -> Iterator[PictureText]:
-    """The lines of a text: each tspan with a y or dy of its own begins one."""
+    """Yield the lines of a text: each tspan with a y or dy of its own begins one."""
     lines: list[tuple[list[float], str]] = []
     place = _read_place(element, [0.0, 0.0])
     lines.append((place, element.text or ""))
@@ -199,7 +199,7 @@ def _find_lines(element: xml.Element, matrix: Array, height: float) -> Iterator[
 
 
 def _read_place(element: xml.Element, default: list[float]) -> list[float]:
-    """x and y of a text, where they are stated."""
+    """Return x and y of a text, where they are stated."""
     found = [re.match(NUMBER, element.get(name, "").strip()) for name in ("x", "y")]
     return [float(f[0]) if f else value for f, value in zip(found, default, strict=True)]
 

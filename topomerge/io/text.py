@@ -94,14 +94,14 @@ def _parse(block: list[str], columns: tuple[int, ...], delimiter: str | None) ->
 
 
 def _strip_comment(line: str) -> str:
-    """The line without a comment."""
+    """Return the line without a comment."""
     for mark in COMMENTS:
         line = line.split(mark, 1)[0]
     return line
 
 
 def _find_first_bad_line(block: list[str], columns: tuple[int, ...], delimiter: str | None) -> tuple[int, str]:
-    """Number (from 1) and text of the first line of a block that can't be read."""
+    """Return the number (from 1) and text of the first line of a block that can't be read."""
     for number, line in enumerate(block, 1):
         fields = line.strip().split(delimiter)
         try:
@@ -113,7 +113,7 @@ def _find_first_bad_line(block: list[str], columns: tuple[int, ...], delimiter: 
 
 
 def _sniff(path: Path) -> _Layout:
-    """Delimiter, columns and first row of a table, from its first lines."""
+    """Return the delimiter, columns and first row of a table, from its first lines."""
     with path.open("rb") as stream:
         head = stream.read(HEAD_BYTES)
     if b"\0" in head:
@@ -136,7 +136,7 @@ def _sniff(path: Path) -> _Layout:
 
 
 def _detect_delimiter(text: str) -> tuple[str | None, bool]:
-    """Delimiter of a line (None: white space), and whether its numbers have decimal commas."""
+    """Return the delimiter of a line (None: white space), and whether its numbers have decimal commas."""
     if ";" in text:
         return ";", "," in text and "." not in text
     if re.search(r"\d,\d+[ \t]+-?\d", text):
@@ -145,7 +145,7 @@ def _detect_delimiter(text: str) -> tuple[str | None, bool]:
 
 
 def _find_numeric_fields(fields: list[str], comma: bool) -> list[int]:
-    """Which of the fields are numbers."""
+    """Return which of the fields are numbers."""
     numeric_columns = []
     for column, text in enumerate(fields):
         try:
@@ -157,7 +157,7 @@ def _find_numeric_fields(fields: list[str], comma: bool) -> list[int]:
 
 
 def _match_header_columns(header: list[str], width: int) -> tuple[int, ...]:
-    """Columns of x, y, z and of colours by their names; none where no header fits."""
+    """Return the columns of x, y, z and of colours by their names; none where no header fits."""
     if len(header) != width:
         return ()
     axes = next(names for names in AXES if all(n in header for n in names))
@@ -166,7 +166,7 @@ def _match_header_columns(header: list[str], width: int) -> tuple[int, ...]:
 
 
 def _guess_columns(numbers: list[int], lines: list[str], delimiter: str | None) -> tuple[int, ...]:
-    """Columns of x, y, z and of colours by what stands in them."""
+    """Guess the columns of x, y, z and of colours by what stands in them."""
     for start in (3, 4):  # x y z r g b, and x y z intensity r g b
         if len(numbers) >= start + 3 and _are_bytes(lines, numbers[start : start + 3], delimiter):
             return (*numbers[:3], *numbers[start : start + 3])

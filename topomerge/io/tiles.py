@@ -82,7 +82,7 @@ def _list_tiles(folder: Path) -> list[Path]:
 
 
 def _read_tile(file: Path, form: Format, options: ReadOptions) -> Iterator[Piece]:
-    """The pieces of one file, which an error names.
+    """Yield the pieces of one file, which an error names.
 
     Raises:
         InputError: it can't be read.

@@ -269,7 +269,7 @@ class FrameTree:
         return ""
 
     def forget(self, frame: str) -> None:
-        """Nothing is known of where the frame stands."""
+        """Forget where the frame stands."""
         self._edges.pop(frame, None)
 
     def list_rigid_chain(self, frame: str) -> list[str]:

@@ -85,7 +85,7 @@ def save_transformed_points(
 def _save_ply(
     source: Path, target: Path, move: Move, layout: tuple[str, bool], progress: Progress | None, options: dict[str, Any]
 ) -> int | None:
-    """Points written; None where colours came after a block without."""
+    """Write the points, and return how many; None where colours came after a block without."""
     real, colored = layout
     count = 0
     with target.open("wb") as stream:
@@ -103,7 +103,7 @@ def _save_ply(
 
 
 def _write_head(stream: BinaryIO, real: str, colored: bool, count: int) -> None:
-    """The header; of one length, whatever the count."""
+    """Write the header; of one length, whatever the count."""
     number = str(count)
     names = {"f4": "float", "f8": "double"}
     lines = [

@@ -146,7 +146,7 @@ def refuse_outside(path: Path) -> None:
 
 
 def _iter_parts(path: Path, stage: Any) -> Iterator[Part]:
-    """The meshes and boxes of a stage, placed in the world."""
+    """Yield the meshes and boxes of a stage, placed in the world."""
     from pxr import Usd, UsdGeom
 
     unit = float(UsdGeom.GetStageMetersPerUnit(stage))

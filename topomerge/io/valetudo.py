@@ -58,7 +58,7 @@ def is_robot_map(about: object) -> bool:
 
 
 def _is_rand256_map(about: Mapping[str, Any]) -> bool:
-    """Is it the JSON of Valetudo RE (rand256)?"""
+    """Return whether it is the JSON of Valetudo RE (rand256)."""
     image = about.get("image")
     return isinstance(image, dict) and isinstance(image.get("pixels"), dict) and isinstance(image.get("dimensions"), dict)
 
@@ -232,7 +232,8 @@ def parse_roborock_map(path: Path, data: bytes) -> RobotMap:
 
 
 def _build_roborock_map(path: Path, pixels: Array, corner: tuple[int, int]) -> RobotMap:
-    """Of a picture whose lowest three bits say what a pixel is, 1 wall and others floor, and the upper five which room."""
+    """Build the map of a picture whose lowest three bits say what a pixel is, 1 wall and others floor, and the upper five which
+    room."""
     low = pixels & 7
     walls, segment = (low == 1) | ((low == 0) & (pixels > 0)), np.where(low == 7, pixels >> 3, 0)
     free = (pixels > 0) & ~walls
@@ -244,7 +245,7 @@ def _build_roborock_map(path: Path, pixels: Array, corner: tuple[int, int]) -> R
 
 
 def _parse_rand256_map(path: Path, about: Mapping[str, Any]) -> RobotMap:
-    """The same of Valetudo RE, whose rows are counted from the top."""
+    """Parse the same of Valetudo RE, whose rows are counted from the top."""
     image = about["image"]
     sizes: list[Any] = [image["dimensions"].get(side) for side in ("height", "width")]
     corner: list[Any] = [(image.get("position") or {}).get(side) for side in ("left", "top")]
@@ -269,7 +270,7 @@ def _parse_rand256_map(path: Path, about: Mapping[str, Any]) -> RobotMap:
 
 
 def _parse_pixels(path: Path, listed: Any, width: int, height: int, name: str) -> tuple[Array, Array]:
-    """Numbers of pixels of a list of pairs x, y, or of whole numbers; and what is packed above these."""
+    """Return the numbers of pixels of a list of pairs x, y, or of whole numbers; and what is packed above these."""
     try:
         values = np.array(listed)
     except ValueError as error:

@@ -85,7 +85,7 @@ def _probe() -> None: ...
 
 
 def _create_private_folder() -> Path:
-    """A folder that nobody else can write to: what is kept there is code.
+    """Create a folder that nobody else can write to: what is kept there is code.
 
     Raises:
         OSError: there is none.

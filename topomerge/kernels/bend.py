@@ -9,7 +9,7 @@ from topomerge.kernels import compile_ahead
 
 @compile_ahead("f8[:,::1], i8[::1], i8[::1], f8[:,::1], f8[::1], f8[::1], f8[::1], f4[:,:,::1], f8[::1], f8", error_model="numpy")
 def score_moves(points, sector, start, places, turns, yaws, shifts, gain, origin, edge):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(K, Y, S, S) sums of the gain at the points of each piece under each turn and shift.
+    """Return (K, Y, S, S) sums of the gain at the points of each piece under each turn and shift.
 
     Args:
         points: (n, 2) m about the anchor of their piece; sector (n,) int, which gain each point has.
@@ -45,7 +45,8 @@ def score_moves(points, sector, start, places, turns, yaws, shifts, gain, origin
 
 @compile_ahead("f8[:,::1], f8[::1], i8[::1], i8, f8[:,::1], f4[:,::1], f8[::1], f8", error_model="numpy")
 def sum_shifted_values(points, weights, owner, owners, shifts, values, origin, edge):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(S, owners) sums of the values of a raster (nx, ny) at weighted points (n, 2) of each owner, moved by each shift (S, 2)."""
+    """Return (S, owners) sums of the values of a raster (nx, ny) at weighted points (n, 2) of each owner, moved by each shift (S,
+    2)."""
     out = np.zeros((len(shifts), owners))
     for k in range(len(shifts)):
         for p in range(len(points)):
@@ -58,8 +59,8 @@ def sum_shifted_values(points, weights, owner, owners, shifts, values, origin, e
 
 @compile_ahead("i4[:,::1], f8[:,::1], i8[:,::1], i8, i8", error_model="numpy")
 def estimate_line_normals(row, points, columns, reach, least):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(n, 2) unit normals of the lines through the points within `reach` columns of each one, and (n,) how straight these are
-    (0 to 1); 0 where fewer than `least` points are near.
+    """Return (n, 2) unit normals of the lines through the points within `reach` columns of each one, and (n,) how straight these
+    are (0 to 1); 0 where fewer than `least` points are near.
 
     Args:
         row: (nx, ny) int32 row of the point in each column, -1 none.
@@ -95,8 +96,8 @@ def estimate_line_normals(row, points, columns, reach, least):  # type: ignore[n
 def build_line_equations(
     points, normal, faced, start, places, turns, row, target, target_normal, target_faced, origin, edge, reach, sigma
 ):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Normal equations of a shift and a turn of each piece: each of its points and the nearest one of the target whose normal is
-    alike, within `reach` columns; two sides of a wall are not alike.
+    """Build the normal equations of a shift and a turn of each piece: each of its points and the nearest one of the target whose
+    normal is alike, within `reach` columns; two sides of a wall are not alike.
 
     Args:
         points: (n, 2) m about the anchor of their piece; normal (n, 2), towards empty space where `faced` (n,).
@@ -149,7 +150,8 @@ def build_line_equations(
 
 @compile_ahead("f8[:,::1], f8[::1], f8, f8[:,:,::1]", error_model="numpy")
 def interpolate_nodes(points, origin, step, nodes):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(n, 2) bilinear values at points (n, 2) of those at the nodes (nx, ny, 2) of a lattice; outside the value at its rim.
+    """Return (n, 2) bilinear values at points (n, 2) of those at the nodes (nx, ny, 2) of a lattice; outside the value at its
+    rim.
 
     Args:
         origin: (2,) m, node (0, 0); step: m between nodes.
@@ -170,8 +172,8 @@ def interpolate_nodes(points, origin, step, nodes):  # type: ignore[no-untyped-d
 
 @compile_ahead("u1[:,:,::1], f4[::1], f4[:,::1], b1[:,::1]", error_model="numpy")
 def compute_wall_gain(level, table, lost, seen):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(Q, nx, ny) float32: the entry of a table (256,) at each level (Q, nx, ny) uint8, less what is lost there (nx, ny) float32;
-    0 where nothing was seen (nx, ny) and the entry is not above 0."""
+    """Return (Q, nx, ny) float32: the entry of a table (256,) at each level (Q, nx, ny) uint8, less what is lost there (nx, ny)
+    float32; 0 where nothing was seen (nx, ny) and the entry is not above 0."""
     out = np.zeros(level.shape, np.float32)
     for q in range(level.shape[0]):
         for i in range(level.shape[1]):
@@ -184,7 +186,7 @@ def compute_wall_gain(level, table, lost, seen):  # type: ignore[no-untyped-def]
 
 @compile_ahead("f8[:,::1], f8[:,::1], i8[:,::1], f8[:,::1], f8[:,::1], f8", error_model="numpy")
 def blend_moves(points, distance, nearest, anchors, moves, reach):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(n, 2) m: shifts of points (n, 2) by the moves (k, 4) of pieces about their anchors (k, 2).
+    """Return (n, 2) m: shifts of points (n, 2) by the moves (k, 4) of pieces about their anchors (k, 2).
 
     Args:
         distance, nearest: (n, q) m to the nearest pieces, ascending, and which these are.

@@ -79,7 +79,7 @@ def compute_crc32c(pages: NDArray[np.uint8]) -> NDArray[np.uint32]:
 
 @njit(cache=True)
 def _walk_octree(data, keys, depths, states, stack):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Walk the nodes; returns (leaves, bytes read), leaves -1 where the tree is broken."""
+    """Walk the nodes; return (leaves, bytes read), leaves -1 where the tree is broken."""
     count, at = 0, 0
     top = 1
     stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = 0, 0, 0, 0
@@ -108,7 +108,7 @@ def _walk_octree(data, keys, depths, states, stack):  # type: ignore[no-untyped-
 
 
 def read_octree_leaves(data: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None:
-    """Leaves of an OctoMap's nodes in depth-first order, or None where they are cut short or broken.
+    """Return the leaves of an OctoMap's nodes in depth-first order, or None where they are cut short or broken.
 
     Returns:
         (n, 3) int32 smallest cell of each leaf in 0..65535, (n,) int8 depth 1..16 and (n,) int8 FREE_LEAF or OCCUPIED_LEAF.
@@ -125,7 +125,7 @@ def read_octree_leaves(data: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[A
 
 @njit(cache=True)
 def _walk_full_octree(data, width, keys, depths, states, stack):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Walk the nodes of `width` bytes, log-odds first and bits of the children last; returns as `_octree`."""
+    """Walk the nodes of `width` bytes, log-odds first and bits of the children last; return as `_walk_octree` does."""
     top, count, at = 1, 0, 0
     stack[0, :] = 0
     while top > 0:
@@ -155,7 +155,8 @@ def _walk_full_octree(data, width, keys, depths, states, stack):  # type: ignore
 
 
 def read_full_octree_leaves(data: NDArray[np.uint8], width: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None:
-    """As `read_octree_leaves`, of the nodes of a full OctoMap, each of `width` bytes; the root may be a leaf (of depth 0)."""
+    """Return, as `read_octree_leaves`, the leaves of the nodes of a full OctoMap, each of `width` bytes; the root may be a leaf
+    (of depth 0)."""
     room = len(data) // width
     keys, depths, states = np.empty((room, 3), np.int32), np.empty(room, np.int8), np.empty(room, np.int8)
     stack = np.empty((8 * LEAF_LEVEL + 8, 4), np.int32)

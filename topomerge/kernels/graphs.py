@@ -17,8 +17,8 @@ LEAST_SETS = 64  # of a slice
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def run_mcl_step(indptr, indices, values, inflation, threshold, most):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Expansion (M @ M), inflation, pruning below `threshold` and to the `most` largest entries; also the largest "chaos" of a
-    column (its maximum minus its sum of squares: 0 once the column is settled). Columns in CSC form."""
+    """Expand (M @ M), inflate, and prune below `threshold` and to the `most` largest entries; return also the largest "chaos" of
+    a column (its maximum minus its sum of squares: 0 once the column is settled). Columns in CSC form."""
     n = len(indptr) - 1
     counts = np.zeros(n, np.int64)
     rows = np.zeros((n, most), np.int32)
@@ -79,7 +79,8 @@ def run_mcl_step(indptr, indices, values, inflation, threshold, most):  # type: 
 
 @compile_ahead("i4[::1], i4[::1], f8[::1], f8[::1]")
 def compute_selected_inverse(indptr, rows, values, diagonal):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Lower half of the inverse of L D L^T on the entries of L; nan at its first entry if those do not close under elimination.
+    """Compute the lower half of the inverse of L D L^T on the entries of L; nan at its first entry if those do not close under
+    elimination.
 
     Args:
         indptr, rows, values: L by columns, rows rising, the ones on its diagonal first.
@@ -113,7 +114,7 @@ def compute_selected_inverse(indptr, rows, values, diagonal):  # type: ignore[no
 
 @intrinsic
 def count_bits(typingctx, value):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Number of ones in a uint64: the processor has an instruction for it."""
+    """Count the ones in a uint64: the processor has an instruction for it."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
         return builder.ctpop(args[0])
@@ -122,7 +123,7 @@ def count_bits(typingctx, value):  # type: ignore[no-untyped-def]  # pragma: no 
 
 
 def count_intersections(indptr: Ints, words: Ints, masks: Ints, first: Ints, second: Ints) -> Ints:
-    """(p,) size of the intersection of sets first[k] and second[k]."""
+    """Return the (p,) size of the intersection of sets first[k] and second[k]."""
     out = np.zeros(len(first), np.int64)
     run_in_slices(_count_intersections, len(first), LEAST_SETS, indptr, words, masks, first, second, out)
     return out
@@ -144,7 +145,7 @@ def _count_intersections(begin, end, indptr, words, masks, first, second, out): 
 
 
 def compute_extents(indptr: Ints, words: Ints, masks: Ints, values: Ints) -> Ints:
-    """(s, 2) smallest and largest of the rows' values in each set; (largest, smallest) integers for an empty one."""
+    """Return the (s, 2) smallest and largest of the rows' values in each set; (largest, smallest) integers for an empty one."""
     out = np.empty((len(indptr) - 1, 2), np.int64)
     run_in_slices(_compute_extents, len(out), LEAST_SETS, indptr, words, masks, values, out)
     return out
@@ -166,7 +167,7 @@ def _compute_extents(first, last, indptr, words, masks, values, out):  # type: i
 
 @njit(cache=True)
 def find_most_voted(indptr, words, masks, order, cluster, winner):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """For each row the cluster with the most sets that hold it, in place; ties go to the smaller cluster number.
+    """Find for each row the cluster with the most sets that hold it, in place; ties go to the smaller cluster number.
 
     `order` lists the sets cluster by cluster, in ascending order of `cluster`.
     """

@@ -11,7 +11,7 @@ from topomerge.kernels import compile_ahead
 
 @njit(cache=True, nogil=True)
 def cut(planes, room, corner, number, side, step):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(n, side, side, P + 1) uint8: the planes from each corner on, then how much of each pixel is the room of that number.
+    """Cut (n, side, side, P + 1) uint8: the planes from each corner on, then how much of each pixel is the room of that number.
 
     Pixels off the sheet are 0.
 
@@ -61,7 +61,7 @@ def interpolate_drift(knots, x, y):  # type: ignore[no-untyped-def]  # pragma: n
 
 @njit(cache=True, nogil=True)
 def interpolate_drifts(knots, places):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(n, 2) `drift` of places (n, 2) float64."""
+    """Return the (n, 2) `drift` of places (n, 2) float64."""
     out = np.zeros((len(places), 2))
     for k in range(len(places)):
         out[k, 0], out[k, 1] = interpolate_drift(knots, places[k, 0], places[k, 1])
@@ -70,7 +70,7 @@ def interpolate_drifts(knots, places):  # type: ignore[no-untyped-def]  # pragma
 
 @njit(cache=True, nogil=True)
 def warp_sheet(planes, room, back, low, shape, knots, step):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Planes (*shape, P) uint8 and rooms (*shape) int16: each pixel is that of the sheet that came there; off it 0 and -1.
+    """Return planes (*shape, P) uint8 and rooms (*shape) int16: each pixel is that of the sheet that came there; off it 0 and -1.
 
     Args:
         planes: (H, W, P) uint8; room: (H, W) int16.
@@ -157,8 +157,8 @@ def fill_strips(
 
 
 def _find_touched_tiles(frames: Floats, along: Floats, across: float, low: Floats, tile: float, columns: Ints) -> Ints:
-    """(n, 2) square and strip of all that touch each other, ascending: squares of places in a strip that are closer to each other
-    than a square is wide."""
+    """Return the (n, 2) square and strip of all that touch each other, ascending: squares of places in a strip that are closer to
+    each other than a square is wide."""
     d = np.linspace(0, across, int(np.ceil(4 * across / tile)) + 2)
     aside = tile / 4 * np.array([(u, v) for u in (-1, 0, 1) for v in (-1, 0, 1)])
     steps = np.ceil(4 * along / tile).astype(np.int64) + 2

@@ -41,7 +41,8 @@ def _clip(corners, owner, count, x, y, half, name):  # type: ignore[no-untyped-d
 
 @njit(cache=True)
 def compute_voronoi_weights(flat, spacing):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Area of each point's cell, and the weight of each of its neighbours: length of the common side over the distance.
+    """Return the area of each point's cell, and the weight of each of its neighbours: length of the common side over the
+    distance.
 
     Args:
         flat: (n, k, 2) float64 neighbours in the tangent plane of each point, the point itself being the origin.
@@ -87,7 +88,7 @@ def compute_voronoi_weights(flat, spacing):  # type: ignore[no-untyped-def]  # p
 
 @njit(cache=True, inline="always")
 def _draw_uniform(number):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Uniform in [0, 1) from an integer (splitmix64)."""
+    """Draw a number uniform in [0, 1) from an integer (splitmix64)."""
     h = (np.uint64(number) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
     h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -134,7 +135,7 @@ def _walk(triangles, spacing, first, points, owner, fill):  # type: ignore[no-un
 
 
 def sample_triangles(triangles: NDArray[Any], spacing: float, first: int = 0) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """(n, 3) points on triangles (m, 3, 3) and the (n,) triangle of each; `first` is the number of the first triangle.
+    """Return (n, 3) points on triangles (m, 3, 3) and the (n,) triangle of each; `first` is the number of the first triangle.
 
     The caller bounds the area: n is about the area over spacing².
     """

@@ -34,7 +34,7 @@ def _compute_bounds(first, last, points, low, high):  # type: ignore[no-untyped-
 
 
 def compute_bounds(points: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
-    """Lowest and highest finite coordinates of (N, 3) points and the number of points that are not finite."""
+    """Return the lowest and highest finite coordinates of (N, 3) points and the number of points that are not finite."""
 
     def compute(first: int, last: int) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -46,7 +46,7 @@ def compute_bounds(points: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[n
 
 @compile_ahead("f4[:,::1], i8, f8[::1], f8", error_model="numpy")
 def _locate_cell(points, i, shift, edge):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Is point i finite, and its lattice cell floor((p + shift) / edge)."""
+    """Return whether point i is finite, and its lattice cell floor((p + shift) / edge)."""
     x, y, z = points[i, 0], points[i, 1], points[i, 2]
     if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
         return False, 0, 0, 0
@@ -60,13 +60,13 @@ def _locate_cell(points, i, shift, edge):  # type: ignore[no-untyped-def]  # pra
 
 @njit(cache=True, inline="always")
 def _find_part(place):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Which of the `OFFSET_STEPS` parts of its cell a place, in cells, lies in: exact: a power of 2."""
+    """Return which of the `OFFSET_STEPS` parts of its cell a place, in cells, lies in: exact: a power of 2."""
     return np.int64(np.floor(place * OFFSET_STEPS)) & (OFFSET_STEPS - 1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def convert_to_lattice(points, shift, edge, out, parts):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Lattice cell of each point, and its part of the cell; points that are not finite get the lowest integer."""
+    """Return the lattice cell of each point, and its part of the cell; points that are not finite get the lowest integer."""
     for i in range(len(points)):
         finite, x, y, z = _locate_cell(points, i, shift, edge)
         if finite:
@@ -79,7 +79,7 @@ def convert_to_lattice(points, shift, edge, out, parts):  # type: ignore[no-unty
 
 @compile_ahead("i8, i8, f4[:,::1], f8[::1], f8, i8[::1], i4[:,:,::1]", error_model="numpy")
 def mark(first, last, points, shift, edge, base, table):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """First pass: 1 in `table` for each brick that holds a point. Threads may write the same 1 twice."""
+    """Set, in a first pass, 1 in `table` for each brick that holds a point. Threads may write the same 1 twice."""
     for i in range(first, last):
         finite, x, y, z = _locate_cell(points, i, shift, edge)
         if finite:
@@ -88,7 +88,7 @@ def mark(first, last, points, shift, edge, base, table):  # type: ignore[no-unty
 
 @njit(cache=True, inline="always")
 def _encode_place(x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Place of a cell in its brick, in Morton order."""
+    """Return the place of a cell in its brick, in Morton order."""
     x3, y3, z3 = x & 7, y & 7, z & 7
     code = (x3 & 1) | (y3 & 1) << 1 | (z3 & 1) << 2
     code |= (x3 & 2) << 2 | (y3 & 2) << 3 | (z3 & 2) << 4
@@ -97,8 +97,9 @@ def _encode_place(x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover 
 
 @compile_ahead("i8, i8, f4[:,::1], f8[::1], f8, i8[::1], i4[:,:,::1], i8, i8[::1], i8[:,::1]", error_model="numpy")
 def sort_places(first, last, points, shift, edge, base, table, bits, places, starts):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Second pass, of slabs of `SLAB` points: place of each point's cell in the bricks in use, with the parts of its cell in the
-    24 lowest bits, in order of bins of ``2**bits`` places; starts (slabs, bins + 1) of the bins in `places`."""
+    """Write, in a second pass, of slabs of `SLAB` points, the place of each point's cell in the bricks in use, with the parts of
+    its cell in the 24 lowest bits, in order of bins of ``2**bits`` places; and the starts (slabs, bins + 1) of the bins in
+    `places`."""
     buffer = np.empty(min(SLAB, len(points)), np.int64)
     ends = np.empty(starts.shape[1], np.int64)
     for slab in range(first, last):
@@ -131,7 +132,7 @@ def sort_places(first, last, points, shift, edge, base, table, bits, places, sta
 
 @compile_ahead("i8, i8, i8, i8[::1], i8[:,::1], u4[::1], i8[::1]")
 def count_cells(first, last, bits, places, starts, counts, occupied):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Third pass, of bins: points in each cell, and how many cells of the bin are occupied."""
+    """Count, in a third pass, of bins, the points in each cell, and how many cells of the bin are occupied."""
     for k in range(first, last):
         for slab in range(len(starts)):
             for i in range(starts[slab, k], starts[slab, k + 1]):
@@ -142,8 +143,8 @@ def count_cells(first, last, bits, places, starts, counts, occupied):  # type: i
 
 @compile_ahead("i8, i8, i8, i8[::1], i8[:,::1], u4[::1], i8[::1], i8[::1], i8[::1], i8[:,::1]")
 def add_parts(first, last, bits, places, starts, counts, rows, cells, numbers, sums):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Fourth pass, of bins, whose first cell has the row `rows[bin]`: of each occupied cell its place, its points and the sums
-    (n, 3) of the parts of the cell that they lie in, or (n, 6): with how many of them are odd."""
+    """Write, in a fourth pass, of bins, whose first cell has the row `rows[bin]`, of each occupied cell its place, its points and
+    the sums (n, 3) of the parts of the cell that they lie in, or (n, 6): with how many of them are odd."""
     odd = sums.shape[1] == 6
     for k in range(first, last):
         row = rows[k]
@@ -242,7 +243,8 @@ Occupied = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArra
 def find_occupied_codes(
     points: NDArray[Any], shift: NDArray[Any], edge: float, origin: NDArray[np.int64], odd: bool = False
 ) -> Run | None:
-    """Occupied lattice cells of one chunk of points, by Morton codes; None where these do not reach, or the extent is too large.
+    """Return the occupied lattice cells of one chunk of points, by Morton codes; None where these do not reach, or the extent is
+    too large.
 
     Args:
         points, shift, edge: as of `find_occupied_cells`.
@@ -259,7 +261,7 @@ def find_occupied_codes(
 
 
 def find_occupied_cells(points: NDArray[Any], shift: NDArray[Any], edge: float) -> Occupied:
-    """Occupied lattice cells of one chunk of points.
+    """Return the occupied lattice cells of one chunk of points.
 
     Args:
         points: (N, 3) float; points that are not finite are left out.
@@ -278,7 +280,7 @@ def find_occupied_cells(points: NDArray[Any], shift: NDArray[Any], edge: float) 
 
 
 def _find_brick_box(points: NDArray[Any], shift: NDArray[Any], edge: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The lowest cell of the bricks that hold all finite points, and how many bricks lie along each axis."""
+    """Return the lowest cell of the bricks that hold all finite points, and how many bricks lie along each axis."""
     low, high, _ = compute_bounds(points)
     if not np.isfinite(low).all():
         return np.zeros(3, np.int64), np.zeros(3, np.int64)
@@ -297,8 +299,8 @@ def _count_in_bricks(
     first: NDArray[np.int64],
     columns: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.uint64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Bricks (b, 3) that hold points, by their Morton codes (b,) about a brick `first` steps before; places (n,) in them of their
-    occupied cells, in Morton order; of these the counts (n,) and sums (n, columns)."""
+    """Return the bricks (b, 3) that hold points, by their Morton codes (b,) about a brick `first` steps before; places (n,) in
+    them of their occupied cells, in Morton order; of these the counts (n,) and sums (n, columns)."""
     table = np.zeros(tuple(size), np.int32)
     if not table.size:
         none = np.zeros(0, np.int64)
@@ -325,7 +327,7 @@ def _count_in_bricks(
 
 
 def _split(points: NDArray[Any], shift: NDArray[Any], edge: float) -> Occupied:
-    """`occupied` for an extent too large for a table: a table around the median point, the points far from it sorted."""
+    """Return `occupied` for an extent too large for a table: a table around the median point, the points far from it sorted."""
     cells, parts = np.empty((len(points), 3), np.int64), np.zeros((len(points), 3), np.uint8)
     convert_to_lattice(points, shift, edge, cells, parts)
     finite = cells[:, 0] != np.iinfo(np.int64).min

@@ -56,7 +56,8 @@ def _compute_bounds(cells, child, span, box):  # type: ignore[no-untyped-def]  #
 
 
 def build(cells: NDArray[np.int32], codes: NDArray[np.uint64]) -> Nodes:
-    """Nodes over (n, 3) cells in Morton order: codes go into buckets of 8 until one bucket, the root, is left (seeds 2.2.1)."""
+    """Build the nodes over (n, 3) cells in Morton order: codes go into buckets of 8 until one bucket, the root, is left (seeds
+    2.2.1)."""
     level, start = codes, 0
     parts: list[tuple[NDArray[Any], NDArray[Any]]] = []
     while len(codes) and (not parts or len(level) > 1):
@@ -75,7 +76,7 @@ def build(cells: NDArray[np.int32], codes: NDArray[np.uint64]) -> Nodes:
 
 @njit(cache=True, error_model="numpy")
 def _descend(child, j, stack, top):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Put the children of node j on the stack, the last row's first; returns its new height."""
+    """Put the children of node j on the stack, the last row's first; return its new height."""
     for c in range(child[j + 1] - 1, child[j] - 1, -1):
         stack[top] = c
         top += 1
@@ -84,7 +85,7 @@ def _descend(child, j, stack, top):  # type: ignore[no-untyped-def]  # pragma: n
 
 @njit(cache=True, error_model="numpy")
 def _find_bricks(centre, reach, size):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """First and last + 1 of the bricks that an axis of the ball may touch; an empty range where it lies outside."""
+    """Return the first and last + 1 of the bricks that an axis of the ball may touch; an empty range where it lies outside."""
     low = min(max(np.ceil(centre - reach), 0.0), 8.0 * size)  # clipped as floats: a far point is no integer
     high = max(min(np.floor(centre + reach), 8.0 * size - 1.0), -1.0)
     first = int(low) >> 3
@@ -118,8 +119,8 @@ def _push_start_nodes(table, first_brick, centre, reach, root, stack):  # type: 
 
 @njit(cache=True, error_model="numpy")
 def _find_in_ball(cells, child, span, box, centre, square, top, stack, out, fill):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Rows of the cells whose squared distance to `centre` (in cells) is at most `square`, below the `top` nodes on the
-    stack; returns how many."""
+    """Find the rows of the cells whose squared distance to `centre` (in cells) is at most `square`, below the `top` nodes on the
+    stack; return how many."""
     n, count = len(cells), 0
     x, y, z = centre[0], centre[1], centre[2]
     while top:
@@ -162,7 +163,7 @@ def _query_balls(begin, end, tree, centres, reach, indptr, out, fill):  # type: 
 
 @njit(cache=True, error_model="numpy")
 def _collect_in_box(cells, child, span, box, low, high, stack, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Rows of the cells low <= cell < high into `out`; returns how many."""
+    """Collect the rows of the cells low <= cell < high into `out`; return how many."""
     n, count, top = len(cells), 0, 1
     stack[0] = n + len(span) - 1
     while top:
@@ -200,7 +201,8 @@ def find_in_box(cells: NDArray[np.int32], nodes: Nodes, low: NDArray[np.int64], 
 def find_in_balls(
     cells: NDArray[np.int32], nodes: Nodes, table: NDArray[np.int32], centres: NDArray[np.float64], radius: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """CSR (indptr, ascending rows) of the cells within `radius` of (q, 3) centres, all in cells; `table` is `lookup.build`'s."""
+    """Return the CSR (indptr, ascending rows) of the cells within `radius` of (q, 3) centres, all in cells; `table` is
+    `lookup.build`'s."""
     indptr = np.zeros(len(centres) + 1, np.int64)
     rows = np.empty(0, np.int64)
     if not len(cells):

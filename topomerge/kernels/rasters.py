@@ -25,8 +25,8 @@ def _find_root(parent, i):  # type: ignore[no-untyped-def]  # pragma: no cover -
 
 @compile_ahead("i4[:,::1], i4[:,:,::1], i4[:,::1], i8[:,::1], i8[::1]")
 def label_components(cells, table, bricks, offsets, group):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(n,) component of each cell, numbered by first cell. Neighbours are `offsets` (k, 3), which must hold one of each pair of
-    opposite directions; only cells of the same `group` are joined, cells of a negative group are left out (-1)."""
+    """Return the (n,) component of each cell, numbered by first cell. Neighbours are `offsets` (k, 3), which must hold one of
+    each pair of opposite directions; only cells of the same `group` are joined, cells of a negative group are left out (-1)."""
     n = len(cells)
     parent = np.arange(n)
     for i in range(n):
@@ -56,7 +56,7 @@ def label_components(cells, table, bricks, offsets, group):  # type: ignore[no-u
 
 @compile_ahead("i4[:,::1], i4[:,:,::1], i4[:,::1], i8[:,::1], i8[::1], i8")
 def spread(cells, table, bricks, offsets, labels, limit):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Labels carried breadth first from labelled cells to unlabelled (-1) neighbours, at most `limit` steps; in place."""
+    """Carry labels breadth first from labelled cells to unlabelled (-1) neighbours, at most `limit` steps; in place."""
     n = len(cells)
     queue = np.empty(n, np.int64)
     tail = 0
@@ -82,7 +82,7 @@ def spread(cells, table, bricks, offsets, labels, limit):  # type: ignore[no-unt
 
 @compile_ahead("f8[:,::1], i8[::1], f8")
 def compute_watershed(clearance, order, prominence):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(nx, ny) int64 label of each cell with clearance above 0, numbered in the order of the peaks, -1 elsewhere.
+    """Return the (nx, ny) int64 label of each cell with clearance above 0, numbered in the order of the peaks, -1 elsewhere.
 
     Cells are flooded from the widest place down. Where two basins meet they are one if the lower peak rises less than
     `prominence` above the pass.
@@ -136,8 +136,8 @@ def compute_watershed(clearance, order, prominence):  # type: ignore[no-untyped-
 
 @compile_ahead("i8[:,::1], f8[:,::1]")
 def find_contacts(label, clearance):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(k, 3) int64 pairs of neighbouring cells of different labels: the two labels, ascending, and the flat index of the
-    narrower cell."""
+    """Return the (k, 3) int64 pairs of neighbouring cells of different labels: the two labels, ascending, and the flat index of
+    the narrower cell."""
     nx, ny = label.shape
     pairs = []
     for x in range(nx):
@@ -159,7 +159,8 @@ def find_contacts(label, clearance):  # type: ignore[no-untyped-def]  # pragma: 
 
 @compile_ahead("b1[:,::1], b1[:,::1]")
 def count_steps(start, way):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(nx, ny) int64 fewest steps, of 8 neighbours and through pixels of `way` only, from a pixel of `start` to each; -1 none.
+    """Return the (nx, ny) int64 fewest steps, of 8 neighbours and through pixels of `way` only, from a pixel of `start` to each;
+    -1 none.
 
     Args:
         start, way: (nx, ny) bool.
@@ -189,7 +190,8 @@ def count_steps(start, way):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 @compile_ahead("i8[::1], i8[::1], f8[::1], f8[:,::1], f8, f8")
 def compute_column_bits(ix, iy, z, base, low, band):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(H, W) uint32: bit k is set where a cell lies between low + k * band and low + (k + 1) * band above `base` (H, W)."""
+    """Return (H, W) uint32: bit k is set where a cell lies between low + k * band and low + (k + 1) * band above `base` (H,
+    W)."""
     out = np.zeros(base.shape, np.uint32)
     for i in range(len(z)):
         x, y = ix[i], iy[i]
@@ -203,8 +205,8 @@ def compute_column_bits(ix, iy, z, base, low, band):  # type: ignore[no-untyped-
 
 @njit(cache=True, nogil=True)
 def find_line_columns(mask, cosines, sines, long, least, beside):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(H, W) bool: the columns of a mask in, or at an end of, a straight run of `long` columns of which `least` are in it, with a
-    parallel run, `beside` columns away to the left or to the right, of which a fifth at most is in it."""
+    """Return (H, W) bool: the columns of a mask in, or at an end of, a straight run of `long` columns of which `least` are in it,
+    with a parallel run, `beside` columns away to the left or to the right, of which a fifth at most is in it."""
     out = np.zeros(mask.shape, np.bool_)
     height, width = mask.shape
     for x in range(height):
@@ -248,7 +250,7 @@ PROFILE_BELOW = 4  # levels below the floor that a profile begins with
 
 @compile_ahead("i4[:,::1], i8[::1], i8[:,::1], i8[:,::1], u8[:,::1]")
 def fill_profiles(cells, low, base, top, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Sets in `out` (nx, ny) uint64 bit b where cell (x, y, base - PROFILE_BELOW + b) is occupied, up to the level `top`.
+    """Set in `out` (nx, ny) uint64 bit b where cell (x, y, base - PROFILE_BELOW + b) is occupied, up to the level `top`.
 
     `low` (2,) is the column of out[0, 0]; a `base` below -PROFILE_BELOW means that the column has no floor.
     """
@@ -263,7 +265,7 @@ def fill_profiles(cells, low, base, top, out):  # type: ignore[no-untyped-def]  
 
 @compile_ahead("u8[::1], i8")
 def find_lowest_bit(profile, begin):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(n,) first set bit of each profile from bit `begin` on; -1: none."""
+    """Return the (n,) first set bit of each profile from bit `begin` on; -1: none."""
     out = np.full(len(profile), -1, np.int64)
     for i in range(len(profile)):
         word = profile[i]
@@ -284,8 +286,8 @@ def _find_first_occupied(first, last, table, bricks, cells, start, step, limit, 
 
 
 def find_first_occupied(table: Ints, bricks: Ints, cells: Ints, start: int, step: int, limit: int) -> Ints:
-    """(m,) number of cells from each cell to the first occupied one above (`step` 1) or below (-1) it, beginning `start` cells
-    away; 0 where there is none within `limit` cells."""
+    """Return the (m,) number of cells from each cell to the first occupied one above (`step` 1) or below (-1) it, beginning
+    `start` cells away; 0 where there is none within `limit` cells."""
     out = np.zeros(len(cells), np.int64)
     run_in_slices(_find_first_occupied, len(cells), LEAST_CELLS, table, bricks, cells, start, step, limit, out)
     return out
@@ -319,8 +321,9 @@ def _is_hollow_below(first, last, table, bricks, cells, reach, thickness, headro
 def is_hollow_below(
     table: Ints, bricks: Ints, cells: Ints, reach: int, thickness: int, headroom: int, limit: int
 ) -> NDArray[np.bool_]:
-    """(m,) bool: does a run of at least `headroom` empty cells begin within `thickness` cells below each cell, and end at an
-    occupied one within `limit` cells? A level is occupied if any cell within `reach` columns is: sparse points leave gaps."""
+    """Return (m,) bool: whether a run of at least `headroom` empty cells begins within `thickness` cells below each cell, and
+    ends at an occupied one within `limit` cells. A level is occupied if any cell within `reach` columns is: sparse points leave
+    gaps."""
     out = np.zeros(len(cells), np.bool_)
     run_in_slices(_is_hollow_below, len(cells), LEAST_CELLS, table, bricks, cells, reach, thickness, headroom, limit, out)
     return out
@@ -334,7 +337,7 @@ def _count_levels_below(first, last, table, bricks, cells, reach, depth, out):  
 
 
 def count_levels_below(table: Ints, bricks: Ints, cells: Ints, reach: int, depth: int) -> Ints:
-    """(m,) how many of the `depth` levels below each cell are occupied within `reach` columns."""
+    """Return (m,) how many of the `depth` levels below each cell are occupied within `reach` columns."""
     out = np.zeros(len(cells), np.int64)
     run_in_slices(_count_levels_below, len(cells), LEAST_CELLS, table, bricks, cells, reach, depth, out)
     return out
@@ -342,7 +345,8 @@ def count_levels_below(table: Ints, bricks: Ints, cells: Ints, reach: int, depth
 
 @compile_ahead("f8[:,::1], f8[::1], f8[::1], f8")
 def find_strongest_line(points, weights, angles, width):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Direction (rad) and offset across it (m) of the line with most weight in two neighbouring bins; the first of several.
+    """Return the direction (rad) and the offset across it (m) of the line with most weight in two neighbouring bins; the first of
+    several.
 
     Args:
         points: (n, 2) m, about their middle.
@@ -370,7 +374,7 @@ def find_strongest_line(points, weights, angles, width):  # type: ignore[no-unty
 
 @compile_ahead("f8[:,::1], f8[::1], f8[::1], f8[::1]")
 def weigh_by_distance(points, weights, along, scales):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(n,) weights of points, those far from the line through most of them counting less (Cauchy).
+    """Return (n,) weights of points, those far from the line through most of them counting less (Cauchy).
 
     Args:
         points: (n, 2) m.

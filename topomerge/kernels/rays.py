@@ -19,7 +19,8 @@ FIELD_LIMIT = 255  # the distance field is a byte
 
 @njit(cache=True, nogil=True)
 def compute_distance_field(cells, low, size):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(size) uint8 Chebyshev distance, in cells, to the nearest of (n, 3) occupied cells of the window at `low`; at most 255."""
+    """Return the (size) uint8 Chebyshev distance, in cells, to the nearest of (n, 3) occupied cells of the window at `low`; at
+    most 255."""
     sx, sy, sz = size
     field = np.full((sx + 2, sy + 2, sz + 2), FIELD_LIMIT, np.uint8)  # a border of one cell spares the tests for the edge
     for i in range(len(cells)):
@@ -49,7 +50,8 @@ def compute_distance_field(cells, low, size):  # type: ignore[no-untyped-def]  #
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def is_visible(field, ox, oy, oz, tx, ty, tz):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Does the ray from (ox, oy, oz) meet no occupied cell before cell (tx, ty, tz)? Coordinates in cells of the window."""
+    """Return whether the ray from (ox, oy, oz) meets no occupied cell before cell (tx, ty, tz). Coordinates in cells of the
+    window."""
     dx, dy, dz = tx + 0.5 - ox, ty + 0.5 - oy, tz + 0.5 - oz
     length = max(abs(dx), abs(dy), abs(dz))
     x, y, z = int(np.floor(ox)), int(np.floor(oy)), int(np.floor(oz))
@@ -92,7 +94,8 @@ def is_visible(field, ox, oy, oz, tx, ty, tz):  # type: ignore[no-untyped-def]  
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cast(field, low, views, radius, cells, near, rows, indptr, words, masks):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Seen rows of each view as words of 64 rows: word numbers and bit masks, from indptr[v] on; returns their count a view.
+    """Write the seen rows of each view as words of 64 rows: word numbers and bit masks, from indptr[v] on; return their count a
+    view.
 
     `views` are in cells of the whole grid, `field` covers a window at `low`; rows[near[v] : near[v + 1]] are ascending and hold
     all cells in range of view v; indptr must leave room for their words.
@@ -122,7 +125,7 @@ def cast(field, low, views, radius, cells, near, rows, indptr, words, masks):  #
 
 @njit(cache=True, nogil=True)
 def count_words(near, rows):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(v,) in how many words of 64 rows the ascending rows[near[v] : near[v + 1]] lie."""
+    """Return (v,) in how many words of 64 rows the ascending rows[near[v] : near[v + 1]] lie."""
     count = np.zeros(len(near) - 1, np.int64)
     for v in range(len(count)):
         for k in range(near[v], near[v + 1]):
@@ -151,8 +154,8 @@ def _is_seen_from(first, last, free, targets, starts, reach, out):  # type: igno
 
 
 def is_seen_from(free: NDArray[np.bool_], targets: Ints, starts: Ints, reach: float) -> NDArray[np.bool_]:
-    """(t,) bool: does a straight line over columns that are `free` (nx, ny) lead from any start to each target, at most `reach`
-    columns long?
+    """Return (t,) bool: whether a straight line over columns that are `free` (nx, ny) leads from any start to each target, at
+    most `reach` columns long.
 
     `targets` (t, 2) and `starts` (s, 2) int64 columns.
     """
@@ -163,8 +166,8 @@ def is_seen_from(free: NDArray[np.bool_], targets: Ints, starts: Ints, reach: fl
 
 @njit(cache=True, nogil=True)
 def find_lit_pixels(opaque, starts, reach):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(nx, ny) bool: pixels that a straight line from any start (n, 2) int64 reaches, at most `reach` pixels long, with the
-    `opaque` (nx, ny) pixel that ends it. A start may stand on an opaque pixel."""
+    """Return (nx, ny) bool: pixels that a straight line from any start (n, 2) int64 reaches, at most `reach` pixels long, with
+    the `opaque` (nx, ny) pixel that ends it. A start may stand on an opaque pixel."""
     nx, ny = opaque.shape
     out = np.zeros((nx, ny), np.bool_)
     rays = int(2 * np.pi * reach) + 8
@@ -186,8 +189,8 @@ def find_lit_pixels(opaque, starts, reach):  # type: ignore[no-untyped-def]  # p
 
 
 def carve(starts: Floats, ends: Floats, margin: float, crossed: NDArray[np.bool_]) -> None:
-    """Sets `crossed` (nx, ny, nz) bool in every cell that a ray enters between `starts` and `margin` cells before `ends`
-    ((k, 3) float64, in cells), by the digital differential analyser of Amanatides and Woo (1987)."""
+    """Set `crossed` (nx, ny, nz) bool in every cell that a ray enters between `starts` and `margin` cells before `ends` ((k, 3)
+    float64, in cells), by the digital differential analyser of Amanatides and Woo (1987)."""
     run_in_slices(_carve, len(starts), LEAST_TARGETS, starts, ends, margin, crossed)
 
 
@@ -225,8 +228,8 @@ def _carve(first, last, starts, ends, margin, crossed):  # type: ignore[no-untyp
 def sweep(
     table: Ints, bricks: Ints, starts: Floats, directions: Floats, reach: float, coarser: int, crossed: NDArray[np.bool_]
 ) -> None:
-    """Sets `crossed` in every cell, `coarser` times as long as those of the grid, that lies between a start and the first
-    occupied cell in each direction; nothing for a ray that meets none within `reach` cells.
+    """Set `crossed` in every cell, `coarser` times as long as those of the grid, that lies between a start and the first occupied
+    cell in each direction; nothing for a ray that meets none within `reach` cells.
 
     `starts` (v, 3) in cells, `directions` (d, 3) unit vectors.
     """
@@ -259,7 +262,7 @@ def _sweep(first, last, table, bricks, starts, directions, reach, coarser, cross
 
 @njit(cache=True)
 def count_rays(starts, ends, margin, passed, met):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Adds to `passed` and `met` (nx, ny) int32 how many rays go through each column, from `starts` until `margin` columns before
+    """Add to `passed` and `met` (nx, ny) int32 how many rays go through each column, from `starts` until `margin` columns before
     `ends` ((k, 2) float64, in columns), and how many end in it: as `carve`, in the plane."""
     nx, ny = passed.shape
     for i in range(len(starts)):
@@ -288,7 +291,7 @@ def count_rays(starts, ends, margin, passed, met):  # type: ignore[no-untyped-de
 
 @compile_ahead("b1[:,::1], f8, f8, f8, f8, f8")
 def measure_run(mask, x, y, dx, dy, limit):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Cells from (x, y) along the unit vector (dx, dy) while `mask` holds, in halves, at most `limit`."""
+    """Count the cells from (x, y) along the unit vector (dx, dy) while `mask` holds, in halves, at most `limit`."""
     length = 0.0
     while length < limit:
         u, v = int(np.rint(x + (length + 0.5) * dx)), int(np.rint(y + (length + 0.5) * dy))
@@ -300,8 +303,8 @@ def measure_run(mask, x, y, dx, dy, limit):  # type: ignore[no-untyped-def]  # p
 
 @compile_ahead("b1[:,::1], f8, f8, f8, f8, i8, f8")
 def measure_widths(mask, x, y, dx, dy, steps, limit):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(2 steps + 1,) free width (cells) across the direction (dx, dy)'s normal, at -steps..steps cells along that normal from
-    (x, y); -1 from where the normal itself is blocked."""
+    """Return the (2 steps + 1,) free width (cells) across the direction (dx, dy)'s normal, at -steps..steps cells along that
+    normal from (x, y); -1 from where the normal itself is blocked."""
     out = np.full(2 * steps + 1, -1.0)
     for sign in (-1, 1):
         for t in range(steps + 1):
@@ -315,8 +318,8 @@ def measure_widths(mask, x, y, dx, dy, steps, limit):  # type: ignore[no-untyped
 
 @compile_ahead("f4[:,::1], f8, f8, f8, f8, f8, f8, i8")
 def measure_cover(mask, x, y, dx, dy, before, after, steps):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Greatest share of the cells of a line, from `before` cells behind (x, y) to `after` ahead along (dx, dy), for which `mask`
-    holds; the line may be shifted by up to `steps` cells along its normal."""
+    """Return the greatest share of the cells of a line, from `before` cells behind (x, y) to `after` ahead along (dx, dy), for
+    which `mask` holds; the line may be shifted by up to `steps` cells along its normal."""
     best = 0.0
     for t in range(-steps, steps + 1):
         hit, total = 0, 0

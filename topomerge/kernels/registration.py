@@ -19,7 +19,7 @@ LEAST_NORMALS = 1024  # of a slice
 
 @compile_ahead("f8[:,::1], f8[::1], i8", error_model="numpy")
 def solve_cholesky(h, g, count):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(F,) x of H x = g in the first `count` of F unknowns, 0 in the others: by Cholesky's factor.
+    """Return (F,) x of H x = g in the first `count` of F unknowns, 0 in the others: by Cholesky's factor.
 
     Args:
         h: (F, F) positive definite; only its upper half is read.
@@ -47,7 +47,7 @@ def solve_cholesky(h, g, count):  # type: ignore[no-untyped-def]  # pragma: no c
 
 @compile_ahead("f4[:,::1], f8, f8")
 def _sample(field, u, v):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Value and gradient (per cell) of a field between the middles of its cells; False outside."""
+    """Return the value and gradient (per cell) of a field between the middles of its cells; False outside."""
     i, j = int(np.floor(u)), int(np.floor(v))
     if i < 0 or j < 0 or i + 1 >= field.shape[0] or j + 1 >= field.shape[1]:
         return False, 0.0, 0.0, 0.0
@@ -59,7 +59,8 @@ def _sample(field, u, v):  # type: ignore[no-untyped-def]  # pragma: no cover - 
 
 @compile_ahead("f8[:,::1], f4[:,::1], f8[::1], f8, f8[:,::1], f8[::1], i8, b1", error_model="numpy")
 def refine(points, field, origin, cell, poses, sigmas, rounds, scaled):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Gauss-Newton over (x, y, yaw, log scale) of many poses on a distance field, weights exp(-d2 / 2 sigma2), sigma shrinking.
+    """Run Gauss-Newton over (x, y, yaw, log scale) of many poses on a distance field, weights exp(-d2 / 2 sigma2), sigma
+    shrinking.
 
     Points are (n, 2) about their middle; a pose places that middle at (x, y). `scaled`: is the scale free, too?
     Returns the poses and, for each, the sum of the weights at the last sigma.
@@ -111,7 +112,7 @@ def refine(points, field, origin, cell, poses, sigmas, rounds, scaled):  # type:
 
 @compile_ahead("u4, u4")
 def _compare_bits(p, q):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Bits in both of those in either."""
+    """Return the share of the bits in either that are in both."""
     both, either = 0, 0
     for k in range(32):
         u, v = (p >> np.uint32(k)) & np.uint32(1), (q >> np.uint32(k)) & np.uint32(1)
@@ -187,8 +188,8 @@ def tally(points, kinds, facing, inner, filled, kind, to_wall, to_any, face, ope
 def estimate_normals(
     table: Ints, bricks: Ints, cells: Ints, points: Floats, chosen: Ints, reach: int, least: int
 ) -> tuple[Floats, Floats]:
-    """(m, 3) unit normals of the planes through the points of the cells within `reach` of each `chosen` row, and (m,) how flat
-    these are (0 to 1); 0 where fewer than `least` cells are near."""
+    """Return (m, 3) unit normals of the planes through the points of the cells within `reach` of each `chosen` row, and (m,) how
+    flat these are (0 to 1); 0 where fewer than `least` cells are near."""
     out, flat = np.zeros((len(chosen), 3)), np.zeros(len(chosen))
     square, enough = np.zeros((len(chosen), 3, 3)), np.zeros(len(chosen), np.bool_)
     run_in_slices(_sum_squares, len(chosen), LEAST_NORMALS, table, bricks, cells, points, chosen, reach, least, square, enough)
@@ -203,7 +204,7 @@ def estimate_normals(
 
 @compile_ahead("i8, i8, i4[:,:,::1], i4[:,::1], i4[:,::1], f8[:,::1], i8[::1], i8, i8, f8[:,:,::1], b1[::1]")
 def _sum_squares(first, last, table, bricks, cells, points, chosen, reach, least, out, enough):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Covariances (m, 3, 3) of the points around each chosen row of which enough cells are near."""
+    """Write the covariances (m, 3, 3) of the points around each chosen row of which enough cells are near."""
     for k in range(first, last):
         i = chosen[k]
         n, mean, square = 0, np.zeros(3), out[k]
@@ -231,7 +232,7 @@ def _sum_squares(first, last, table, bricks, cells, points, chosen, reach, least
     "i4[:,:,::1], i4[:,::1], f8[::1], f8, f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], i8, f8, b1", error_model="numpy"
 )
 def build_normal_equations(table, bricks, origin, edge, points, normal, moving, moving_normal, pose, reach, sigma, scaled):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Normal equations of one round: each moving point and the nearest one with a like normal within `reach` cells.
+    """Build the normal equations of one round: each moving point and the nearest one with a like normal within `reach` cells.
 
     `pose` is (x, y, z, yaw, log scale); moving points are about the origin of the rotation. Returns H (5, 5), g (5,), number of
     partners, and the sums of weights and of weighted squared distances.
@@ -294,7 +295,7 @@ def measure_pose_evidence(
     poses: Floats, storeys: Ints, points: Floats, storey: Ints, is_wall: Bools, distance: NDArray[np.float32], floor: Bools,
     origin: Floats, edge: float, sigma: float,
 ) -> Floats:  # fmt: skip
-    """Agreement, conflict and common floor of each pose, in numbers of points.
+    """Return the agreement, conflict and common floor of each pose, in numbers of points.
 
     Args:
         poses: (H, 4) float64 a, b, x, y: (u, v) -> (a u - b v + x, b u + a v + y).
@@ -342,13 +343,13 @@ def _measure_pose_evidence(first, last, poses, storeys, points, storey, is_wall,
 
 @njit(cache=True, error_model="numpy")
 def sum_votes(way, rise, room, probability, voted, voters, widths, level_gap):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Sums (len(voted), len(widths)) float64 of the chances of the voters whose way is near that of each pair, by how near it is:
-    the weight of a voter falls from 1 to 0 at a width (biweight). None votes for a pair that shares a room with it.
+    """Return the sums (len(voted), len(widths)) float64 of the chances of the voters whose way is near that of each pair, by how
+    near it is: the weight of a voter falls from 1 to 0 at a width (biweight). None votes for a pair that shares a room with it.
 
     Args:
         way: (n, 2) float64 m from one map to the other by each pair of rooms; rise: (n,) float64 m, likewise upwards.
         room: (n, 2) int64 the two rooms of each pair.
-        chance: (n,) float64 how likely each pair is.
+        probability: (n,) float64 how likely each pair is.
         voted, voters: int64 pairs that are voted for, and those that vote.
         widths: float64 m.
         level_gap: m, from which on two ways lead to different storeys.
@@ -382,7 +383,7 @@ def _is_upright(table, bricks, x, y, z):  # type: ignore[no-untyped-def]  # prag
 
 @compile_ahead("Tuple((i4[:,:,::1], i4[:,::1])), i8, i8, i8, f8, f8")
 def _is_seen_through(free, x, y, z, u, v):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Is the first or second place of free space behind (x, y, z), in the direction (u, v), known to be empty?"""
+    """Return whether the first or second place of free space behind (x, y, z), in the direction (u, v), is known to be empty."""
     for step in (1.5, 2.5, 3.5):
         p, q = int(np.floor(x + 0.5 + step * u)), int(np.floor(y + 0.5 + step * v))
         if find_row(free[0], free[1], p >> 1, q >> 1, z >> 1) >= 0:
@@ -395,7 +396,7 @@ def _is_seen_through(free, x, y, z, u, v):  # type: ignore[no-untyped-def]  # pr
     "Tuple((i4[:,:,::1], i4[:,::1])), Tuple((i4[:,:,::1], i4[:,::1]))"
 )
 def find_copied_cells(cells, offsets, first, second, first_free, second_free):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(n,) int64 row of the first map's cell of which each of the second one's is a copy, -1 none.
+    """Return the (n,) int64 row of the first map's cell of which each of the second one's is a copy, -1 none.
 
     A copy is a cell of a wall, beside one of a wall of the first map, where that is not occupied itself: and either the first map
     saw through where it stands, or the second one through where the other stands. Else the two are the faces of a thick wall.

@@ -36,7 +36,7 @@ def build_columns(cells: NDArray[Any], table: NDArray[Any], bricks: NDArray[Any]
 
 @compile_ahead("i4[:,:,::1], u1[:,::1], i8, i8, i8, i8", error_model="numpy")
 def _count_in_column(table, bits, x, y, low, high):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Occupied cells (x, y, low .. high)."""
+    """Count the occupied cells (x, y, low .. high)."""
     low, high = max(low, 0), min(high, table.shape[2] * 8 - 1)
     if x < 0 or y < 0 or (x >> 3) >= table.shape[0] or (y >> 3) >= table.shape[1] or low > high:
         return 0
@@ -56,7 +56,7 @@ def _count_in_column(table, bits, x, y, low, high):  # type: ignore[no-untyped-d
 
 @compile_ahead("i8, i8, i4[:,:,::1], u1[:,::1], i8[:,::1], i8[:,::1], f8[::1], b1, f8[::1]", error_model="numpy")
 def _count(first, last, table, bits, cells, runs, weights, stop, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """With `stop` a count ends with the first run that holds a cell."""
+    """Count the cells under runs; with `stop` a count ends with the first run that holds a cell."""
     for i in range(first, last):
         x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
         total = 0.0
@@ -87,7 +87,7 @@ def _weigh(first, last, table, bricks, cells, offsets, weights, values, largest,
 
 @njit(cache=True, error_model="numpy")
 def _find_winner(voted, votes, count, present):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """The label with most votes: of several `own`, else the smallest; -1 where nobody voted."""
+    """Return the label with most votes: of several `own`, else the smallest; -1 where nobody voted."""
     best, most = -1, 0.0
     for k in range(count):
         if votes[k] > most or (votes[k] == most and best != present and (voted[k] == present or voted[k] < best)):
@@ -119,21 +119,21 @@ def _vote(first, last, table, bricks, cells, offsets, weights, labels, out):  # 
 def count(
     table: NDArray[Any], bits: NDArray[Any], cells: NDArray[Any], runs: NDArray[Any], weights: NDArray[Any]
 ) -> NDArray[np.float64]:
-    """(m,) weighted number of cells under runs (dx, dy, lowest, highest dz) placed at each of (m, 3) int64 cells."""
+    """Return the (m,) weighted number of cells under runs (dx, dy, lowest, highest dz) placed at each of (m, 3) int64 cells."""
     out = np.empty(len(cells), np.float64)
     run_in_slices(_count, len(cells), LEAST_CELLS, table, bits, cells, runs, weights, False, out)
     return out
 
 
 def is_any_occupied(table: NDArray[Any], bits: NDArray[Any], cells: NDArray[Any], runs: NDArray[Any]) -> NDArray[np.bool_]:
-    """(m,) is any cell under the runs placed at each of (m, 3) int64 cells occupied?"""
+    """Return (m,) whether any cell under the runs placed at each of (m, 3) int64 cells is occupied."""
     out = np.empty(len(cells), np.float64)
     run_in_slices(_count, len(cells), LEAST_CELLS, table, bits, cells, runs, np.ones(len(runs)), True, out)
     return out > 0
 
 
 def weigh(bricks: Arrays2, cells: NDArray[Any], stencil: Arrays2, values: NDArray[Any], largest: bool) -> NDArray[np.float64]:
-    """(n, c) sum, or `largest`, of weight * value over the cells under (k, 3) int64 offsets; values (n, c) float64."""
+    """Return the (n, c) sum, or `largest`, of weight * value over the cells under (k, 3) int64 offsets; values (n, c) float64."""
     out = np.empty(values.shape, np.float64)
     run_in_slices(_weigh, len(cells), LEAST_CELLS, *bricks, cells, *stencil, values, largest, out)
     return out

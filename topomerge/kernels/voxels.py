@@ -28,7 +28,7 @@ def spread(value):  # type: ignore[no-untyped-def]  # pragma: no cover - compile
 
 @njit(cache=True, inline="always")
 def gather(code):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Inverse of `spread`."""
+    """Undo `spread`."""
     v = uint64(code) & uint64(0x1249249249249249)
     v = (v | (v >> uint64(2))) & uint64(0x10C30C30C30C30C3)
     v = (v | (v >> uint64(4))) & uint64(0x100F00F00F00F00F)
@@ -121,7 +121,7 @@ def _fill_bricks(cells, table, bricks):  # type: ignore[no-untyped-def]  # pragm
 # Called, not copied into each caller: less to compile (docs/adr/0031).
 @compile_ahead("i4[:,:,::1], i4[:,::1], i8, i8, i8")
 def find_row(table, bricks, x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Row of cell (x, y, z), -1 where it is empty or outside."""
+    """Return the row of cell (x, y, z), -1 where it is empty or outside."""
     if x < 0 or y < 0 or z < 0:
         return -1
     bx, by, bz = x >> 3, y >> 3, z >> 3
@@ -140,7 +140,7 @@ def _find_rows(table, bricks, cells, out):  # type: ignore[no-untyped-def]  # pr
 
 
 def build(cells: NDArray[Any], shape: tuple[int, int, int]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Table (bricks along x, y, z) int32 and rows (bricks, 512) int32 for unique (n, 3) cells."""
+    """Build the table (bricks along x, y, z) int32 and the rows (bricks, 512) int32 for unique (n, 3) cells."""
     size = tuple((s + 7) >> 3 for s in shape)
     if int(np.prod(size, dtype=np.float64)) > MAX_BRICKS:
         extent = " x ".join(str(s) for s in shape)
@@ -161,7 +161,7 @@ def find_rows(table: NDArray[Any], bricks: NDArray[Any], cells: NDArray[Any]) ->
 
 @compile_ahead("i4[:,::1], i8[:,::1], f8[:,::1], f8[:,::1], f8, i8, i8")
 def find_filled_cells(cells, holding, matrix, local, slack, reach, tall):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(m, 3) int64 cells of the lattice of which the middle lies in a cell of the grid, and (m,) int64 in which one.
+    """Return the (m, 3) int64 cells of the lattice of which the middle lies in a cell of the grid, and (m,) int64 in which one.
 
     A bent grid is taken as linear in each of its cells: what is bent to p is at middle + J (p - bent) - lean (height of p over
     the middle).

@@ -74,14 +74,15 @@ def score_pressure(a: TopometricMap, b: TopometricMap, pose: Sim3) -> dict[str, 
 
 
 def _compare(difference: Array, step: float, sigma: float, same: float) -> float:
-    """Log likelihood ratio of differences (n,), hPa, that are one step up or down, or 0 with a probability, against all 0."""
+    """Return the log likelihood ratio of differences (n,), hPa, that are one step up or down, or 0 with a probability, against
+    all 0."""
     one = [-0.5 * ((difference - shift) / sigma) ** 2 for shift in (0.0, -step, step)]
     shares = np.log(np.maximum([same, (1 - same) / 2, (1 - same) / 2], 1e-12))
     return float(np.sum(np.logaddexp.reduce([p + s for p, s in zip(one, shares, strict=True)]) - one[0]))
 
 
 def _average_places(landmarks: Landmarks, pose: Sim3) -> Array:
-    """(n, 5) x, y, z (m, under a pose), pressure (hPa) and time (s; nan: not known) of each place."""
+    """Return (n, 5) x, y, z (m, under a pose), pressure (hPa) and time (s; nan: not known) of each place."""
     table = landmarks.table[landmarks.is_kind("pressure")]
     good = np.isfinite(table["position"]).all(axis=1) & (table["number"] > POSSIBLE[0]) & (table["number"] < POSSIBLE[1])
     table = table[good]
@@ -95,7 +96,8 @@ def _average_places(landmarks: Landmarks, pose: Sim3) -> Array:
 
 
 def _pair_places(a: Array, b: Array) -> tuple[Array, float]:
-    """hPa by which b reads more than a at each place of b that a passed, too, and the least time, s, between the sessions."""
+    """Return the hPa by which b reads more than a at each place of b that a passed, too, and the least time, s, between the
+    sessions."""
     stretched = [p[:, :3] * (1, 1, NEAR / SAME_STOREY) for p in (a, b)]
     distance, nearest = cKDTree(stretched[0]).query(stretched[1], distance_upper_bound=NEAR)
     met = np.isfinite(distance)
@@ -160,7 +162,7 @@ class LandmarkEvidence:
         return sum(f["here"] - f["outside"] for f in self.factors.values())
 
     def compute_likelihoods(self) -> dict[str, float]:
-        """Log-likelihood ratio of each alternative against this place, of all kinds."""
+        """Compute the log-likelihood ratio of each alternative against this place, of all kinds."""
         return {name: sum(f[name] - f["here"] for f in self.factors.values()) for name in ALTERNATIVES}
 
     def apply(self, posterior: Mapping[str, float], rivals: Sequence[tuple[float, LandmarkEvidence]] = ()) -> dict[str, float]:
@@ -193,7 +195,7 @@ class LandmarkEvidence:
         return sentences
 
     def serialise(self) -> dict[str, Any]:
-        """As plain values, for merge.json."""
+        """Return plain values, for merge.json."""
         return {
             "factors": {kind: {name: round(v, 4) for name, v in f.items()} for kind, f in self.factors.items()},
             "sentences": self.list_sentences(),
@@ -292,7 +294,7 @@ class LandmarkScorer:
 
 
 def _find_cells_around(sightings: Sightings, tree: cKDTree) -> Array:
-    """(n, SEEN_CELLS, 3) m, cells of a map around its landmarks, from these; nan where there are fewer."""
+    """Return (n, SEEN_CELLS, 3) m, the cells of a map around its landmarks, from these; nan where there are fewer."""
     out = np.full((len(sightings), SEEN_CELLS, 3), np.nan)
     placed = (sightings.sigma <= 1.0) & ~sightings.named & np.isfinite(sightings.position[:, 2])
     for k in np.flatnonzero(placed)[:MOST_ASKED].tolist():

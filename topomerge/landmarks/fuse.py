@@ -134,7 +134,7 @@ class _Fusion:
         self._compare_numbers(before, own, taken)
 
     def _match_by_place(self, before: Array, own: Array) -> tuple[Array, Array]:
-        """Rows of both that are the nearest of their key within reach, one to one."""
+        """Return the rows of both that are the nearest of their key within reach, one to one."""
         known = self.known
         before, own = before[known[before]], own[known[own]]
         before = before[np.isin(self.key[before], self.key[own])]
@@ -143,7 +143,7 @@ class _Fusion:
         return _pair_nearest(before, own, far, nearest)
 
     def _match_by_room(self, before: Array, own: Array) -> tuple[Array, Array]:
-        """Rows of both with one key and one room, of which one has no position or that are names; one pair of each."""
+        """Return the rows of both with one key and one room, of which one has no position or that are names; one pair of each."""
         bare = ~self.known | self.landmarks.is_kind("name")
         first = self._pair_rooms(before, own[bare[own]])
         second = self._pair_rooms(np.setdiff1d(before[bare[before]], first[0]), own[~bare[own]])
@@ -220,19 +220,20 @@ class _Fusion:
 
 
 def is_cut_off(one: str, other: str) -> bool:
-    """May one of two numbers be the other one, of which a reader lost an end: 0.12 and 0.129?"""
+    """Return whether one of two numbers may be the other one, of which a reader lost an end: 0.12 and 0.129."""
     short, long = sorted((fold_text(one), fold_text(other)), key=len)
     return len(long) > 2 and len(long) - len(short) == 1 and (long.startswith(short) or long.endswith(short))
 
 
 def _number_strings(values: Sequence[str]) -> Array:
-    """(n,) number of each string, the same of equal ones."""
+    """Return the (n,) number of each string, the same of equal ones."""
     numbers = {value: k for k, value in enumerate(dict.fromkeys(values))}
     return np.array([numbers[value] for value in values], np.int64)
 
 
 def _find_nearest(position: Array, group: Array, before: Array, own: Array, reach: float) -> tuple[Array, Array]:
-    """(k,) distance of each own row to the nearest row before of its group, inf beyond reach; and that row's place there."""
+    """Return the (k,) distance of each own row to the nearest row before of its group, inf beyond reach; and that row's place
+    there."""
     if not len(before) or not len(own):
         return np.full(len(own), np.inf), np.zeros(len(own), np.int64)
     rank = np.searchsorted(np.unique(group[before]), group[np.concatenate([before, own])])
@@ -246,7 +247,7 @@ def _find_nearest(position: Array, group: Array, before: Array, own: Array, reac
 
 
 def _pair_nearest(before: Array, own: Array, far: Array, nearest: Array) -> tuple[Array, Array]:
-    """The pairs of `_find_nearest`, each row once: of several with one nearest row the one that is nearest to it."""
+    """Return the pairs of `_find_nearest`, each row once: of several with one nearest row the one that is nearest to it."""
     rows = np.flatnonzero(np.isfinite(far))
     rows = rows[np.lexsort((far[rows], nearest[rows]))]
     _, first = np.unique(nearest[rows], return_index=True)

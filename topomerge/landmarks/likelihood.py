@@ -142,7 +142,8 @@ def associate_sightings(a: Sightings, b: Sightings, at: Sequence[Array], pose: S
 
 
 def pick_partners(a: Sightings, b: Sightings, met: Associated, rules: Kind, kind: str) -> Associated:
-    """Pick of the sightings that may be one a partner of each, the likeliest first; those without one of a like kind drop out."""
+    """Pick, of the sightings that may be one, a partner of each, the likeliest first; those without one of a like kind drop
+    out."""
     if len(met.pairs) > MOST_PAIRS:
         met = met.select(np.argsort(met.apart, kind="stable")[:MOST_PAIRS])
     middle = READERS[2][0]
@@ -261,7 +262,8 @@ def compute_chances(a: Sightings, b: Sightings, pairs: Array, keys: Sequence[tup
 
 
 def _count_shifts(keys: Sequence[tuple[str, str]], numbers: Array, most: int = 3) -> list[Shift]:
-    """The shifts that turn most numbers of a into those of b: `most`, and one that is as good as the last of them backwards."""
+    """List the shifts that turn most numbers of a into those of b: `most`, and one that is as good as the last of them
+    backwards."""
     count: dict[Shift, int] = {}
     for (one, other), number in zip(keys, numbers.tolist(), strict=True):
         for shift in find_shifts(one, other) if number else ():

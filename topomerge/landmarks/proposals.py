@@ -79,7 +79,7 @@ def match_values(a: Sightings, b: Sightings) -> Array:
 
 
 def _propose_by_two(a: Sightings, b: Sightings, matches: Array, scaled: bool) -> list[Sim3]:
-    """Poses under which two matches lie on each other, by how many others do."""
+    """Propose poses under which two matches lie on each other, by how many others do."""
     if len(matches) < 2:
         return []
     p, q = a.position[matches[:, 0]], b.position[matches[:, 1]]
@@ -103,7 +103,7 @@ def _propose_by_two(a: Sightings, b: Sightings, matches: Array, scaled: bool) ->
 
 
 def _fit_pose(p: Array, q: Array, scale: float) -> Sim3:
-    """The pose of a scale that lays points q (n, 3) onto p best (least squares); heights that are not known say nothing."""
+    """Fit the pose of a scale that lays points q (n, 3) onto p best (least squares); heights that are not known say nothing."""
     mean = p[:, :2].mean(axis=0), q[:, :2].mean(axis=0)
     one, other = ((of[:, :2] - m) @ (1, 1j) for of, m in zip((p, q), mean, strict=True))
     yaw = float(np.angle((one * np.conj(other)).sum()))
@@ -114,7 +114,7 @@ def _fit_pose(p: Array, q: Array, scale: float) -> Sim3:
 
 
 def _propose_by_one(a: Sightings, b: Sightings, matches: Array, yaws: Sequence[float]) -> list[Sim3]:
-    """Poses of single matches: by the ways that they face, or in line with the walls."""
+    """Propose poses of single matches: by the ways that they face, or in line with the walls."""
     poses = []
     for i, j in matches.tolist():
         faced = float(a.heading[i] - b.heading[j])
@@ -126,7 +126,7 @@ def _propose_by_one(a: Sightings, b: Sightings, matches: Array, yaws: Sequence[f
 
 
 def _snap_height(pose: Sim3, heights: Sequence[float]) -> Sim3:
-    """The pose on the floors that are nearest to where it has them; on the first ones where nothing tells."""
+    """Return the pose on the floors that are nearest to where it has them; on the first ones where nothing tells."""
     x, y, z = pose.translation
     if z == UNKNOWN:
         return replace(pose, translation=(x, y, heights[0] if len(heights) else 0.0))

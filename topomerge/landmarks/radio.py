@@ -111,7 +111,7 @@ def collect_radio_scans(landmarks: Landmarks, placed: bool = True, most: int = M
 
 
 def _hash_scans(table: Array) -> Array:
-    """(n,) int64 that is equal for readings of one scan: of one group, source and place."""
+    """Return (n,) int64 that is equal for readings of one scan: of one group, source and place."""
     place = np.nan_to_num(table["position"], nan=0.0, posinf=0.0, neginf=0.0)
     columns = [table["group"], table["source"], *np.round(np.clip(place, -1e9, 1e9) * 100).T]
     code = np.zeros(len(table), np.uint64)
@@ -175,7 +175,7 @@ def compare_scans(a: RadioScans, b: RadioScans) -> Likeness:
 
 
 def _build_pooling(position: Array) -> sparse.csr_matrix:
-    """(n, n) weights of the scans around each scan, that sum to 1; bell-shaped, of standard deviation `POOLED`."""
+    """Build the (n, n) weights of the scans around each scan, that sum to 1; bell-shaped, of standard deviation `POOLED`."""
     near = cKDTree(position).query_pairs(2.5 * POOLED, output_type="ndarray")
     i = np.concatenate([near[:, 0], near[:, 1], np.arange(len(position))])
     j = np.concatenate([near[:, 1], near[:, 0], np.arange(len(position))])
@@ -185,7 +185,8 @@ def _build_pooling(position: Array) -> sparse.csr_matrix:
 
 
 def _compute_address_weights(scans: RadioScans) -> Array:
-    """(k,) weights of addresses: less for what is heard everywhere, and for what is loud at places far from each other."""
+    """Return the (k,) weights of addresses: less for what is heard everywhere, and for what is loud at places far from each
+    other."""
     power, n = scans.power, max(len(scans), 1)
     top = power.max(axis=0).toarray().ravel() if len(scans) and power.shape[1] else np.zeros(power.shape[1])
     mean = np.asarray(power.sum(axis=0)).ravel() / n
@@ -348,7 +349,7 @@ def _build_shifts(size: float) -> Array:
 def _compare_alternatives(
     likeness: Array, apart: tuple[Array, Array], half: Array, shifted: Sequence[Sequence[Array]], shares: Array, law: RadioLaw
 ) -> dict[str, float]:
-    """Log likelihood ratio of each of `WRONG` against this pose, before it is limited.
+    """Return the log likelihood ratio of each of `WRONG` against this pose, before it is limited.
 
     Args:
         half: (n, m) m between scans, were b turned by half a turn.
@@ -360,11 +361,11 @@ def _compare_alternatives(
     places = min(float((shares * near).max(axis=1).sum()), float((shares * near).max(axis=0).sum()))
 
     def add(log_density: Array) -> float:
-        """Log likelihood of places that testify once each, by the mean of their pairs."""
+        """Return the log likelihood of places that testify once each, by the mean of their pairs."""
         return law.discount * places * float(np.average(log_density, weights=w))
 
     def at(distance: Array, table: Array = law.fine[0]) -> float:
-        """Log likelihood if pairs are that far apart, whatever a metre of this building is worth."""
+        """Return the log likelihood if pairs are that far apart, whatever a metre of this building is worth."""
         steps = [np.minimum((distance * stretch / FINE).astype(int), last) for stretch in STRETCHES]
         return float(np.logaddexp.reduce([add(table[step, k]) for step in steps]) - np.log(len(STRETCHES)))
 
@@ -373,7 +374,7 @@ def _compare_alternatives(
     other = add(foreign[k])
 
     def choose(*parts: float) -> float:
-        """Log likelihood of models that are alike likely, unless all access points were replaced."""
+        """Return the log likelihood of models that are alike likely, unless all access points were replaced."""
         mean = np.logaddexp.reduce(parts) - np.log(len(parts))
         return float(np.logaddexp(np.log1p(-REPLACED) + mean, np.log(REPLACED) + other))
 

@@ -126,7 +126,7 @@ def propose_scan_poses(a: RadioScans, b: RadioScans, n: int, law: RadioLaw) -> l
 
 
 def _keep_best(found: Sequence[tuple[Array, float]]) -> list[tuple[Array, float]]:
-    """Poses by falling score, each but once."""
+    """Keep poses by falling score, each but once."""
     kept: list[tuple[Array, float]] = []
     for at, score in sorted(found, key=lambda r: -r[1]):
         if all(not _is_same(at, other) for other, _ in kept):
@@ -140,7 +140,7 @@ def _is_same(a: Array, b: Array) -> bool:
 
 
 def _find_height(likeness: Array, a: Array, b: Array) -> float:
-    """m by which b is raised: the median over the best partners of its scans, by how alike they are."""
+    """Return the height, m, by which b is raised: the median over the best partners of its scans, by how alike they are."""
     best = likeness.argmax(axis=0)
     lift, weight = a[best] - b, likeness[best, np.arange(len(b))]
     order = np.argsort(lift, kind="stable")
@@ -149,7 +149,7 @@ def _find_height(likeness: Array, a: Array, b: Array) -> float:
 
 
 def _build_pose(at: Array, middle: Array, height: float) -> Sim3:
-    """The pose that turns b about the middle of its scans and lays that at (x, y)."""
+    """Build the pose that turns b about the middle of its scans and lays that at (x, y)."""
     x, y, yaw = at.tolist()
     placed = Sim3(yaw).apply(middle[None])[0]
     yaw = (yaw + np.pi) % (2 * np.pi) - np.pi
@@ -234,7 +234,8 @@ class _Search:
         return np.asarray(at + found.x * unit)
 
     def _build_score(self, at: Array, reach: float, rows: tuple[Array, ...], slack: float):  # type: ignore[no-untyped-def]
-        """Function of a pose near one: log likelihood ratio of the pairs of scans up to a reach, m, against pairs beyond it."""
+        """Build a function of a pose near one: the log likelihood ratio of the pairs of scans up to a reach, m, against pairs
+        beyond it."""
         a, b, table = self.a[rows[0]], self.b[rows[1]], self.tables[reach]
         moved = b @ _turn(at[2]) + at[:2]
         i, j = np.nonzero(((a[:, None] - moved[None]) ** 2).sum(axis=2) < (reach + slack) ** 2)
@@ -272,7 +273,7 @@ FINE_STEP = 0.25  # m, to which distances of a pose are told apart
 
 
 def _build_table(law: RadioLaw, reach: float, stretch: float) -> Array:
-    """(K, F) log likelihood ratio of a class of likeness at each `FINE_STEP` against pairs just beyond a reach, m."""
+    """Build the (K, F) log likelihood ratio of a class of likeness at each `FINE_STEP` against pairs just beyond a reach, m."""
     beyond = law.mix_between(reach * stretch, (reach + 4.0) * stretch)
     table = law.fine[0] - beyond
     at = np.arange(0.0, reach + FINE_STEP, FINE_STEP) * stretch
@@ -377,14 +378,14 @@ def rank_maps(index: RadioIndex, landmarks: Landmarks) -> list[RadioRank]:
 
 
 def _find_storeys(scans: RadioScans, map: TopometricMap) -> Array:
-    """(n,) storey of each scan: as it says, or the highest whose floor lies below it."""
+    """Return the (n,) storey of each scan: as it says, or the highest whose floor lies below it."""
     floors = map.storeys["floor"]
     below = np.clip(np.searchsorted(floors, scans.position[:, 2] + 0.5, side="right") - 1, 0, None) if len(floors) else 0
     return np.where(scans.storey >= 0, scans.storey, below)
 
 
 def _average_places(scans: RadioScans) -> sparse.csr_matrix:
-    """(p, k) mean power at each place of scans, `PLACE` wide, wider where there are too many."""
+    """Return the (p, k) mean power at each place of scans, `PLACE` wide, wider where there are too many."""
     cell = PLACE
     while True:
         at = np.floor(scans.position[:, :2] / cell).astype(np.int64)

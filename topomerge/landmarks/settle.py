@@ -70,7 +70,7 @@ class Observation:
         return f"visit the room {where}, which only {names[1 - self.map]} shows"
 
     def serialise(self) -> dict[str, Any]:
-        """As plain values, for merge.json."""
+        """Return plain values, for merge.json."""
         place = {"map": self.map, "room": self.room if self.room >= 0 else None, "at": [round(v, 2) for v in self.at]}
         worth = {"change": round(self.change, 4), "cost": round(self.cost, 2)}
         return {"action": self.action, **place, "expected": self.expected, **worth}
@@ -129,7 +129,7 @@ def _sample(points: Array) -> Array:
 def _list_signs(
     map: TopometricMap, into: Sim3, other: cKDTree, number: int, reported: set[int], posterior: Mapping[str, float]
 ) -> list[Observation]:
-    """Signs of a map that the other one could show and does not."""
+    """List the signs of a map that the other one could show and does not."""
     signs = build_sightings(map, ("text", "name"))
     kind = KINDS["text"]
     out = []
@@ -151,7 +151,7 @@ def _list_signs(
 
 
 def _list_rooms(map: TopometricMap, into: Sim3, other: cKDTree, number: int, posterior: Mapping[str, float]) -> list[Observation]:
-    """Rooms of a map that lie beside what the other one shows."""
+    """List the rooms of a map that lie beside what the other one shows."""
     out = []
     change = compute_expected_change(posterior, FOUND)
     for centroid in into.apply(map.rooms["centroid"]) if len(map.rooms) else ():
@@ -169,7 +169,7 @@ def _list_doors(
     posterior: Mapping[str, float],
     witnesses: Sequence[Witness],
 ) -> list[Observation]:
-    """Doors that both maps show and of whose signs nothing is known."""
+    """List the doors that both maps show and of whose signs nothing is known."""
     a, b = maps
     doors = a.edges[(a.edges["kind"] == "door")]["centre"]
     if other is None or not len(doors) or not len(b.edges):
@@ -188,7 +188,7 @@ def _list_doors(
 
 
 def _find_room(map: TopometricMap, at: Sequence[float]) -> int:
-    """The room of the nearest floor within `SEEN_WITHIN`, -1 none."""
+    """Return the room of the nearest floor within `SEEN_WITHIN`, -1 none."""
     inside = map.navigable_room >= 0
     if not inside.any():
         return -1

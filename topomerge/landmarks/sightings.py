@@ -124,7 +124,7 @@ def build_sightings(map: TopometricMap, kinds: Sequence[str]) -> Sightings:
 
 
 def _pick_single_readings(sightings: Sightings) -> Array:
-    """Numbers of the sightings without those that repeat a surer one of the same string at the same place."""
+    """Return the numbers of the sightings without those that repeat a surer one of the same string at the same place."""
     by_key: dict[str, list[int]] = {}
     for k in np.lexsort((sightings.rows, sightings.sigma, -sightings.confidence)).tolist():
         if not sightings.keys[k]:

@@ -63,7 +63,7 @@ EVERYWHERE = tuple(
 
 @lru_cache(maxsize=65536)
 def is_number(text: str) -> bool:
-    """Is a string a number of a room or the like, with letters perhaps, or read as one?"""
+    """Return whether a string is a number of a room or the like, with letters perhaps, or read as one."""
     folded = fold_text(text)
     digits = sum(c.isdigit() for c in text[: 4 * LONGEST_FOLDED])
     return bool(folded) and len(folded) <= 8 and (folded.isdigit() or 2 * digits >= len(folded))
@@ -71,7 +71,7 @@ def is_number(text: str) -> bool:
 
 @lru_cache(maxsize=65536)
 def is_common(text: str) -> bool:
-    """Does a string stand in every building?"""
+    """Return whether a string stands in every building."""
     return estimate_share(text) >= COMMON and not is_number(text)
 
 
@@ -122,7 +122,7 @@ def score_reading(one: str, other: str, error: float) -> float:
 
 
 def is_cut_off(one: str, other: str) -> bool:
-    """May one of two folded strings be the other one, of which an end of half its length at most is missing?"""
+    """Return whether one of two folded strings may be the other one, of which an end of half its length at most is missing."""
     short, long = sorted((one, other), key=len)
     return len(short) < len(long) <= 2 * len(short) and (long.startswith(short) or long.endswith(short))
 
@@ -161,7 +161,7 @@ def find_shifts(one: str, other: str) -> list[Shift]:
 
 
 def is_leading(shift: Shift) -> bool:
-    """Does a shift change the character that tells the storey or the wing: one of the first two?"""
+    """Return whether a shift changes the character that tells the storey or the wing: one of the first two."""
     return shift[0] == "change" and shift[1] <= 1
 
 

@@ -125,7 +125,7 @@ Pairs = tuple[tuple[int, int], ...]
 
 
 def grow(a: TopometricMap, b: TopometricMap, cost: Array, c_max: float | None = None, de_max: float = 2.5) -> list[Pairs]:
-    """Hypotheses, the one with most matches first (of equal ones the cheapest); each is a set of pairs, ascending.
+    """Grow hypotheses, the one with most matches first (of equal ones the cheapest); each is a set of pairs, ascending.
 
     Every pair of the assignment of least cost is a seed. A seed's neighbours are assigned to those of its partner; a pair is
     taken if its cost is at most `c_max` and the alignment of all matched centroids does not get worse by more than `de_max`;
@@ -153,7 +153,7 @@ def _grow_from_seed(
     c_max: float,
     de_max: float,
 ) -> Pairs:
-    """One hypothesis from its seed."""
+    """Grow one hypothesis from its seed."""
     partner = {seed[0]: seed[1]}
     error, queue = 0.0, deque([seed])
     while queue:
@@ -175,8 +175,8 @@ def _grow_from_seed(
 
 
 def align(to: Array, points: Array, scale: bool = False, weight: Array | None = None) -> tuple[Sim3, float]:
-    """The turn about the vertical and the translation (and the scale) that bring points (n, 3) onto others best, and the root
-    mean square error, m. One point, or several in one place, leave the turn at 0."""
+    """Return the turn about the vertical and the translation (and the scale) that bring points (n, 3) onto others best, and the
+    root mean square error, m. One point, or several in one place, leave the turn at 0."""
     w = np.ones(len(to)) if weight is None else weight
     w = w / w.sum()
     middle_to, middle = w @ to, w @ points
@@ -196,7 +196,8 @@ TWIN_SIZE = 0.15  # rooms whose area, length and width differ by no more than th
 
 
 def rank_partners(similarity: Array, matches: Array) -> tuple[Array, Array]:
-    """For each room of a that has a partner: which one it is, and the rank, from 1, of its best partner among all rooms of b.
+    """Return, for each room of a that has a partner, which one it is, and the rank, from 1, of its best partner among all rooms
+    of b.
 
     Ties count half of those that are as similar, so that a constant is as good as chance.
 
@@ -253,7 +254,7 @@ def assign_certain(certain: Array, least: float) -> Array:
 
 
 def count_pairs(pairs: Array, matches: Array) -> tuple[int, int, int, int]:
-    """Numbers of pairs, of right ones, of rooms of a and b that have a partner, and of those that got a right one.
+    """Return the numbers of pairs, of right ones, of rooms of a and b that have a partner, and of those that got a right one.
 
     Precision is the second over the first, recall the fourth over the third.
     """

@@ -127,7 +127,7 @@ def propose_door_poses(
 def propose_middle_poses(
     a: TopometricMap, b: TopometricMap, plans: tuple[RoomPlans, RoomPlans], pairs: Array, weight: Array
 ) -> PoseArrays:
-    """Four poses for each pair of rooms, middle on middle along the walls: for rooms without doors in common."""
+    """Propose four poses for each pair of rooms, middle on middle along the walls: for rooms without doors in common."""
     quarter = (plans[0].direction[0] - plans[1].direction[0]) + np.arange(4) * np.pi / 2
     i, j = np.repeat(pairs[:, 0], 4), np.repeat(pairs[:, 1], 4)
     yaw = np.tile(quarter, len(pairs))
@@ -144,8 +144,8 @@ def propose_scaled_poses(
     weight: Array,
     scales: tuple[float, float] = SCALE_LIMITS,
 ) -> PoseArrays:
-    """Poses at a scale of their own: from two doors of one room on two doors of another, the ratio of whose distances it is; and
-    from single doors at the ratio of the rooms' heights.
+    """Propose poses at a scale of their own: from two doors of one room on two doors of another, the ratio of whose distances it
+    is; and from single doors at the ratio of the rooms' heights.
 
     Args:
         scales: least and greatest.
@@ -167,7 +167,8 @@ def propose_scaled_poses(
 
 
 def snap_yaws(yaw: Array, plans: tuple[RoomPlans, RoomPlans]) -> Array:
-    """Yaws turned to the nearest one at which the walls of both maps are parallel, if that is near and walls are orderly."""
+    """Return the yaws turned to the nearest one at which the walls of both maps are parallel, if that is near and walls are
+    orderly."""
     if min(p.direction[1] for p in plans) < ORDERLY:
         return yaw
     base = plans[0].direction[0] - plans[1].direction[0]
@@ -176,7 +177,7 @@ def snap_yaws(yaw: Array, plans: tuple[RoomPlans, RoomPlans]) -> Array:
 
 
 def _pair_doors(a: Doors, b: Doors, pairs: Array, weight: Array, widths: float = WIDTH_GAP) -> tuple[Array, Array, Array]:
-    """Rows of the doors of a and of b that may be one, and the weight of their rooms."""
+    """Return the rows of the doors of a and of b that may be one, and the weight of their rooms."""
     table = np.zeros((int(max(a.room.max(initial=0), pairs[:, 0].max(initial=0))) + 1,
                       int(max(b.room.max(initial=0), pairs[:, 1].max(initial=0))) + 1))  # fmt: skip
     table[tuple(pairs.T)] = weight
@@ -188,7 +189,7 @@ def _pair_doors(a: Doors, b: Doors, pairs: Array, weight: Array, widths: float =
 
 
 def _pair_door_spans(a: Doors, b: Doors, pairs: Array, weight: Array, scales: tuple[float, float]) -> tuple[Array, ...]:
-    """Two doors of one room on two of another, at a scale between these: rows of the first doors, yaw, scale, weight."""
+    """Pair two doors of one room with two of another, at a scale between these: rows of the first doors, yaw, scale, weight."""
     of_a, of_b = (
         {int(room): _measure_spans(doors, int(room)) for room in np.unique(k)} for doors, k in ((a, pairs.T[0]), (b, pairs.T[1]))
     )
@@ -206,8 +207,8 @@ def _pair_door_spans(a: Doors, b: Doors, pairs: Array, weight: Array, scales: tu
 
 
 def _measure_spans(doors: Doors, room: int) -> tuple[Array, Array, Array]:
-    """Rows of each two doors of a room that are apart, in either order, and the way from the first to the second, x + i y; of
-    very many, some of each length."""
+    """Return the rows of each two doors of a room that are apart, in either order, and the way from the first to the second, x +
+    i y; of very many, some of each length."""
     own = np.flatnonzero(doors.room == room)
     first, second = (k.ravel() for k in np.meshgrid(own, own, indexing="ij"))
     way = (doors.centre[second, :2] - doors.centre[first, :2]) @ np.array([1, 1j])
@@ -219,7 +220,7 @@ def _measure_spans(doors: Doors, room: int) -> tuple[Array, Array, Array]:
 
 
 def _build_poses(to: Array, point: Array, yaw: Array, scale: Array, weight: Array, lift: Array) -> PoseArrays:
-    """Poses that bring points (H, 3) of b onto points of a, and floors onto floors (`_lift`)."""
+    """Build the poses that bring points (H, 3) of b onto points of a, and floors onto floors (`_lift`)."""
     c, s = scale * np.cos(yaw), scale * np.sin(yaw)
     x = to[:, 0] - (c * point[:, 0] - s * point[:, 1])
     y = to[:, 1] - (s * point[:, 0] + c * point[:, 1])
@@ -237,18 +238,20 @@ SAME_MATCHING = PoseTolerance(0.5, float(np.radians(5)), 0.05)
 
 @dataclass(frozen=True)
 class ConsistencySettings:
-    """Args:
-    partners: of a room, that are tried.
-    samples: of walls and of floor, of the first look at a pose and of the last.
-    sigmas: m, of the agreement of walls, likewise.
-    refined: poses that are moved until walls meet.
-    voters: poses; votes of neighbours are not counted among more.
-    overlaid: columns of floor, laid over each other to tell the rooms in common.
-    storey_gap: m by which floors of one storey may differ.
-    same: poses closer than this are one.
-    vote_reach: m by which votes of matches by attention for one pose differ.
-    least_voter: certainty of a match by attention, from which on it votes for a pose.
-    shortlist: share of the best agreement, below which a hypothesis ranks after all others.
+    """Settings of finding matches that one transform explains.
+
+    Args:
+        partners: of a room, that are tried.
+        samples: of walls and of floor, of the first look at a pose and of the last.
+        sigmas: m, of the agreement of walls, likewise.
+        refined: poses that are moved until walls meet.
+        voters: poses; votes of neighbours are not counted among more.
+        overlaid: columns of floor, laid over each other to tell the rooms in common.
+        storey_gap: m by which floors of one storey may differ.
+        same: poses closer than this are one.
+        vote_reach: m by which votes of matches by attention for one pose differ.
+        least_voter: certainty of a match by attention, from which on it votes for a pose.
+        shortlist: share of the best agreement, below which a hypothesis ranks after all others.
     """
 
     partners: int = 5
@@ -311,7 +314,7 @@ def propose_hypotheses(
 
 
 def select_best_poses(poses: PoseArrays, score: Array, point: Array, number: int) -> PoseArrays:
-    """Up to `number` poses of the highest score (H,), best first, none like a better one at a point (3,) of b."""
+    """Return up to `number` poses of the highest score (H,), best first, none like a better one at a point (3,) of b."""
     poses = poses.take(np.argsort(-score, kind="stable"))
     return poses.take(find_distinct_poses(poses, point, CONSISTENCY.same, number))
 
@@ -325,7 +328,8 @@ def propose_candidate_poses(
     scale_free: bool,
     scale: float | None = None,
 ) -> PoseArrays:
-    """Poses of all doors of all pairs, and of middles of the rooms; of unknown scale those about a scale, if there is one."""
+    """Propose poses of all doors of all pairs, and of middles of the rooms; of unknown scale those about a scale, if there is
+    one."""
     if not scale_free:
         return concatenate_poses(
             propose_door_poses(a, b, plans, pairs, weight), propose_middle_poses(a, b, plans, pairs, 0.2 * weight)

@@ -176,7 +176,8 @@ def weigh_turns(turns: Sequence[YawProbability], ranked: Sequence[PoseHypothesis
 def _compute_odds(
     describe: Descriptor, rows: tuple[Rows, Rows], b: TopometricMap, scale_free: bool, statistics: dict[str, float]
 ) -> tuple[RoomOdds, ...]:
-    """Partners of rooms by `room_matcher`; of unknown scale at that at which they are surest, which goes into the statistics."""
+    """Compute the partners of rooms by `room_matcher`; of unknown scale at that at which they are surest, which goes into the
+    statistics."""
     if not scale_free:
         return compute_room_odds(*rows)
     if not hasattr(describe, "at_scales"):
@@ -186,8 +187,8 @@ def _compute_odds(
 
 
 def _match_by_attention(a: TopometricMap, b: TopometricMap, odds: Sequence[RoomOdds], statistics: dict[str, float]) -> Matching:
-    """Matches of `room_matcher` at the likeliest turn, and the pose that most of their doors and middles vote for; how probable a
-    match is, is the mean over turns.
+    """Return the matches of `room_matcher` at the likeliest turn, and the pose that most of their doors and middles vote for; how
+    probable a match is, is the mean over turns.
 
     Raises:
         InputError: the rows are of another embedder.
@@ -231,7 +232,8 @@ def embed_rooms(describe: Descriptor, map: TopometricMap) -> Rows:
 
 
 def select_marginal_matches(a: TopometricMap, b: TopometricMap, ranked: tuple[PoseHypothesis, ...]) -> tuple[Array, Array]:
-    """Matches of the best hypothesis, and all whose probability over the hypotheses is above 0.5 and that exclude none of those.
+    """Return the matches of the best hypothesis, and all whose probability over the hypotheses is above 0.5 and that exclude none
+    of those.
 
     The probability of a match is the sum, over the hypotheses that have it, of theirs times that rooms which fit so are one.
     """
@@ -250,7 +252,7 @@ def select_marginal_matches(a: TopometricMap, b: TopometricMap, ranked: tuple[Po
 def _grow_ranked_hypotheses(
     a: TopometricMap, b: TopometricMap, cost: Array, similarity: Array, limits: GrowingLimits
 ) -> tuple[PoseHypothesis, ...]:
-    """Hypotheses of the growing; their probability goes with the square of the number of matches."""
+    """Return the hypotheses of the growing; their probability goes with the square of the number of matches."""
     grown = grow(a, b, cost, limits.cost, limits.error)[:MOST_HYPOTHESES]
     weight = np.array([len(p) ** 2 for p in grown], float)
     ranked = []

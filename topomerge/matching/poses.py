@@ -65,7 +65,7 @@ class PoseArrays:
 
     @classmethod
     def from_transforms(cls, transforms: Sequence[Sim3]) -> PoseArrays:
-        """Given poses, of weight 1."""
+        """Return given poses, of weight 1."""
         yaw, scale = (np.array([getattr(t, name) for t in transforms], np.float64) for name in ("yaw", "scale"))
         return cls(yaw, np.array([t.translation for t in transforms], np.float64).reshape(-1, 3), scale, np.ones(len(yaw)))
 
@@ -152,13 +152,13 @@ def wrap_yaw(yaw: float) -> float:
 
 
 def _wrap_angles(angles: Array) -> Array:
-    """The same angles in [-pi, pi)."""
+    """Return the same angles in [-pi, pi)."""
     out: Array = (angles + np.pi) % (2 * np.pi) - np.pi
     return out
 
 
 def pose_difference(p: Sim3, q: Sim3, anchor: Array) -> tuple[float, float, float]:
-    """How far two poses are apart: m at the anchor, rad, log scale.
+    """Return how far two poses are apart: m at the anchor, rad, log scale.
 
     Args:
         anchor: (3,) m, a point of the moved map: the frame's origin may lie far away, where a small turn is a long way.
@@ -286,13 +286,15 @@ SAME_POSE = PoseTolerance(0.4, float(np.radians(2.0)), 0.03)
 
 @dataclass(frozen=True)
 class RefineSettings:
-    """Args:
-    sigmas: m, of the weights of walls by their distance, round by round.
-    rounds: of each sigma.
-    sample: wall columns that a pose is refined by, at most.
-    same_level: m by which floors of one storey may differ.
-    unseen_level: m, likewise where a floor was not seen: its guess may be off by more.
-    same_pose: refined poses that are nearer are one.
+    """Settings of refining poses by walls.
+
+    Args:
+        sigmas: m, of the weights of walls by their distance, round by round.
+        rounds: of each sigma.
+        sample: wall columns that a pose is refined by, at most.
+        same_level: m by which floors of one storey may differ.
+        unseen_level: m, likewise where a floor was not seen: its guess may be off by more.
+        same_pose: refined poses that are nearer are one.
     """
 
     sigmas: tuple[float, ...] = (0.3, 0.15, 0.08)
@@ -327,7 +329,8 @@ def refine(
     scaled: bool = False,
     sample: int = REFINE.sample,
 ) -> list[PoseHypothesis]:
-    """Hypotheses moved to where b's walls lie on those of a, without duplicates; the best first, by the share of walls that meet.
+    """Return the hypotheses moved to where b's walls lie on those of a, without duplicates; the best first, by the share of walls
+    that meet.
 
     Those under which no storeys lie on one level are left out.
 
@@ -351,7 +354,7 @@ def refine(
 def _refine_group(
     v: PlanFields, w: PlanFields, group: Sequence[PoseHypothesis], scaled: bool, sample: int
 ) -> list[PoseHypothesis]:
-    """The hypotheses of one offset of heights, moved by the walls of one storey of each map."""
+    """Return the hypotheses of one offset of heights, moved by the walls of one storey of each map."""
     walls = w.walls
     if len(walls) > sample:
         walls = walls[np.random.default_rng(0).permutation(len(walls))[:sample]]

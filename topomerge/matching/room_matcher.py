@@ -111,8 +111,9 @@ class RoomOdds:
 
 
 def compute_room_odds(a: Rows, b: Rows, likeliest: bool = False) -> tuple[RoomOdds, ...]:
-    """Partners of the rooms of two maps at each turn of the second one that may be true (`match_turns`); none where the rows are
-    not those of the embedder that the network was trained with, or a map has no rooms. Which map is given first changes nothing.
+    """Compute the partners of the rooms of two maps at each turn of the second one that may be true (`match_turns`); none where
+    the rows are not those of the embedder that the network was trained with, or a map has no rooms. Which map is given first
+    changes nothing.
 
     Args:
         likeliest: only at the turn that is likeliest by rows alone.
@@ -158,7 +159,7 @@ def _match_turn(turn: Turn, matcher: Matcher) -> RoomOdds:
 
 
 def _compute_order_key(rows: TurnedRows) -> tuple[int, float]:
-    """That of two maps, whichever is given first."""
+    """Return the order key of two maps, the same whichever is given first."""
     assert rows.facts is not None
     return len(rows), float(rows.facts.sum())
 
@@ -276,8 +277,8 @@ RowsAt = Callable[[float], Rows]
 
 
 def find_best_scale(of_a: Rows, of_b: Rows, rows_at: RowsAt) -> tuple[float, tuple[RoomOdds, ...]]:
-    """m that the unit of the second map is taken for, and the partners of the rooms of both maps at each likely turn then; 1 and
-    none where the rows are of an embedder for which there is no such network.
+    """Return the metres that the unit of the second map is taken for, and the partners of the rooms of both maps at each likely
+    turn then; 1 and none where the rows are of an embedder for which there is no such network.
 
     Args:
         of_a: rows of the first map, whose scale is known.
@@ -289,7 +290,7 @@ def find_best_scale(of_a: Rows, of_b: Rows, rows_at: RowsAt) -> tuple[float, tup
     rows: dict[float, Rows] = {}
 
     def compute_confidence(scale: float) -> float:
-        """At the turn that is likeliest by rows alone: all of them take longer."""
+        """Compute the confidence at the turn that is likeliest by rows alone: all of them take longer."""
         rows[scale] = rows[scale] if scale in rows else rows_at(scale)
         return compute_room_odds(of_a, rows[scale], likeliest=True)[0].confidence
 

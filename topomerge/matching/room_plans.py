@@ -95,8 +95,8 @@ class RoomPlans:
         return float(np.angle(total) / 4 % (np.pi / 2)), abs(total) / max(weight, 1e-9)
 
     def sample_columns(self, number: int) -> tuple[Array, Array, Array, Array]:
-        """Up to `number` wall columns and as many of the floor, evenly spread: places (n, 2), storey, is it a wall?, and (2,) how
-        many columns of walls and of floor each sample stands for."""
+        """Sample up to `number` wall columns and as many of the floor, evenly spread: places (n, 2), storey, whether it is a
+        wall, and (2,) how many columns of walls and of floor each sample stands for."""
         parts, each = [], np.zeros(2)
         for k, raster in enumerate((self.walls, self.floor)):
             columns = np.flatnonzero(raster)

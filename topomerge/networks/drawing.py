@@ -61,7 +61,7 @@ def _look(x: Array, run: Run, turn: int) -> Array:
 
 
 def _split_side(side: int) -> list[tuple[int, int]]:
-    """Ends of the tiles of a side."""
+    """Return the ends of the tiles of a side."""
     count = max(1, math.ceil(side / TILE))
     ends = np.linspace(0, side, count + 1).astype(int).tolist()
     return list(pairwise(ends))

@@ -39,7 +39,7 @@ class Tensor:
     dtype: str = "float32"
 
     def describe(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """Describe it as JSON has it."""
         return {"shape": list(self.shape), "dtype": self.dtype, "meaning": self.meaning}
 
 
@@ -57,7 +57,7 @@ class Signature:
     outputs: Mapping[str, Tensor]
 
     def describe(self) -> dict[str, Any]:
-        """As JSON has it: what a card begins with."""
+        """Describe it as JSON has it: what a card begins with."""
         sides = {"inputs": self.inputs, "outputs": self.outputs}
         return {"what": self.what, **{side: {n: t.describe() for n, t in some.items()} for side, some in sides.items()}}
 
@@ -88,7 +88,7 @@ class Network:
         self.session, self.signature, self.path, self.card = session, signature, path, card
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Sent to another process as its file, which is opened there."""
+        """Send it to another process as its file, which is opened there."""
         return open_network, (self.path, str(self.card.get("sha256")), self.signature, self.card)
 
     def __call__(self, outputs: Sequence[str] | None = None, /, **inputs: Array) -> list[Array]:
@@ -197,7 +197,7 @@ def open_network(path: Path, digest: str, signature: Signature, card: Mapping[st
 
 
 def _checked_bytes(path: Path, digest: str) -> bytes:
-    """The bytes of a file, if they are those of its card."""
+    """Return the bytes of a file, if they are those of its card."""
     try:
         if path.stat().st_size > LARGEST_FILE:
             raise InputError(f"{path}: has more than {LARGEST_FILE >> 20} MB, no network is as large; copy both files again")
@@ -210,14 +210,14 @@ def _checked_bytes(path: Path, digest: str) -> bytes:
 
 
 def _fits(shape: Sequence[int | str], dtype: str, type_found: str, shape_found: Sequence[Any]) -> bool:
-    """Is a tensor of the type, and of the shape wherever both name a number?"""
+    """Return whether a tensor is of the type, and of the shape wherever both name a number."""
     pairs = zip(shape, shape_found, strict=False)
     numbers = all(a == b for a, b in pairs if isinstance(a, int) and isinstance(b, int))
     return type_found == dtype and len(shape) == len(shape_found) and numbers
 
 
 def _failure(path: Path, what: str, error: Exception) -> Exception:
-    """The error to raise for one of ONNX Runtime's."""
+    """Return the error to raise for one of ONNX Runtime's."""
     reason = " ".join(str(error).split())[:160]
     if is_memory_short(error):
         return MemoryError(f"{path}: {reason}")

@@ -43,7 +43,8 @@ class Judge:
         self._steps: dict[int, int] = {}
 
     def __call__(self, pose: Sim3, step: int = 1) -> dict[str, float]:
-        """Features of a pose. Areas, and walls as areas of columns, in m2; shares of 1. `step`: only so many of the columns."""
+        """Compute the features of a pose. Areas, and walls as areas of columns, in m2; shares of 1. `step`: only so many of the
+        columns."""
         counts = self.tally(pose, step)
         gaps = [0.0]
         for v, w in pair_storeys(self.a, self.b, pose.translation[2], pose.scale):
@@ -70,8 +71,8 @@ class Judge:
         return out
 
     def _compare_ceilings(self, pose: Sim3, step: int = 1) -> tuple[float, float]:
-        """How unlike the ceilings are where both maps saw free ground: mean deviation from their median difference, m, and the
-        area, m2. Storeys of one plan often differ in nothing else."""
+        """Return how unlike the ceilings are where both maps saw free ground: mean deviation from their median difference, m, and
+        the area, m2. Storeys of one plan often differ in nothing else."""
         deviations, area = [], 0.0
         for v, w in pair_storeys(self.a, self.b, pose.translation[2], pose.scale):
             if not (np.isfinite(v.plan.levels[1]) and np.isfinite(w.plan.levels[1])):
@@ -125,7 +126,8 @@ class Judge:
 
 
 def _smooth_blocks(values: Array, columns: Array) -> Array:
-    """The median of the values in each block of `CEILING_BLOCK` columns a side: rooms differ in height, lamps do not count."""
+    """Return the median of the values in each block of `CEILING_BLOCK` columns a side: rooms differ in height, lamps do not
+    count."""
     block = columns // CEILING_BLOCK
     _, owner = np.unique(block[:, 0] << 32 | block[:, 1], return_inverse=True)
     order = np.lexsort((values, owner))
@@ -168,7 +170,7 @@ class Side:
         self._parts: dict[int, tuple[Array, ...]] = {}
 
     def _sample_columns(self, step: int) -> tuple[Array, ...]:
-        """Every n-th of the columns."""
+        """Return every n-th of the columns."""
         if step not in self._parts:
             columns = (self.points, self.kinds, self.faces, self.inner, self.filled)
             self._parts[step] = tuple(np.ascontiguousarray(x[::step]) for x in columns)
@@ -251,8 +253,8 @@ def _compare_walls(source: PlanFields, target: PlanFields, move: Sim3) -> tuple[
 
 
 def _moved(rows: Array, target: PlanFields, main: float) -> Array:
-    """How much more of the walls would agree if each square were moved along one of the main directions by itself, m2, and how
-    much there is of them: a longer end fits only after such a move, and furniture or noise hardly fit better."""
+    """Return how much more of the walls would agree if each square were moved along one of the main directions by itself, m2, and
+    how much there is of them: a longer end fits only after such a move, and furniture or noise hardly fit better."""
     rows = rows[rows[:, 2] > 0]
     places, weights = np.ascontiguousarray(rows[:, :2]), np.ascontiguousarray(rows[:, 5])
     steps = np.arange(*WINDOW_SHIFTS)
@@ -293,9 +295,9 @@ def _compute_shares(walls: Array, conflict: float, main: float) -> dict[str, flo
 
 
 def _count_overhead(judge: Judge, pose: Sim3) -> dict[str, float]:
-    """Pieces of what hangs from ceilings (lamps, beams, ducts) that hang in the other map, too, and of all that both maps would
-    show: it stays when furniture moves, and no storey has that of another. Counted for the map that shows less: the other one may
-    look higher."""
+    """Count the pieces of what hangs from ceilings (lamps, beams, ducts) that hang in the other map, too, and of all that both
+    maps would show: it stays when furniture moves, and no storey has that of another. Counted for the map that shows less: the
+    other one may look higher."""
     pieces, back = np.zeros((2, 2)), pose.inverse()
     for v, w in pair_storeys(judge.a, judge.b, pose.translation[2], pose.scale):
         for side, (source, target, move) in enumerate(((w, v, pose), (v, w, back))):
@@ -314,8 +316,8 @@ def _count_overhead(judge: Judge, pose: Sim3) -> dict[str, float]:
 
 
 def _count_furniture(judge: Judge, pose: Sim3) -> dict[str, float]:
-    """How many pieces of furniture stand in place, of how many, and how many would by chance: where all is moved
-    by `FURNITURE_SHIFT`.
+    """Count how many pieces of furniture stand in place, of how many, and how many would by chance: where all is moved by
+    `FURNITURE_SHIFT`.
 
     Counted for the map that shows less of it: a tablet that looks up sees no desks, and missing desks are no evidence then.
     """

@@ -100,8 +100,8 @@ def build_candidate(
 
 
 def select_rivals(ranked: Sequence[PoseHypothesis]) -> list[int]:
-    """Which of ranked hypotheses to look at closely: the first, those next to it that are not far behind, and the one that ratios
-    speak for most, of those that explain enough: a shift along a row of rooms explains less, but is no worse."""
+    """Return which of ranked hypotheses to look at closely: the first, those next to it that are not far behind, and the one that
+    ratios speak for most, of those that explain enough: a shift along a row of rooms explains less, but is no worse."""
     near = [k for k, h in enumerate(ranked[:CLOSELY]) if h.score >= ranked[0].score - MARGIN_CAP]
     lag = compute_quality_lag(ranked)
     rest = [k for k in range(1, len(ranked)) if k not in near and lag[k] < MARGIN_CAP / 2]
@@ -109,7 +109,7 @@ def select_rivals(ranked: Sequence[PoseHypothesis]) -> list[int]:
 
 
 def select_testified(ranked: Sequence[PoseHypothesis], scorer: LandmarkScorer) -> list[int]:
-    """Which of ranked hypotheses landmarks speak for most, with what walls say of each."""
+    """Return which of ranked hypotheses landmarks speak for most, with what walls say of each."""
     support = [scorer.score(h.transform).support for h in ranked]
     odds = [h.score + s for h, s in zip(ranked, support, strict=True)]
     return [k for k in sorted(range(len(ranked)), key=lambda k: -odds[k])[:TESTIFIED] if support[k] > 0]
@@ -153,7 +153,7 @@ class FallbackProposals:
     below: float
 
     def inverse(self) -> FallbackProposals:
-        """That of the maps the other way round."""
+        """Return the proposals of the maps the other way round."""
         return replace(self, make=lambda: _invert_poses(self.make()))
 
 
@@ -326,8 +326,8 @@ def _invert_poses(poses: Sequence[Sim3]) -> list[Sim3]:
 
 
 def _refine_candidate(a: Prepared, b: Prepared, best: Candidate, scaled: bool, rigid: bool) -> tuple[Bend, float]:
-    """The bending of the best candidate with its pose by surfaces (all of it where the maps stay rigid, else its height), and the
-    root mean square distance of the surfaces, m. A slice has no planes, and stays as it is."""
+    """Return the bending of the best candidate with its pose by surfaces (all of it where the maps stay rigid, else its height),
+    and the root mean square distance of the surfaces, m. A slice has no planes, and stays as it is."""
     bent = best.bend
     if any(v.plan.sliced for v in (*a.storeys, *b.storeys)):
         return bent, best.features["rmse"]
@@ -363,7 +363,7 @@ def _build_registration(ranked: Sequence[PoseHypothesis], examined: Sequence[Can
 
 
 def refine_by_surfaces(a: Prepared, b: Prepared, start: Sim3, scaled: bool = False) -> tuple[Sim3, float]:
-    """Point-to-plane refinement of T_ab, unless it runs away, and the root mean square distance of the surfaces, m."""
+    """Refine T_ab point to plane, unless it runs away; return also the root mean square distance of the surfaces, m."""
     moved = refine_pose(a.surface, b.surface, start, scaled)
     shift = float(np.linalg.norm(moved.pose.apply(b.middle[None]) - start.apply(b.middle[None])))
     turn = abs(wrap_yaw(moved.pose.yaw - start.yaw))

@@ -52,7 +52,7 @@ class Crops:
 
     @staticmethod
     def none() -> Crops:
-        """No squares."""
+        """Return no squares."""
         empty = np.zeros((0, 2, SIDE, SIDE), np.uint8)
         return Crops(empty, empty, np.zeros((0, 2, LOOKED), np.float32), np.zeros((0, 3)), np.zeros(0))
 
@@ -91,7 +91,7 @@ def _cut_storey_crops(v: PlanFields, w: PlanFields, pose: Sim3) -> Crops:
 
 
 def _find_common_box(a: StoreyPlan, b: StoreyPlan, pose: Sim3, axes: Array) -> tuple[Array, Array]:
-    """Lower corner, m in the raster's axes, and size, pixels, of the box that both plans reach into."""
+    """Return the lower corner, m in the raster's axes, and size, pixels, of the box that both plans reach into."""
     lows, highs = [], []
     for plan, move in ((a, Sim3()), (b, pose)):
         span = np.array(plan.wall.shape) * plan.edge
@@ -104,7 +104,7 @@ def _find_common_box(a: StoreyPlan, b: StoreyPlan, pose: Sim3, axes: Array) -> t
 
 
 def _draw_layers(fields: PlanFields, places: Array, scale: float) -> tuple[Array, Array]:
-    """Bytes of parts and of ceilings of a plan at places (..., 2), m in its frame; its heights grow by `scale`."""
+    """Draw the bytes of parts and of ceilings of a plan at places (..., 2), m in its frame; its heights grow by `scale`."""
     p = fields.plan
     cells = np.floor((places - p.origin) / p.edge).astype(np.int64)
     inside = np.asarray(((cells >= 0) & (cells < p.wall.shape)).all(axis=-1))
@@ -116,8 +116,8 @@ def _draw_layers(fields: PlanFields, places: Array, scale: float) -> tuple[Array
 
 
 def level_ceilings(layers: tuple[Array, Array], other: tuple[Array, Array]) -> Array:
-    """Bytes of the ceilings of a map, raised by the median of what the other one's are above them on floor that is free in both:
-    in the storey below another one, what a map takes for the ceiling may be the floor above."""
+    """Return the bytes of the ceilings of a map, raised by the median of what the other one's are above them on floor that is
+    free in both: in the storey below another one, what a map takes for the ceiling may be the floor above."""
     both = (layers[0] & other[0] & ROOFED) == ROOFED
     if not both.any():
         return layers[1]
@@ -126,7 +126,8 @@ def level_ceilings(layers: tuple[Array, Array], other: tuple[Array, Array]) -> A
 
 
 def _select_tiles(seen: Array) -> tuple[Array, Array]:
-    """Middles (k, 2), pixels, of what both maps saw of each tile, and how much that is, m2; those of enough of it only."""
+    """Return the middles (k, 2), pixels, of what both maps saw of each tile, and how much that is, m2; those of enough of it
+    only."""
     at = np.argwhere(seen)
     across = seen.shape[1] // TILE + 1
     tile = at[:, 0] // TILE * across + at[:, 1] // TILE
@@ -226,7 +227,7 @@ def _compare_layers(shown: Array, missing: Array, near: Array) -> list[Array]:
 
 
 def _widen_bits(bits: Array) -> Array:
-    """Bits (..., side, side) that any pixel up to `SLACK` away has."""
+    """Return the bits (..., side, side) that any pixel up to `SLACK` away has."""
     side = bits.shape[-1]
     for axis in (-1, -2):
         pad = [(0, 0)] * bits.ndim

@@ -70,7 +70,8 @@ def compute_posterior(here: float, plan: float, kinds: Mapping[str, Any], x: Arr
 
 
 def limit_posterior(each: Mapping[str, float], most: float) -> dict[str, float]:
-    """A posterior in which this place has at most the probability `most`; the alternatives get the rest as they share theirs."""
+    """Return a posterior in which this place has at most the probability `most`; the alternatives get the rest as they share
+    theirs."""
     if each["here"] <= most:
         return dict(each)
     rest = 1 - each["here"]

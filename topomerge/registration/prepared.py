@@ -109,7 +109,7 @@ def unpack_prepared(parts: Mapping[str, Any], map: Map) -> Prepared:
 
 
 def prepare(map: Map, free: VoxelGrid | None = None) -> Prepared:
-    """Plans of a map, with what is drawn from them when it is first needed.
+    """Prepare the plans of a map, with what is drawn from them when it is first needed.
 
     Args:
         free: cells known to be empty; a topometric map brings its own.
@@ -137,7 +137,7 @@ def get_grid(map: Map) -> VoxelGrid:
 
 
 def compute_registration_order(map: Map) -> tuple[int, str]:
-    """Larger maps come first; among equal ones the order is arbitrary, but always the same."""
+    """Compute the key of an order in which larger maps come first; among equal ones it is arbitrary, but always the same."""
     grid = get_grid(map)
     digest = hashlib.sha256(np.ascontiguousarray(grid.cells).tobytes() + grid.origin.tobytes()).hexdigest()
     return -len(grid), digest

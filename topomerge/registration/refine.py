@@ -40,7 +40,7 @@ class Surface:
 
 
 def build_surface(grid: VoxelGrid) -> Surface:
-    """Blocks of cells, their mean points, and normals from the cells within two of the block's first one."""
+    """Build blocks of cells, their mean points, and normals from the cells within two of the block's first one."""
     points = compute_cell_means(grid)
     coarse = grid.cells // SURFACE_BLOCK
     blocks = VoxelGrid.from_cells(coarse, grid.origin, grid.edge * SURFACE_BLOCK)
@@ -60,7 +60,7 @@ def build_surface(grid: VoxelGrid) -> Surface:
 def refine_pose(
     a: Surface, b: Surface, start: Sim3, scaled: bool = False, stages: Sequence[tuple[int, float]] = REFINE_STAGES
 ) -> Refined:
-    """T_ab that brings b's surfaces onto a's, from a start that is right to a few decimetres.
+    """Return T_ab that brings b's surfaces onto a's, from a start that is right to a few decimetres.
 
     Slices have vertical planes only: what the planes do not fix (the height) stays as it was.
     """

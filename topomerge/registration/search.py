@@ -32,8 +32,8 @@ PROJECTED_WALLS = 4000  # wall columns that are projected
 
 
 def find_yaw_candidates(a: Array, b: Array, peaks: int = YAW_PEAKS) -> list[float]:
-    """Yaws (rad) that turn b's direction profile into a's, best first; each with its half turn, the best ones in all quarters:
-    where one map shows the walls of one direction only, those of the other direction are the nearest peak."""
+    """Find the yaws (rad) that turn b's direction profile into a's, best first; each with its half turn, the best ones in all
+    quarters: where one map shows the walls of one direction only, those of the other direction are the nearest peak."""
     blur = 1.5 / DIRECTION_STEP
     a, b = (ndimage.gaussian_filter1d(p, blur / 2, mode="wrap") for p in (a, b))
     a, b = a / max(a.max(), 1e-9), b / max(b.max(), 1e-9)
@@ -65,15 +65,17 @@ def select_distinct_yaws(yaws: Iterable[float]) -> list[float]:
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """Args:
-    cell: m, of the correlated images; wider where maps are large.
-    largest_image: cells along a side of them.
-    conflict_weight: of a wall on free ground, against one on a wall.
-    least_walls: columns of walls; storeys with fewer are not searched.
-    height_gap: m by which offsets of heights differ at least.
-    per_yaw: peaks of each yaw.
-    peak_distance: m between these.
-    hypotheses: that are refined, beside those of matched rooms.
+    """Settings of searching poses of one map in another.
+
+    Args:
+        cell: m, of the correlated images; wider where maps are large.
+        largest_image: cells along a side of them.
+        conflict_weight: of a wall on free ground, against one on a wall.
+        least_walls: columns of walls; storeys with fewer are not searched.
+        height_gap: m by which offsets of heights differ at least.
+        per_yaw: peaks of each yaw.
+        peak_distance: m between these.
+        hypotheses: that are refined, beside those of matched rooms.
     """
 
     cell: float = 0.2
@@ -117,7 +119,7 @@ class Correlator:
         return image
 
     def find_translations(self, yaw: float, number: int = SEARCH.per_yaw, scale: float = 1.0) -> list[tuple[float, float, float]]:
-        """(score, x, y): the translations of T_ab at the best peaks that are `peak_distance` from each other."""
+        """Find (score, x, y): the translations of T_ab at the best peaks that are `peak_distance` from each other."""
         c, s = scale * np.cos(yaw), scale * np.sin(yaw)
         turn = np.array([[c, s], [-s, c]])
         walls, cores = self.b.walls @ turn, self.cores @ turn
@@ -145,7 +147,8 @@ class Correlator:
 
 
 def find_height_offsets(a: Sequence[StoreyPlan], b: Sequence[StoreyPlan], scale: float = 1.0) -> list[float]:
-    """z offsets, m, that bring a storey of b to one of a: by their floors, or by their ceilings where a floor was not seen."""
+    """Find the z offsets, m, that bring a storey of b to one of a: by their floors, or by their ceilings where a floor was not
+    seen."""
     offsets: list[float] = []
     for p in a:
         for q in b:
@@ -211,7 +214,7 @@ def search_scaled(
 
 
 def find_scale_candidates(v: PlanFields, w: PlanFields, yaws: Sequence[float]) -> list[tuple[float, float, float]]:
-    """(score, yaw, scale) whose wall spacings agree, best first; for each yaw the separate peaks over the scale."""
+    """Find (score, yaw, scale) whose wall spacings agree, best first; for each yaw the separate peaks over the scale."""
     logs = np.arange(np.log(TRIED_SCALES[0]), np.log(TRIED_SCALES[1]) + SCALE_STEP, SCALE_STEP)
     main = v.main_direction
     axes = np.array([[np.cos(main), -np.sin(main)], [np.sin(main), np.cos(main)]])  # columns: along and across

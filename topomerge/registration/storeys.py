@@ -43,7 +43,8 @@ BESIDE_RUN = 0.35  # m from such a run, and on one side of it at least, hardly a
 
 
 def is_extruded(grid: VoxelGrid) -> bool:
-    """Was a map made from lines, which were given walls? Then all of its levels but the lowest hold the same columns."""
+    """Return whether a map was made from lines, which were given walls. Then all of its levels but the lowest hold the same
+    columns."""
     if not len(grid):
         return False
     level = grid.cells[:, 2] - grid.cells[:, 2].min()
@@ -64,7 +65,7 @@ def extract_lines(grid: VoxelGrid) -> tuple[VoxelGrid, VoxelGrid]:
 
 
 def find_slices(grid: VoxelGrid) -> list[float]:
-    """Heights of the layers of a map that was seen at one height a storey only, lowest first; none for other maps.
+    """Find the heights of the layers of a map that was seen at one height a storey only, lowest first; none for other maps.
 
     Nearly all cells lie in a few thin layers, and these show lines, where floors and ceilings would show areas.
     """
@@ -88,7 +89,7 @@ def find_slices(grid: VoxelGrid) -> list[float]:
 
 
 def _filled(cells: Array, edge: float) -> bool:
-    """Do cells fill areas, seen from above, or only draw lines?"""
+    """Return whether cells fill areas, seen from above, or only draw lines."""
     flat = cells[:, :2].astype(np.int64)
     columns = len(np.unique(flat[:, 0] << 32 | flat[:, 1]))
     side = max(round(0.5 / edge), 1)
@@ -97,7 +98,7 @@ def _filled(cells: Array, edge: float) -> bool:
 
 
 def find_levels(grid: VoxelGrid) -> list[tuple[float, float, float]]:
-    """(floor, ceiling, base) of each storey, m, lowest first: nan where not seen; bands are counted from the base.
+    """Find (floor, ceiling, base) of each storey, m, lowest first: nan where not seen; bands are counted from the base.
 
     A floor and its ceiling bound empty columns; where hardly any column has both, the largest level is a floor if most of the
     map lies above it, else a ceiling.
@@ -116,7 +117,7 @@ def find_levels(grid: VoxelGrid) -> list[tuple[float, float, float]]:
 
 
 def _find_gaps(grid: VoxelGrid) -> tuple[Array, Array]:
-    """Levels of the cells below and above each run of empty cells of at least `STOREY_GAP` in a column."""
+    """Return the levels of the cells below and above each run of empty cells of at least `STOREY_GAP` in a column."""
     x, y, z = grid.cells.T.astype(np.int64)
     key = np.sort((x * grid.shape[1] + y) * (1 << 21) + z)
     step = np.diff(key)
@@ -196,7 +197,7 @@ def build_plans(map: TopometricMap | VoxelGrid, free: VoxelGrid | None = None, c
 
 
 def _find_crossed_columns(free: VoxelGrid, corner: Array, cell: float) -> tuple[Array, Array, Array]:
-    """Columns ix, iy and heights, m, of empty cells; one that is wider than a column is in several."""
+    """Return the columns ix, iy and heights, m, of empty cells; one that is wider than a column is in several."""
     side = max(round(free.edge / cell), 1)
     at = free.compute_centroids()
     steps = (np.arange(side) - (side - 1) / 2) * free.edge / side

@@ -52,7 +52,7 @@ def check_open3d() -> None:
 
 
 def compute_fpfh(points: Array, normals: Array) -> Features:
-    """Fast point feature histograms of oriented points.
+    """Compute fast point feature histograms of oriented points.
 
     Args:
         points: (N, 3) m.
@@ -67,8 +67,8 @@ def compute_fpfh(points: Array, normals: Array) -> Features:
 
 
 def estimate_pose(a: Features, b: Features, seed: int = 0) -> Sim3 | None:
-    """T_ab that brings most points of b near those of a with the likest histograms, of triples with like edges; None where there
-    is none, or only one that tilts the floor. The same seed gives the same pose.
+    """Return T_ab that brings most points of b near those of a with the likest histograms, of triples with like edges; None where
+    there is none, or only one that tilts the floor. The same seed gives the same pose.
 
     Open3D knows no gravity: of the pose that it gives the turn about the vertical is taken.
     """
@@ -149,7 +149,7 @@ def compute_mean_pose(poses: Sequence[Sim3], weights: Array | Sequence[float] | 
 def cluster_poses(
     poses: Sequence[Sim3], weights: Array | Sequence[float], anchor: Array | None = None
 ) -> list[tuple[Sim3, float, list[int]]]:
-    """Clusters of weighted poses, heaviest first: (mean, weight, members).
+    """Return the clusters of weighted poses, heaviest first: (mean, weight, members).
 
     The pose with most weight around it is a cluster's seed; members are those within `CLUSTER_RADIUS` of the mean, until none
     changes.
@@ -222,7 +222,7 @@ def described(map: TopometricMap, room: int) -> Room | None:
 
 
 def align_rooms(a: Room | None, b: Room | None) -> Sim3 | None:
-    """T_ab of one room: sample consensus, then refinement; None where the surfaces stay apart."""
+    """Return T_ab of one room: sample consensus, then refinement; None where the surfaces stay apart."""
     if a is None or b is None:
         return None
     start = estimate_pose(a[1], b[1])

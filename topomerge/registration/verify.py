@@ -71,8 +71,8 @@ def compute_pose_vector(f: Features) -> Array:
 
 
 def load_model() -> dict[str, Any]:
-    """Coefficients and the threshold, fitted on simulated training pairs (`train.py task=merge_belief`): of two models each for
-    pairs of maps with heights (``solid``) and for those of which one is a slice or a drawing (``flat``)."""
+    """Load the coefficients and the threshold, fitted on simulated training pairs (`train.py task=merge_belief`): of two models
+    each for pairs of maps with heights (``solid``) and for those of which one is a slice or a drawing (``flat``)."""
     return read_weights_json("topomerge.registration", "calibration.json")
 
 
@@ -102,8 +102,8 @@ def score_bent(f: Features) -> float:
 
 
 def compute_lead(scores: Array, vectors: Array, weights: Array, scales: Array) -> tuple[float, float, float, float]:
-    """How far the first of ranked hypotheses is ahead, named `LEAD_VECTOR`: in log odds; in log odds without the amounts, of
-    those that explain a share of what it does; in log odds of its share of the odds of all; and its share where the amounts of
+    """Return how far the first of ranked hypotheses is ahead, named `LEAD_VECTOR`: in log odds; in log odds without the amounts,
+    of those that explain a share of what it does; in log odds of its share of the odds of all; and its share where the amounts of
     rivals count in part (`AMOUNT_COUNTS`).
 
     A shift by one room along a row of rooms explains less, but nothing speaks against it: it is nearly as good.
@@ -122,11 +122,13 @@ def compute_lead(scores: Array, vectors: Array, weights: Array, scales: Array) -
 
 @dataclass(frozen=True)
 class Verdict:
-    """Args:
-    posterior: probability of each of `posterior.POSTERIOR`; they sum to 1.
-    each: probability of each of the ranked poses, the first one that of this place (``here``).
-    features: of the first pose, all that it was judged by.
-    walls: probability of this place without landmarks.
+    """Probabilities of ranked poses and of their alternatives.
+
+    Args:
+        posterior: probability of each of `posterior.POSTERIOR`; they sum to 1.
+        each: probability of each of the ranked poses, the first one that of this place (``here``).
+        features: of the first pose, all that it was judged by.
+        walls: probability of this place without landmarks.
     """
 
     posterior: dict[str, float]
@@ -138,7 +140,8 @@ class Verdict:
 def compute_verdict(
     rivals: Sequence[Features], winner: Features, same: str = "nothing", landmarks: Sequence[LandmarkEvidence] = ()
 ) -> Verdict:
-    """Is the first of ranked poses right? At most its share of the odds of all, and at most what so much evidence can carry.
+    """Return whether the first of ranked poses is right. At most its share of the odds of all, and at most what so much evidence
+    can carry.
 
     Args:
         rivals: features of each pose once the maps are bent, best first.
@@ -215,7 +218,8 @@ def compute_bent_pose_vector(f: Features) -> Array:
 
 
 def compute_furniture_log_odds(f: Features) -> float:
-    """Log odds that furniture which both maps could see is of one room at two visits and not of two rooms of one plan.
+    """Compute the log odds that furniture which both maps could see is of one room at two visits and not of two rooms of one
+    plan.
 
     Of n pieces m stand in place: a beta-binomial likelihood of m by what stays over time (`FURNITURE_STAYS`) against that by what
     would meet by chance, measured where all furniture is moved (`compute_winner_features`). The three numbers are the most likely
@@ -277,8 +281,8 @@ def compute_plan_odds(fitted: Mapping[str, Any], x: Array) -> Array:
 
 
 def rank(hypotheses: Sequence[PoseHypothesis], judge: Judge, ranked: Sequence[PoseHypothesis] = ()) -> list[PoseHypothesis]:
-    """The hypotheses with their features and, as scores, the log odds that each is right, seen by itself; best first, and among
-    them those that were ranked before.
+    """Return the hypotheses with their features and, as scores, the log odds that each is right, seen by itself; best first, and
+    among them those that were ranked before.
 
     The findings' two-stage rule (shortlist what reaches 0.6 of the best agreement, then least conflict) put the right pose
     first in 76 of 82 training pairs, the logistic model in 80: a flipped plan can agree in more walls than a true overlap.

@@ -84,7 +84,7 @@ def compute_jambs(edge: Any) -> Array:
 
 
 def is_flight(edge: Any) -> bool:
-    """Does an edge lead from storey to storey, with a lower and an upper end?"""
+    """Return whether an edge leads from storey to storey, with a lower and an upper end."""
     return str(edge["kind"]) in ("stairs", "ramp")
 
 
@@ -102,7 +102,7 @@ def _group_by_room(label: Array, count: int) -> list[Array]:
 
 
 def _estimate_floor_level(cells: Array, z: Array) -> float:
-    """Median height of the lowest cell of each column: what lies above is its dilation upwards, or a gallery."""
+    """Return the median height of the lowest cell of each column: what lies above is its dilation upwards, or a gallery."""
     order = np.lexsort((z, cells[:, 1], cells[:, 0]))
     column = cells[order, :2]
     first = np.ones(len(order), bool)
@@ -136,7 +136,7 @@ def _rasterise_floor(columns: Array, edge: float) -> _Plan | None:
 
 
 def _trace_polygon(cells: Array, low: Array) -> shapely.MultiPolygon:
-    """The filled cells as polygons, in cells: the union of their runs along y."""
+    """Return the filled cells as polygons, in cells: the union of their runs along y."""
     change = np.diff(np.pad(cells, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     x, start = np.nonzero(change == 1)
     stop = np.nonzero(change == -1)[1]
@@ -145,7 +145,7 @@ def _trace_polygon(cells: Array, low: Array) -> shapely.MultiPolygon:
 
 
 def _estimate_growth(map: TopometricMap, plans: list[_Plan | None], cells: list[Any]) -> float:
-    """m, between the cells of floors and the walls around them."""
+    """Estimate the distance, m, between the cells of floors and the walls around them."""
     edge = map.navigable.edge
     missing = [
         (float(map.rooms["area"][r]) / edge**2 + plan.filled - shape.area) / shape.length * edge
@@ -156,7 +156,7 @@ def _estimate_growth(map: TopometricMap, plans: list[_Plan | None], cells: list[
 
 
 def _straighten_walls(cells: shapely.MultiPolygon) -> shapely.MultiPolygon:
-    """Straight walls in place of the steps of cells."""
+    """Put straight walls in place of the steps of cells."""
     parts = []
     for part in cells.geoms:
         rings = [_straighten_ring(np.asarray(ring.coords)[:-1]) for ring in (part.exterior, *part.interiors)]
@@ -189,7 +189,8 @@ def _straighten_ring(corners: Array) -> Array:
 
 
 def _remove_bevels(walls: list[Array]) -> list[Array]:
-    """Walls without short ones across a corner, where the two beside them meet: nobody stood in the tip of that corner."""
+    """Return the walls without short ones across a corner, where the two beside them meet: nobody stood in the tip of that
+    corner."""
     lines = [_fit_line(points) for points in walls]
     long_walls = []
     for k, points in enumerate(walls):
@@ -215,7 +216,8 @@ def _intersect_walls(walls: list[Array]) -> Array:
 
 
 def _fit_line(points: Array) -> tuple[Array, Array]:
-    """A point and the direction of the line through most of the points (n, 2): niches of a cell, as at doors, do not turn it."""
+    """Return a point and the direction of the line through most of the points (n, 2): niches of a cell, as at doors, do not turn
+    it."""
     points = points[2:-2] if len(points) > 8 else points  # cut across the corners
     weight = np.ones(len(points))
     for _ in range(5):

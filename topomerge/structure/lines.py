@@ -84,7 +84,7 @@ def detect_lines(points: Array, weights: Array, main: float | None = None) -> li
 
 
 def estimate_main_direction(lines: list[Line]) -> float | None:
-    """rad in [0, pi/2), along or across which most metres of lines run; None without any."""
+    """Estimate the direction, rad in [0, pi/2), along or across which most metres of lines run; None without any."""
     if not lines:
         return None
     turn = np.array([np.arctan2(line.along[1], line.along[0]) for line in lines]) % (np.pi / 2)
@@ -96,7 +96,7 @@ def estimate_main_direction(lines: list[Line]) -> float | None:
 
 
 def _find_strongest_run(points: Array, weights: Array, angles: Array) -> Array:
-    """Rows of the points of the run that holds most: of a direction and an offset across it."""
+    """Return the rows of the points of the run that holds most: of a direction and an offset across it."""
     middle = points.mean(axis=0)
     local = points - middle
     angle, offset = find_strongest_line(local, weights, angles, HOUGH_BIN)
@@ -110,7 +110,7 @@ def _find_strongest_run(points: Array, weights: Array, angles: Array) -> Array:
 
 
 def _fit_line(points: Array, weights: Array, main: float | None) -> Line:
-    """The line through most of the points."""
+    """Return the line through most of the points."""
     middle, along = _fit_least_squares(points, weights)
     t = (points - middle) @ along
     length = float(np.ptp(t))
@@ -128,7 +128,7 @@ def _fit_line(points: Array, weights: Array, main: float | None) -> Line:
 
 
 def _fit_least_squares(points: Array, weights: Array, along: Array | None = None) -> tuple[Array, Array]:
-    """A point and the direction of the line, points far off counting less (Cauchy); the direction may be given."""
+    """Return a point and the direction of the line, points far off counting less (Cauchy); the direction may be given."""
     given = np.zeros(2) if along is None else along
     weight = weigh_by_distance(points, weights, given, FIT_SCALES)
     middle = weight @ points / weight.sum()
@@ -193,7 +193,8 @@ def _refine_direction(walls: Array, turn: float) -> float:
 
 
 def _measure_sharpness(walls: Array, turn: float) -> float:
-    """Sum of squares of how many walls fall into each bin of both axes; bins are blurred, so that none is cut in two."""
+    """Return the sum of squares of how many walls fall into each bin of both axes; bins are blurred, so that none is cut in
+    two."""
     c, s = np.cos(turn), np.sin(turn)
     rotation = np.array([[c, -s], [s, c]])
     total = 0.0

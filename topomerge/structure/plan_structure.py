@@ -83,7 +83,8 @@ def place_windows(map: TopometricMap, walls: Array) -> Array:
 
 
 def _estimate_pane_heights(sill: float, head: float) -> tuple[float, float]:
-    """Sill and head above the floor, usual ones where they were not seen; LEAST_PANE high what ends below the floor."""
+    """Return the sill and head above the floor, usual ones where they were not seen; LEAST_PANE high what ends below the
+    floor."""
     low = sill if np.isfinite(sill) else min(USUAL_SILL, head - LEAST_PANE) if np.isfinite(head) else USUAL_SILL
     low = max(low, 0.0)
     if not np.isfinite(head):
@@ -92,7 +93,7 @@ def _estimate_pane_heights(sill: float, head: float) -> tuple[float, float]:
 
 
 def _find_carrier_wall(edge: Array, rooms: Array, walls: Array, table: Array) -> int:
-    """Row of the wall nearest to a door or a window among those that part its rooms, -1 none.
+    """Return the row of the wall nearest to a door or a window among those that part its rooms, -1 none.
 
     Args:
         rooms: (2,) on its two sides, -1 none.
@@ -207,7 +208,7 @@ def _label_pieces(pieces: Array, floor: shapely.MultiPolygon, seen: shapely.Geom
 
 
 def _find_borders(pieces: Array) -> tuple[Array, Array, Array]:
-    """Pairs of pieces that share an edge, and the edge."""
+    """Return the pairs of pieces that share an edge, and the edge."""
     owner: dict[tuple[tuple[float, float], tuple[float, float]], int] = {}
     rows = []
     for i, piece in enumerate(pieces):
@@ -223,7 +224,7 @@ def _find_borders(pieces: Array) -> tuple[Array, Array, Array]:
 
 
 def separate_outlines(outlines: list[shapely.MultiPolygon]) -> list[shapely.MultiPolygon]:
-    """Outlines of one storey without what an earlier one covers already."""
+    """Return the outlines of one storey without what an earlier one covers already."""
     out: list[shapely.MultiPolygon] = []
     for outline in outlines:
         taken = [out[k] for k in np.flatnonzero(shapely.intersects(out, outline))] if out else []
@@ -289,7 +290,7 @@ class _Face:
 
 
 def _find_parallel_pairs(lines: list[Line]) -> list[tuple[int, int]]:
-    """Ordered pairs of nearly parallel lines that lie beside each other."""
+    """Return the ordered pairs of nearly parallel lines that lie beside each other."""
     if not lines:
         return []
     segments = [shapely.LineString(line.ends) for line in lines]
@@ -306,14 +307,14 @@ def _measure_overlap(a: Line, b: Line) -> float:
 
 
 def _measure_distance(a: Line, b: Line) -> float:
-    """m between two lines, in the middle of where they lie beside each other."""
+    """Measure the distance, m, between two lines, in the middle of where they lie beside each other."""
     t = np.sort((b.ends - a.middle) @ a.along)
     middle = a.middle + a.along * (min(t[1], a.end) + max(t[0], a.start)) / 2
     return abs(float((middle - b.middle) @ b.across))
 
 
 def _measure_gap(a: _Face, b: _Face) -> float:
-    """m of wall between two faces; -1 where they do not look away from each other."""
+    """Measure the metres of wall between two faces; -1 where they do not look away from each other."""
     if a.room == b.room or a.side @ b.side > -PARALLEL or (b.line.middle - a.line.middle) @ a.side > 0:
         return -1.0
     return _measure_distance(a.line, b.line)
@@ -331,7 +332,7 @@ def _is_within(floor: shapely.MultiPolygon, points: Array) -> Array:
 
 
 def _shift_line(line: Line, off: Array, extent: Line) -> Line:
-    """A line that is concluded: one moved by `off` (2,) m, as long as another."""
+    """Return a line that is concluded: one moved by `off` (2,) m, as long as another."""
     t = np.sort((extent.ends - line.middle) @ line.along)
     return replace(line, middle=line.middle + off, start=float(t[0]), end=float(t[1]), weight=0.0)
 
@@ -356,7 +357,7 @@ class PlanStructure:
 
 
 def build_plan_structure(map: TopometricMap) -> PlanStructure:
-    """Walls, openings and outlines of rooms of a map; the same map gives the same ones.
+    """Build the walls, openings and outlines of rooms of a map; the same map gives the same ones.
 
     A room's faces are straight lines through the means of the cells that it sees; its outline runs along them where they are, and
     where no wall was seen, and in maps that do not hold these means, along its floor (`build_floor_polygons`). Two faces that

@@ -45,14 +45,15 @@ def add_wall_heights(map: TopometricMap, walls: Array, points: FacePoints) -> Ar
 
 
 def _is_near_door(wall: Array, map: TopometricMap) -> bool:
-    """Is a door of its rooms in a wall? Cupboards have none."""
+    """Return whether a door of its rooms is in a wall. Cupboards have none."""
     line = shapely.LineString([wall["start"], wall["end"]])
     own = np.isin(map.edges["rooms"], wall["rooms"][wall["rooms"] >= 0]).any(axis=1)
     return bool((shapely.distance(line, shapely.points(map.edges["centre"][own, :2])) < DOOR_NEAR).any())
 
 
 def _measure_own_top(wall: Array, points: FacePoints, tree: shapely.STRtree, ceiling: float) -> float:
-    """m above the floor, where a wall ends below a ceiling that is so high; inf: it does not, or that was not seen."""
+    """Return the height, m above the floor, where a wall ends below a ceiling that is so high; inf: it does not, or that was not
+    seen."""
     line = shapely.LineString([wall["start"], wall["end"]])
     rows = tree.query(line, predicate="dwithin", distance=wall["thickness"] / 2 + HEIGHT_REACH)
     along = (wall["end"] - wall["start"]) / max(line.length, 1e-9)
@@ -102,13 +103,13 @@ def join_walls(walls: Array, rooms: shapely.Geometry) -> Array:
 
 
 def _is_inside_rooms(rooms: shapely.Geometry, tip: Array, new: Array, way: Array, thickness: float) -> bool:
-    """Would the longer part of a wall stand in a room?"""
+    """Return whether the longer part of a wall would stand in a room."""
     part = shapely.LineString([tip, new]).buffer(max(thickness / 2 - 0.01, 0.01), cap_style="flat")
     return bool(shapely.area(shapely.intersection(part, rooms)) > 0.1 * max(part.area, 1e-9))
 
 
 def _measure_extension(tip: Array, way: Array, thickness: float, others: Array) -> float | None:
-    """m by which a wall that ends at `tip`, going `way`, is lengthened; None: it meets nothing."""
+    """Return the metres by which a wall that ends at `tip`, going `way`, is lengthened; None: it meets nothing."""
     best: float | None = None
     for other in others:
         line = other["end"] - other["start"]
@@ -248,7 +249,7 @@ def _collect_faces(map: TopometricMap, storey: int, rooms: list[shapely.MultiPol
 
 
 def _bridge_gaps(face: _Face, doors: list[Array]) -> _Face:
-    """The face without short gaps, and with the doors that are in it."""
+    """Return the face without short gaps, and with the doors that are in it."""
     seen = face.seen.copy()
     for door in doors:
         ends = (compute_jambs(door)[:, :2] - face.a) @ face.along
@@ -266,7 +267,7 @@ def _bridge_gaps(face: _Face, doors: list[Array]) -> _Face:
 
 
 def _pair_faces(faces: list[_Face]) -> list[tuple[int, int, float, float]]:
-    """(i, j, start, end): faces i < j are two sides of a wall, between two places on i, m; the nearest other side each."""
+    """Return (i, j, start, end): faces i < j are two sides of a wall, between two places on i, m; the nearest other side each."""
     lines = [shapely.LineString([f.a, f.b]) for f in faces]
     if not lines:
         return []
@@ -295,7 +296,7 @@ def _pair_faces(faces: list[_Face]) -> list[tuple[int, int, float, float]]:
 
 
 def _project_onto_face(face: _Face, point: Array) -> Array:
-    """The point of a face's line that is nearest to another."""
+    """Return the point of a face's line that is nearest to another."""
     out: Array = face.a + face.along * float((point - face.a) @ face.along)
     return out
 
@@ -330,7 +331,7 @@ def _build_double_wall(f: _Face, g: _Face, start: float, end: float) -> Row | No
 
 
 def _build_single_walls(faces: list[_Face], pairs: list[tuple[int, int, float, float]], thickness: float) -> list[Row]:
-    """Walls of which nobody saw the other side."""
+    """Build the walls of which nobody saw the other side."""
     rows: list[Row] = []
     taken: dict[int, list[tuple[float, float]]] = {}
     for i, j, start, end in pairs:
@@ -351,7 +352,7 @@ def _build_single_walls(faces: list[_Face], pairs: list[tuple[int, int, float, f
 
 
 def _find_seen_runs(face: _Face, low: float, high: float) -> list[tuple[float, float]]:
-    """Stretches of a part of a face that were seen."""
+    """Return the stretches of a part of a face that were seen."""
     first, last = int(low / BIN), int(np.ceil(high / BIN - 1e-6))
     change = np.flatnonzero(np.diff(np.pad(face.seen[first:last].astype(np.int8), 1)))
     runs = change.reshape(-1, 2) + first

@@ -54,7 +54,7 @@ class Access:
         return f"topomerge_{hashlib.sha256(self.session.encode()).hexdigest()[:12]}"
 
     def is_host_allowed(self, host: str) -> bool:
-        """Is a name in `Host` this machine's? A page from elsewhere could have its own name lead here."""
+        """Return whether a name in `Host` is this machine's. A page from elsewhere could have its own name lead here."""
         name = (urlsplit(f"//{host}").hostname or "").lower() if host.isascii() else ""
         known = {urlsplit(f"//{n}").hostname for n in LOOPBACK_NAMES} | {self.host.lower()}
         if name in known:
@@ -65,12 +65,12 @@ class Access:
         return name in (own, f"{own}.local", socket.getfqdn().lower()) or _is_address(name)
 
     def is_password(self, given: str) -> bool:
-        """Is it the password? Takes as long whatever it is compared with."""
+        """Return whether it is the password. Takes as long whatever it is compared with."""
         digests = [hashlib.sha256(text.encode()).digest() for text in (given, self.password)]
         return bool(self.password) and hmac.compare_digest(*digests)
 
     def is_session(self, cookies: str) -> bool:
-        """Does a `Cookie` header hold the session?"""
+        """Return whether a `Cookie` header holds the session."""
         held = dict(part.strip().partition("=")[::2] for part in cookies.split(";"))
         return hmac.compare_digest(held.get(self.cookie, "").encode(), self.session.encode())
 

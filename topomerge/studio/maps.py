@@ -159,7 +159,7 @@ def _build(held: OpenMap, wish: Mapping[str, Any]) -> Edit:
 
 
 def _lift(map: TopometricMap, places: list[Any], storey: Any) -> list[Any]:
-    """Places [x, y] of a storey as [x, y, z]; others as they are."""
+    """Return places [x, y] of a storey as [x, y, z]; others as they are."""
     single = not (places and isinstance(places[0], list))
     listed = [places] if single else places
     numbers = all(isinstance(p, list) and len(p) == 2 and all(isinstance(v, int | float) for v in p) for p in listed)

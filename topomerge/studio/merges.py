@@ -159,7 +159,7 @@ class JobQueue:
 
     @staticmethod
     def _note(job: Job, line: str) -> bool:
-        """Keep what a job says; was it anything?"""
+        """Keep what a job says, and return whether it was anything."""
         if line.startswith(PROGRESS_MARK):
             with suppress(ValueError, TypeError, KeyError):
                 message = json.loads(line.removeprefix(PROGRESS_MARK))
@@ -289,7 +289,7 @@ def _format_residual(rmse: float | None) -> str:
 
 
 def _find_matrix(transforms: Mapping[str, Any], k: int, held: OpenMap | None, first: OpenMap | None) -> list[Any] | None:
-    """T_0k between the maps; None where map k has no place."""
+    """Return T_0k between the maps; None where map k has no place."""
     if held is None or first is None or (k and str(k) not in transforms):
         return None
     matrix = np.array(transforms[str(k)]["matrix"], float) if k else np.eye(4)
@@ -298,7 +298,7 @@ def _find_matrix(transforms: Mapping[str, Any], k: int, held: OpenMap | None, fi
 
 
 def _draw_bent(bend: Any, held: OpenMap | None) -> list[str] | None:
-    """The walls of each storey as they are bent; None of a map that is rigid."""
+    """Draw the walls of each storey as they are bent; None of a map that is rigid."""
     if bend is None or held is None or held.drawn is None:
         return None
     deformation = Deformation.from_json(bend)
@@ -402,7 +402,7 @@ def _parse_pose(listed: Any) -> Sim3:
 
 
 def _parse_rooms(listed: Any, a: TopometricMap, b: TopometricMap) -> list[tuple[int, int]]:
-    """Pairs of rooms, of which both maps have theirs."""
+    """Parse pairs of rooms, of which both maps have theirs."""
     counts = len(a.rooms), len(b.rooms)
     try:
         pairs = [(int(i), int(j)) for i, j in listed]

@@ -116,7 +116,7 @@ def build_plan_data(
 def _trace_storey(
     plan: StoreyView, sheet: Sheet, known: Mapping[bytes, Outline], kept: dict[bytes, Outline]
 ) -> dict[int, Outline]:
-    """Room -> its outline; one whose pixels are known is not traced again. All go to `kept`."""
+    """Map each room to its outline; one whose pixels are known is not traced again. All go to `kept`."""
     room = fill_rooms(plan, sheet.frame)
     outlines = {}
     for i, box in enumerate(ndimage.find_objects(room + 1)):
@@ -151,7 +151,7 @@ def _find_neighbours(map: TopometricMap, rasters: Sequence[Array], size: float) 
 
 
 def _find_old_colours(rasters: Sequence[Array], before: DrawnPlan | None) -> dict[int, int]:
-    """Room -> the colour that most of its floor had, those with the most floor first."""
+    """Map each room to the colour that most of its floor had, those with the most floor first."""
     if before is None or not len(before.colours):
         return {}
     count = len(before.colours)
@@ -203,7 +203,7 @@ def _describe_rooms(map: TopometricMap, colours: Array) -> list[dict[str, Any]]:
 
 
 def _find_room_words(map: TopometricMap, kind: str) -> dict[int, str]:
-    """Room -> the value of its landmark of a kind, of several the last."""
+    """Map each room to the value of its landmark of a kind, of several the last."""
     table = map.landmarks.table[map.landmarks.is_kind(kind)]
     return {int(row["room"]): map.landmarks.values[row["value"]] for row in table if row["room"] >= 0}
 

@@ -150,11 +150,11 @@ class Studio:
     # The page.
 
     async def show_page(self, _: Request) -> Response:
-        """The page itself."""
+        """Send the page itself."""
         return _send_package_file("topomerge.studio.page", "studio.html")
 
     async def show_login(self, _: Request) -> Response:
-        """The page that asks for the password."""
+        """Send the page that asks for the password."""
         return _send_package_file("topomerge.studio.page", "login.html")
 
     async def log_in(self, request: Request) -> Response:
@@ -167,7 +167,7 @@ class Studio:
         return RedirectResponse("/login?wrong", status_code=303)
 
     async def send_page_file(self, request: Request) -> Response:
-        """A script or style sheet of the page."""
+        """Send a script or style sheet of the page."""
         name = request.path_params["name"]
         if name not in PAGE_FILES:
             return JSONResponse({"error": "no such file"}, 404)
@@ -195,7 +195,7 @@ class Studio:
         return JSONResponse({"path": self.folder.name(path)}, 201)
 
     async def send_file(self, request: Request) -> Response:
-        """A page of the folder, in an origin of its own; or a map, to be saved."""
+        """Send a page of the folder, in an origin of its own; or a map, to be saved."""
         path = self.folder.resolve(request.path_params["path"])
         if path.suffix.lower() in (".html", ".htm"):
             return FileResponse(path, media_type="text/html", headers={"content-security-policy": REPORT_POLICY})
@@ -242,18 +242,18 @@ class Studio:
         return path
 
     async def send_plan(self, request: Request) -> Response:
-        """The plans of a map, corrected; with `?quick` perhaps only that of the lowest storey."""
+        """Send the plans of a map, corrected; with `?quick` perhaps only that of the lowest storey."""
         held = await run_in_threadpool(self.maps.load, self._resolve_map(request), "quick" in request.query_params)
         return Response(held.plan, media_type="application/json")
 
     async def send_scene(self, request: Request) -> Response:
-        """The cells of a map, for the 3D view."""
+        """Send the cells of a map, for the 3D view."""
         return Response(
             await run_in_threadpool(self.maps.render_scene, self._resolve_map(request)), media_type="application/json"
         )
 
     async def send_report(self, request: Request) -> Response:
-        """The page of a map, to be sent to others."""
+        """Send the page of a map, to be sent to others."""
         path = self._resolve_map(request)
         page = await run_in_threadpool(self.maps.render_report, path)
         answer = Response(page, media_type="application/octet-stream")
@@ -261,7 +261,7 @@ class Studio:
         return answer
 
     async def edit_map(self, request: Request) -> Response:
-        """One correction. Another page that shows the map is told."""
+        """Make one correction. Another page that shows the map is told."""
         path, wish = self._resolve_map(request), await _read_json(request)
         version = wish.get("version")
         if not isinstance(version, int) or not isinstance(wish.get("edit"), dict):
@@ -279,7 +279,7 @@ class Studio:
         return path
 
     async def send_merge(self, request: Request) -> Response:
-        """The verdict of a merge with its evidence, and how its maps lie."""
+        """Send the verdict of a merge with its evidence, and how its maps lie."""
         path = self._resolve_merge(request)
         return JSONResponse(await run_in_threadpool(describe_merge, self.folder, self.maps, path))
 
@@ -292,7 +292,7 @@ class Studio:
         return JSONResponse({"job": job.describe() if job else None}, 202)
 
     async def place_maps(self, request: Request) -> Response:
-        """Where a map lies on another, from pairs of places or a pose, refined by their walls."""
+        """Send where a map lies on another, from pairs of places or a pose, refined by their walls."""
         wish = await _read_json(request)
         paths = [self.folder.resolve(path) for path in _check_paths(wish.get("paths"))]
         return JSONResponse(await run_in_threadpool(place_pair, self.maps, paths, wish))

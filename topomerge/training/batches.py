@@ -46,7 +46,8 @@ WALL, LOW, HIGH, CEILING = (SHEET_PLANES.index(name) for name in ("wall", "low",
 def simulate_partial_walk(
     planes: Array, room: Array, anchor: Array, doors: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Planes and rooms of what a walk sees that enters some rooms and looks into the others from a door: the rest is empty.
+    """Return the planes and rooms of what a walk sees that enters some rooms and looks into the others from a door: the rest is
+    empty.
 
     Args:
         planes: (H, W, len(SHEET_PLANES)) uint8; room: (H, W); anchor: (R, 2) pixels; doors: (R, n, 2) pixels, nan where none is.
@@ -60,7 +61,8 @@ def simulate_partial_walk(
 
 
 def simulate_slice(planes: Array, rng: np.random.Generator) -> Array:
-    """Planes as a laser that turns in one plane sees them: what stands at its height looks like walls, the rest is not seen."""
+    """Return the planes as a laser that turns in one plane sees them: what stands at its height looks like walls, the rest is not
+    seen."""
     out = planes.copy()
     things = np.maximum(planes[..., HIGH], planes[..., LOW]) if rng.random() < 0.5 else planes[..., HIGH]
     out[..., WALL] = np.maximum(planes[..., WALL], things)
@@ -185,7 +187,7 @@ def augment_sheet(graph: Graph, augment: Augment, generator: torch.Generator) ->
 
 
 def _rotate_relative_positions(positions: Tensor, angle: float) -> Tensor:
-    """Ways (E, 4), two of x and y each, turned by an angle, rad."""
+    """Turn ways (E, 4), two of x and y each, by an angle, rad."""
     c, s = math.cos(angle), math.sin(angle)
     return (positions.reshape(-1, 2, 2) @ torch.tensor([[c, s], [-s, c]])).flatten(1)
 
@@ -345,7 +347,7 @@ def build_map_pair(
 
 
 def _join_graphs(graphs: Sequence[Graph], rooms: Sequence[int], names: Sequence[str]) -> Graph:
-    """Graphs of so many rooms as one of which no edge leads from one to another."""
+    """Join graphs of so many rooms to one of which no edge leads from one to another."""
     edges = [graph["edge_index"].shape[1] for graph in graphs]
     first = {"edge_index": rooms, "door_index": edges, "near_index": edges}
     out = {name: torch.cat([graph[name] for graph in graphs]) for name in names if name not in INDICES}
@@ -364,7 +366,7 @@ class _View:
     mirror: bool = False
 
     def rotate_tensors(self, tensors: Graph) -> Graph:
-        """Tensors of this map as it is turned."""
+        """Return the tensors of this map as it is turned."""
         turned = rotate_quarter_turns(tensors, self.quarters)
         return mirror_graph(turned) if self.mirror else turned
 
@@ -372,8 +374,8 @@ class _View:
 def _build_views(
     pair: GraphPair, names: Sequence[str], augment: Augment | None, generator: torch.Generator | None
 ) -> tuple[_View, _View]:
-    """Both maps as they are; while training, those whose turn matters are changed, turned alike, and both turned and mirrored at
-    random."""
+    """Return both maps as they are; while training, those whose turn matters are changed, turned alike, and both turned and
+    mirrored at random."""
     if not ORIENTED & set(names):
         return _View(pair.a), _View(pair.b)
     if augment is None or generator is None:
@@ -484,7 +486,7 @@ def _scale_features(x: Tensor, scale: float, jitter: Tensor) -> Tensor:
 
 
 def _augment_points(points: Tensor, scale: float, augment: Augment, generator: torch.Generator) -> Tensor:
-    """Points drawn at random, in metres, turned about the vertical at random and jittered."""
+    """Draw points at random, in metres, turn them about the vertical at random, and jitter them."""
     rooms, number = points.shape[:2]
     if 0 < augment.points < number:
         chosen = torch.randperm(number, generator=generator)[: augment.points]

@@ -61,8 +61,8 @@ def derive_hypothesis_files(
 
 
 def evaluate_pair(*paths: Path, hypotheses: int, inspected: int) -> dict[str, Array]:
-    """The row of one pair, or of map a of one and b of another one, as JSON, and the squares of its places (`Crops`) with the
-    hypothesis that each is of (``owner``)."""
+    """Return the row of one pair, or of map a of one and b of another one, as JSON, and the squares of its places (`Crops`) with
+    the hypothesis that each is of (``owner``)."""
     pairs = [load_grids(path) for path in paths]
     return evaluate_arrays(pairs[0] if len(pairs) == 1 else pair_different_buildings(*pairs), hypotheses, inspected)
 
@@ -82,7 +82,7 @@ def evaluate_arrays(pair: GridPair, hypotheses: int, inspected: int) -> dict[str
 
 
 def assign_half(row: Mapping[str, Any]) -> int:
-    """0 or 1: the half of the physical buildings that that of a pair is in; networks of places are trained on one each."""
+    """Return 0 or 1: the half of the physical buildings that that of a pair is in; networks of places are trained on one each."""
     return hashlib.sha256(name_building(row).encode()).digest()[0] % 2
 
 
@@ -119,7 +119,8 @@ def read_row(path: Path, networks: Sequence[Run]) -> Row:
 
 
 def compute_pose_error(pose: Sim3, pair: GridPair) -> list[float] | None:
-    """Horizontal and vertical error in the middle of what both saw, m, and of yaw, degrees; None where no pose is right."""
+    """Return the horizontal and vertical error in the middle of what both saw, m, and of yaw, degrees; None where no pose is
+    right."""
     if pair.truth is None or pair.about["kind"] != "overlap":
         return None
     middle = pair.anchor[None]
@@ -142,9 +143,9 @@ def pair_different_buildings(first: GridPair, second: GridPair) -> GridPair:
 
 
 def evaluate_hypotheses(pair: GridPair, hypotheses: int, inspected: int) -> tuple[list[Row], dict[int, Crops], Array]:
-    """Hypotheses with what they are judged by, their errors and their labels; those that registration looks at closely, and
-    besides the first right one and the first wrong ones, with what the maps show once they are bent (``bent``), their squares;
-    and the middle (3,) of the second map, m, where poses are compared."""
+    """Return the hypotheses with what they are judged by, their errors and their labels; those that registration looks at
+    closely, and besides the first right one and the first wrong ones, with what the maps show once they are bent (``bent``),
+    their squares; and the middle (3,) of the second map, m, where poses are compared."""
     first, second = (prepare(g, f) for g, f in zip((pair.a, pair.b), pair.free, strict=True))
     scaled = bool(pair.about.get("scaled"))
     turn = second.order < first.order
@@ -235,8 +236,9 @@ def is_training_row(row: Row) -> bool:
 
 
 def score_lookalikes(rows: Sequence[Row], accepted: Array, true: Array, threshold: float) -> dict[str, float]:
-    """Shares of look-alikes that are wrong and believed, of those that somebody can tell apart (``tellable``) and of the others
-    (``untellable``), and their numbers. Ordinary pairs are passed over; pairs that fit in no one pose are not wrong."""
+    """Return the shares of look-alikes that are wrong and believed, of those that somebody can tell apart (``tellable``) and of
+    the others (``untellable``), and their numbers. Ordinary pairs are passed over; pairs that fit in no one pose are not
+    wrong."""
     out: dict[str, float] = {}
     wrong = (np.asarray(true) == 0) & (np.asarray(accepted) >= threshold)
     for name, tellable in (("tellable", True), ("untellable", False)):

@@ -62,7 +62,8 @@ def run_fit(settings: Settings, make: Callable[[Settings, LogFn], FitResult], lo
 
 
 def compute_calibration_error(p: Array, y: Array) -> float:
-    """Expected calibration error: how far probabilities (n,) are from how often it was so (n,), over `PROBABILITY_BANDS`."""
+    """Compute the expected calibration error: how far probabilities (n,) are from how often it was so (n,), over
+    `PROBABILITY_BANDS`."""
     error = 0.0
     for low, high in pairwise(PROBABILITY_BANDS):
         band = (p >= low) & (p < high + (high == 1))

@@ -13,8 +13,8 @@ from topomerge.registry import OPTIMIZERS
 
 
 def group_parameters(network: torch.nn.Module, decay: float) -> list[dict[str, Any]]:
-    """Weights that are trained, for an optimizer: those of layers decay; biases, gains of norms and lone numbers, such as a
-    temperature, do not."""
+    """Return the weights that are trained, for an optimizer: those of layers decay; biases, gains of norms and lone numbers, such
+    as a temperature, do not."""
     trained = [p for p in network.parameters() if p.requires_grad]
     layers, others = [p for p in trained if p.ndim > 1], [p for p in trained if p.ndim < 2]
     return [{"params": of, "weight_decay": by} for of, by in ((layers, decay), (others, 0.0)) if of]

@@ -134,7 +134,7 @@ def compute_region_pairs(plan: StoreyPlan, probability: Array, truth: Array, vis
 
 
 def _assign_regions_to_rooms(region: Array, truth: Array, edge: float) -> tuple[Array, Array]:
-    """True room of each region, -1 where it lies between rooms, and the regions' areas, m2."""
+    """Return the true room of each region, -1 where it lies between rooms, and the regions' areas, m2."""
     count, rooms = int(region.max(initial=-1)) + 1, int(truth.max(initial=-1)) + 1
     votes = np.zeros((count, rooms + 1))
     inside = region >= 0
@@ -244,7 +244,8 @@ def predict_probabilities(x: Array, weights: dict[str, Any]) -> Array:
 
 
 def score_doors(p: Array, y: Array, threshold: float = 0.5) -> dict[str, float]:
-    """Precision and recall of doors from a probability on, area under the ROC curve, log loss and the share that is right."""
+    """Return the precision and recall of doors from a probability on, area under the ROC curve, log loss and the share that is
+    right."""
     predicted, y = p > threshold, np.asarray(y, bool)
     order = np.unique(p, return_inverse=True)[1]
     ranks = (np.cumsum(np.bincount(order)) - (np.bincount(order) - 1) / 2)[order]

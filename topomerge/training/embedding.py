@@ -186,7 +186,7 @@ class EmbeddingJob:
         return AugmentedPairs(self.train, names, self.augment, lambda pair: pair)
 
     def _draw_order(self, generator: torch.Generator) -> list[int]:
-        """The pairs of an epoch: all of one's own, and those that are drawn for replay, with replacement, among them."""
+        """Draw the pairs of an epoch: all of one's own, and those that are drawn for replay, with replacement, among them."""
         order = torch.randperm(self.own, generator=generator)
         if self.drawn:
             replayed = torch.randint(self.own, len(self.train), (self.drawn,), generator=generator)
@@ -266,7 +266,8 @@ class EmbeddingJob:
 
     @torch.no_grad()
     def _compute_validation_loss(self) -> float:
-        """Mean loss of the validation pairs, as they are, in batches as of the training; each process computes all of it."""
+        """Compute the mean loss of the validation pairs, as they are, in batches as of the training; each process computes all of
+        it."""
         objective = Objective(self.network, self.settings.loss).eval()
         pairs = AugmentedPairs(self.watched, self.network.tensors, None, lambda pair: pair)
         total, size, count = 0.0, self.settings.batch, len(self.watched)
@@ -286,7 +287,7 @@ class EmbeddingJob:
         return getattr(self.fabric.strategy.precision, "scaler", None)
 
     def write_network(self, folder: Path) -> None:
-        """The embedder's state."""
+        """Write the embedder's state."""
         save_state(self.network, folder, describe_training(self.settings, {}))
 
     def export_best(self, folder: Path) -> None:
@@ -298,7 +299,7 @@ class EmbeddingJob:
                 (folder / name).unlink()
 
     def write_checkpoint(self, folder: Path, row: Mapping[str, Any]) -> None:
-        """The embedder's state; what was exported of an earlier one goes."""
+        """Write the embedder's state; what was exported of an earlier one goes."""
         shutil.rmtree(folder, ignore_errors=True)
         save_state(self.network, folder, describe_training(self.settings, row))
 
@@ -357,7 +358,7 @@ def adopt_network(settings: Training) -> Training:
 
 
 def _load_data(settings: Training, log_line: LogFn, fabric: Any) -> tuple[list[GraphPair], list[GraphPair], list[GraphPair]]:
-    """Pairs to train on, to watch, and to replay; a set is packed by one process while the others wait."""
+    """Load the pairs to train on, to watch, and to replay; a set is packed by one process while the others wait."""
     names = (settings.data, settings.validation, settings.replay_data if settings.replay else "")
     with fabric.rank_zero_first():
         train, watched, replayed = (

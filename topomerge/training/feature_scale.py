@@ -76,7 +76,7 @@ def build_pair_features(recipe: Recipe, settings: FeatureScale, log_line: LogFn)
 
 
 def compute_features(path: Path) -> dict[str, Array]:
-    """`PairFeatures` of a pair's file."""
+    """Return the `PairFeatures` of a pair's file."""
     pair = load_evaluation_pair(path)
     maps = pair.load_maps()
     a, b = (compute_raw_features(m) for m in maps)

@@ -161,7 +161,7 @@ def judge(old: Sequence[PairScores], new: Sequence[PairScores], about: Sequence[
 
 
 def _count(one: PairScores) -> list[float]:
-    """Rooms with a partner, those whose partner is first, or among five, and `count_pairs` at each certainty."""
+    """Count the rooms with a partner, those whose partner is first, or among five, and `count_pairs` at each certainty."""
     return [len(one.ranks), (one.ranks <= 1).sum(), (one.ranks <= 5).sum(), *one.counts.ravel()]
 
 
@@ -179,7 +179,7 @@ def _compute_scores(sums: Array, every: Array) -> Array:
 
 
 def _bound(values: Array, draws: Array) -> list[tuple[float, float, float]]:
-    """Each value (1, k) with the ends of the 95 % interval of its draws (n, k)."""
+    """Return each value (1, k) with the ends of the 95 % interval of its draws (n, k)."""
     ends = np.quantile(draws, [OUTSIDE, 1 - OUTSIDE], axis=0)
     return [(float(v), float(low), float(high)) for v, low, high in zip(values[0], ends[0], ends[1], strict=True)]
 

@@ -76,11 +76,11 @@ class State:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Args:
-    settings: of the run.
-    steps: of each epoch.
-    perfect: value of the score at which nothing is left to learn.
-    lower: less of the score is better.
+    """Steps of a run, and the score by which it is watched.
+
+    Args:
+        settings: of the run; steps: of each epoch.
+        perfect: value of the score at which nothing is left to learn; lower: less of the score is better.
     """
 
     settings: NetworkSettings
@@ -153,7 +153,7 @@ class Loop:
         self.traces = self.settings.profile and log is not None
 
     def run(self) -> dict[str, float]:
-        """Epochs until the last one, or until nothing has become better for long; the row of the best epoch.
+        """Run epochs until the last one, or until nothing has become better for long; return the row of the best epoch.
 
         Raises:
             KeyboardInterrupt: after Ctrl-C or SIGTERM; the state is saved.
@@ -215,12 +215,12 @@ class Loop:
         return better
 
     def _is_converged(self) -> bool:
-        """Has nothing become better for long, or is nothing left to learn?"""
+        """Return whether nothing has become better for long, or nothing is left to learn."""
         patience, state = self.settings.patience, self.state
         return bool(patience and state.stale >= patience) or state.best >= self.schedule.perfect
 
     def _run_epoch(self) -> dict[str, Any]:
-        """The steps of an epoch that are left."""
+        """Run the steps of an epoch that are left."""
         began, waited, sizes, state = time.perf_counter(), 0.0, 0, self.state
         batches = self.job.iter_batches(state)
         tracer = StepTracer(self.settings.folder / TRACE_FILE, self.schedule.steps - state.step) if self.traces else None
@@ -291,7 +291,7 @@ class Loop:
 
     @contextmanager
     def _handle_interrupts(self) -> Iterator[None]:
-        """Ctrl-C and SIGTERM let the step end and save; a second one ends at once."""
+        """Let the step end and save at Ctrl-C and SIGTERM; a second one ends at once."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return
@@ -417,7 +417,7 @@ class NetworkJob(ABC):
         return tuple(tensor.to(self.device, non_blocking=True) for tensor in batch)
 
     def optimize(self, loss: torch.Tensor, options: Any, state: State) -> dict[str, float]:
-        """One step of the optimizer at the rate of its place in the run: it rises over `options.warmup` steps, then falls."""
+        """Take a step of the optimizer at the rate of its place in the run: it rises over `options.warmup` steps, then falls."""
         total, done = options.epochs * options.steps, state.epoch * options.steps + state.step
         for group in self.optimizer.param_groups:
             factor = SCHEDULES[self.settings.schedule](done / total, min(options.warmup / total, 0.5))
@@ -433,7 +433,7 @@ class NetworkJob(ABC):
         return {}
 
     def write_checkpoint(self, folder: Path, row: Mapping[str, Any]) -> None:
-        """The weights as torch has them, and their scores; what was exported of earlier ones goes."""
+        """Write the weights as torch has them, and their scores; what was exported of earlier ones goes."""
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         metrics = {k: v for k, v in row.items() if k.startswith("val/")}
@@ -462,7 +462,7 @@ class ExportedJob(NetworkJob):
 
     @abstractmethod
     def exported(self) -> Exported:
-        """The network as the package runs it."""
+        """Return the network as the package runs it."""
 
     def run(self) -> Run:
         """Return the network as it is, for those who call what is exported."""

@@ -64,7 +64,8 @@ def compute_spread(x: Array) -> Array:
 
 
 def fit_logistic(x: Array, y: Array, names: Sequence[str], strength: float, weight: Array | None = None) -> dict[str, Any]:
-    """Standardised logistic regression as plain numbers, in which what speaks for a merge never counts against it (`SIGN`)."""
+    """Fit a standardised logistic regression, as plain numbers, in which what speaks for a merge never counts against it
+    (`SIGN`)."""
     mean, scale = x.mean(axis=0), compute_spread(x)
     z, sign = (x - mean) / scale, np.where(y, 1.0, -1.0)
     weight = np.ones(len(y)) if weight is None else weight
@@ -126,8 +127,8 @@ def weight_by_prior(truth: Array, weight: Array) -> Array:
 
 
 def compute_risk_curve(accepted: Array, true: Array, truth: Array, weight: Array) -> list[list[float]]:
-    """(threshold, false merges in a thousand pairs) for rising thresholds: of pairs drawn by `PRIORS`, by what left-out pairs
-    show; kinds of which there are none count nothing.
+    """Compute (threshold, false merges in a thousand pairs) for rising thresholds: of pairs drawn by `PRIORS`, by what left-out
+    pairs show; kinds of which there are none count nothing.
 
     Args:
         believed, true: (n,) probability of the best hypothesis of each pair, and is it right (1), wrong (0) or neither?
@@ -167,8 +168,8 @@ def fit_multinomial(x: Array, truth: Array, weight: Array, strength: float) -> d
 
 
 def iter_folds(groups: Array, count: int, ordinary: int) -> Iterator[tuple[Array, Array]]:
-    """Rows to train on and rows to test on; no group is in both. Groups from `ordinary` on (of look-alikes) are dealt in turn, so
-    that the folds of the others are the same without them."""
+    """Yield rows to train on and rows to test on; no group is in both. Groups from `ordinary` on (of look-alikes) are dealt in
+    turn, so that the folds of the others are the same without them."""
     first = int(groups[groups < ordinary].max(initial=-1)) + 1
     of = np.append(np.random.default_rng(0).permutation(first), np.arange(first, groups.max() + 1))[groups] % count
     for k in range(count):
@@ -185,7 +186,7 @@ def fit(settings: MergeBelief, log_line: LogFn) -> dict[str, float]:
 
 
 def fit_belief(settings: MergeBelief, log_line: LogFn) -> FitResult:
-    """The models for pairs of maps with heights, from all pairs without drawings, and those for slices and drawings, from all
+    """Fit the models for pairs of maps with heights, from all pairs without drawings, and those for slices and drawings, from all
     pairs; what left-out pairs say about them is reported of the pairs that each is for."""
     rows = [row for row in build_belief_rows(settings.data, settings, log_line) if row["hyps"] and is_distinguishable(row)]
     rows += [row for row in build_lookalike_rows(settings.alike, settings, log_line) if row["hyps"]]
@@ -214,7 +215,7 @@ def fit_belief(settings: MergeBelief, log_line: LogFn) -> FitResult:
 
 
 def compute_left_out_risk(rows: Sequence[dict[str, Any]], accepted: Array, true: Array) -> list[list[float]]:
-    """`compute_risk_curve` of pairs that were left out, but for what nobody can tell apart, what trains nothing, and the
+    """Return `compute_risk_curve` of pairs that were left out, but for what nobody can tell apart, what trains nothing, and the
     floor."""
     no = [row.get("tellable") is False or row.get("judged_only") or row.get("real") for row in rows]
     chosen = ~np.array(no, bool)
@@ -267,7 +268,7 @@ def build_hypothesis_table(rows: list[dict[str, Any]]) -> Table:
 def find_best_hypothesis(
     t: Table, scores: Array, bent: dict[str, Any], i: int, wrong: bool = False
 ) -> tuple[int, Array, float, Array] | None:
-    """Row of the best hypothesis of pair i (of the wrong ones only, as if no search had found a right one), what the
+    """Return the row of the best hypothesis of pair i (of the wrong ones only, as if no search had found a right one), what the
     second model sees of it, its share of the odds, and what the model of places of one plan sees of it."""
     rows = np.flatnonzero((t.owner == i) & t.is_inspected & ((t.y == 0) if wrong else t.rival))
     rows = rows[np.argsort(-scores[rows], kind="stable")]
@@ -285,15 +286,15 @@ def find_best_hypothesis(
 
 
 def _find_distinct_poses(poses: Array, middle: Array) -> list[int]:
-    """Which of ranked poses (n, 4, 4) end in no better one's place (as `matching.poses.select_distinct_hypotheses`)."""
+    """Return which of ranked poses (n, 4, 4) end in no better one's place (as `matching.poses.select_distinct_hypotheses`)."""
     hypotheses = [PoseHypothesis(convert_to_sim3(pose)) for pose in poses]  # type: ignore[arg-type]
     single = {id(h) for h in select_distinct_hypotheses(hypotheses, middle, BASIN)}
     return [k for k, h in enumerate(hypotheses) if id(h) in single]
 
 
 def fit_models(rows: list[dict[str, Any]], flat: bool, settings: MergeBelief) -> tuple[dict[str, Any], tuple[Any, Array, Array]]:
-    """The models of these pairs; and of those that are flat, or are not: the rows, what left-out buildings' models believe of
-    their best hypothesis, and its label.
+    """Fit the models of these pairs; return them, and of those that are flat, or are not: the rows, what left-out buildings'
+    models believe of their best hypothesis, and its label.
 
     Raises:
         InputError: too few pairs or buildings.
@@ -309,8 +310,8 @@ def fit_models(rows: list[dict[str, Any]], flat: bool, settings: MergeBelief) ->
 
 
 def fit_ranking(t: Table, flat: bool, settings: MergeBelief) -> tuple[dict[str, Any], Array]:
-    """The models by which hypotheses are ranked, before (``pose``) and after the maps are bent (``bent``), and (n,) the log odds
-    of each that was looked at, by models of other buildings.
+    """Fit the models by which hypotheses are ranked, before (``pose``) and after the maps are bent (``bent``); return also (n,)
+    the log odds of each that was looked at, by models of other buildings.
 
     Raises:
         InputError: too few pairs or buildings.

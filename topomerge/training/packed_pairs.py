@@ -128,8 +128,8 @@ def load_pairs(
 
 
 def split_pairs(file: Mapping[str, Array], row: Mapping[str, Any]) -> list[tuple[dict[str, Array], dict[str, Any]]]:
-    """The pairs of a cached file of two or more maps of a building, each with its arrays ("a.…", "b.…", matches, transform) and
-    its row; those of a file of several that share no room are left out."""
+    """Return the pairs of a cached file of two or more maps of a building, each with its arrays ("a.…", "b.…", matches,
+    transform) and its row; those of a file of several that share no room are left out."""
     sides, out = str(row.get("sides", "ab")), []
     for s, t in itertools.combinations(sides, 2):
         ending = "" if (s, t) == ("a", "b") else f".{s}{t}"
@@ -142,8 +142,8 @@ def split_pairs(file: Mapping[str, Array], row: Mapping[str, Any]) -> list[tuple
 
 
 def _add_sheets(pairs: Sequence[GraphPair], files: Sequence[Path], packed_file: Path, log_line: Callable[[str], None]) -> None:
-    """The storeys of all maps from above (`embedding.surroundings`), packed in chunks, too: of all files, so that a chunk serves
-    any `limit`."""
+    """Add the storeys of all maps from above (`embedding.surroundings`), packed in chunks, too: of all files, so that a chunk
+    serves any `limit`."""
     of_file: dict[str, list[GraphPair]] = {}
     for pair in pairs:
         of_file.setdefault(str(pair.about["file"]), []).append(pair)
@@ -195,7 +195,7 @@ def _read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def _pack_pairs(pairs_and_rows: list[tuple[dict[str, Array], dict[str, Any]]]) -> dict[str, Array]:
-    """All maps behind each other, a0 b0 a1 b1 ..., with how many rooms, edges and pairs of doors each has."""
+    """Pack all maps behind each other, a0 b0 a1 b1 ..., with how many rooms, edges and pairs of doors each has."""
     pairs, rows = zip(*pairs_and_rows, strict=True)
     sides = [{n[2:]: v for n, v in pair.items() if n.startswith(f"{s}.")} for pair in pairs for s in "ab"]
     out = {name: np.concatenate([side[name] for side in sides]).astype(np.float32) for name in PACKED_TABLES}
@@ -264,8 +264,8 @@ def convert_to_metres(points: Array) -> Array:
 
 
 def hold_out(pairs: Sequence[GraphPair]) -> tuple[list[GraphPair], list[GraphPair]]:
-    """A tenth of the pairs, by whole physical buildings in the order of a hash of their names, is kept from training; at least
-    one of them has rooms that match.
+    """Keep a tenth of the pairs from training, by whole physical buildings in the order of a hash of their names; at least one of
+    them has rooms that match.
 
     Raises:
         InputError: no pair has any, or all that have are of one building.

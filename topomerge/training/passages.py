@@ -122,7 +122,7 @@ def make_passages(item: PlanItem, plan: Plan | None) -> PassageExamples:
 
 
 def collect_storey_passages(storey: SegmentedStorey, truth: Array, visited: set[int]) -> list[tuple[Array, float, float, bool]]:
-    """Features, log odds by the plan and by the walls, and answer of the passages of a storey.
+    """Collect the features, log odds by the plan and by the walls, and the answer of the passages of a storey.
 
     They are collected before and while segments of one true room are merged.
 
@@ -158,7 +158,7 @@ def _draw(seed: int, plans: Any, flat: bool) -> PassageItem:
 
 
 def _arrays(item: PlanItem, examples: PassageExamples) -> dict[str, Array]:
-    """The arrays of a file."""
+    """Return the arrays of a file."""
     about = {"file": f"{item.name}.npz", **asdict(item)}
     values = {name: getattr(examples, name) for name in ("features", "plan", "shown", "parted")}
     return {**values, "kind": np.array(examples.kind), "about": np.frombuffer(json.dumps(about).encode(), np.uint8)}
@@ -174,7 +174,8 @@ def fit(settings: Passages, log_line: LogFn) -> dict[str, float]:
 
 
 def fit_passages(settings: Passages, log_line: LogFn) -> FitResult:
-    """Weights of the models from all scans, and scores of those that were fitted without each building."""
+    """Fit the weights of the models from all scans; return them with the scores of those that were fitted without each
+    building."""
     scans = read_scans(settings.data, settings, log_line)
     fold = number_buildings([scan.building for scan in scans]) % settings.folds
     parts = [[scan for scan, at in zip(scans, fold, strict=True) if at == k] for k in range(settings.folds)]
@@ -201,7 +202,7 @@ def read_scans(recipe: PlanRecipe, settings: Passages, log_line: LogFn) -> list[
 
 
 def fit_models(scans: Sequence[PassageExamples], l2: float) -> dict[str, list[float]]:
-    """Of each of `KINDS` the weights of `SCORE_INPUTS`; scans with many passages count less than proportionally."""
+    """Fit, of each of `KINDS`, the weights of `SCORE_INPUTS`; scans with many passages count less than proportionally."""
     models = {}
     for kind in KINDS:
         own = [scan for scan in scans if scan.kind == kind]
@@ -216,7 +217,7 @@ def fit_models(scans: Sequence[PassageExamples], l2: float) -> dict[str, list[fl
 
 
 def _loss(weights: Array, x: Array, y: Array, count: Array, l2: float) -> tuple[float, Array]:
-    """Negative log likelihood with what pulls the weights to `PRIOR`, and its gradient."""
+    """Return the negative log likelihood with what pulls the weights to `PRIOR`, and its gradient."""
     z, off = x @ weights, weights - PRIOR
     loss = float((count * np.logaddexp(0, np.where(y, -z, z))).sum() + l2 * (STIFF * off**2).sum() / 2)
     return loss, x.T @ (count * (sigmoid(z) - y)) + l2 * STIFF * off
@@ -243,7 +244,7 @@ def compute_figures(scans: Sequence[tuple[Array, Array, Array]]) -> dict[str, fl
 
 
 def judge(settings: Passages, file: Path, log_line: LogFn) -> dict[str, Any]:
-    """Scores of weights on scans of buildings that trained nothing."""
+    """Return the scores of weights on scans of buildings that trained nothing."""
     weights = json.loads(file.read_text(encoding="utf-8"))
     return compute_figures([score(scan, weights) for scan in read_scans(settings.heldout, settings, log_line)])
 

@@ -85,7 +85,7 @@ def _sample_patches(shape: tuple[int, ...], share: float, rng: np.random.Generat
 
 
 def _warp_walls(inside: Array, wall: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Moved by a column or so, differently from place to place."""
+    """Move walls by a column or so, differently from place to place."""
     at = np.indices(inside.shape)
     moved = [a + _sample_smooth_field(inside.shape, rng.uniform(1.5, 6), rng) * rng.uniform(0.2, 1.0) for a in at]
     i, j = (np.clip(np.rint(m), 0, n - 1).astype(int) for m, n in zip(moved, inside.shape, strict=True))
@@ -93,7 +93,7 @@ def _warp_walls(inside: Array, wall: Array, rng: np.random.Generator) -> tuple[A
 
 
 def _add_furniture(inside: Array, wall: Array, room: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Boxes on the floor, full, hollow, or unseen altogether."""
+    """Add boxes on the floor, full, hollow, or unseen altogether."""
     inside, wall = inside.copy(), wall.copy()
     places = np.argwhere(ndimage.binary_erosion(inside & room, SQUARE))
     for _ in range(int(rng.integers(1, MOST_THINGS)) if len(places) else 0):

@@ -53,7 +53,7 @@ def let_main_process_first(settings: Any) -> Iterator[None]:
 
 
 def is_parallel() -> bool:
-    """Are there other processes?"""
+    """Return whether there are other processes."""
     return distributed.is_available() and distributed.is_initialized() and distributed.get_world_size() > 1
 
 
@@ -80,7 +80,7 @@ def average_buffers(network: torch.nn.Module) -> None:
 
 
 def _average(tensors: list[Tensor]) -> None:
-    """The mean over all processes, in place, in one message."""
+    """Take the mean over all processes, in place, in one message."""
     if not tensors:
         return
     flat = torch.cat([tensor.detach().reshape(-1) for tensor in tensors])

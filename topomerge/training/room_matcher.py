@@ -178,7 +178,7 @@ class MatcherJob(ExportedJob):
         return sum(len(example.a[0].present) + len(example.b[0].present) for example, _ in batch)
 
     def exported(self) -> Exported:
-        """All its stages."""
+        """Return all its stages."""
         assert isinstance(self.network, RoomMatcher)
         signature = build_signature(self.network.rows.in_features, self.options.width, self.options.layers + 1)
         return Exported(build_stages(self.network), signature, build_sample(signature))
@@ -190,8 +190,8 @@ class MatcherJob(ExportedJob):
 
 
 def compute_deep_loss(layers: Sequence[Partners], links: Tensor) -> Tensor:
-    """-log(probability of a room's partners, or of having none), mean over the rooms of both maps; after the last layer and,
-    with less weight, after each one before."""
+    """Return -log(probability of a room's partners, or of having none), the mean over the rooms of both maps; after the last
+    layer and, with less weight, after each one before."""
     total = torch.zeros(())
     for k, layer in enumerate(layers):
         weight = 1.0 if k == len(layers) - 1 else 0.3
@@ -207,7 +207,7 @@ def compute_confidence(partners: Partners) -> Tensor:
 
 
 def score_matcher(watched: Sequence[MatcherExample], matcher: Matcher) -> dict[str, float]:
-    """Scores as of `training.validate`, and the share of pairs with rooms in common whose turn is right (`turn`)."""
+    """Return the scores as of `training.validate`, and the share of pairs with rooms in common whose turn is right (`turn`)."""
     ranks, twins, turns, losses, counts = [], [], [], list[Array](), np.zeros((len(LEAST_CERTAINTIES), 4), int)
     for example in watched:
         a, b, matches = example.a[0], example.b[0], example.pair.matches.numpy()

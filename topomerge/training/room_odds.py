@@ -1,4 +1,4 @@
-"""Task `compute_room_odds`: is a room of a map one, whole, entered, outside (`extraction.room_odds`)?
+"""Task `room_odds`: is a room of a map one, whole, entered, outside (`extraction.room_odds`)?
 
 Simulated scans are extracted with and without the sensor's places, robots' grids and scans of buildings with their surroundings
 without; what is true about their rooms answers. Each scan counts alike per root of its rooms, so that hospitals do not outweigh
@@ -114,7 +114,7 @@ def simulate_open_scan(item: PlanItem, plan: Plan | None) -> SimulatedScan:
 
 
 def _add_outdoor_scans(cloud: PointCloud, building: Building, sensor: Sensor, rng: np.random.Generator) -> PointCloud:
-    """The cloud with what the sensor sees from places around the building."""
+    """Add to the cloud what the sensor sees from places around the building."""
     assert cloud.poses is not None and cloud.pose_of is not None
     ring = compute_footprint(building).buffer(float(rng.uniform(*STAND_AWAY))).boundary
     first, count = float(rng.random()), int(rng.integers(*STANDS))
@@ -166,8 +166,8 @@ def make_room_file(item: RoomItem, plan: Plan | None, folder: str) -> BuildRow:
 
 
 def build_room_rows(item: RoomItem, plan: Plan | None) -> Mapping[str, Array]:
-    """Features and answers of the rooms of a scan: `x` and answers without poses; `posed.x`, `posed.p` and answers with them. `x`
-    are `GRID_FEATURES` of robots' grids of buildings that stand in the open."""
+    """Build the features and answers of the rooms of a scan: `x` and answers without poses; `posed.x`, `posed.p` and answers with
+    them. `x` are `GRID_FEATURES` of robots' grids of buildings that stand in the open."""
     scan = simulate_open_scan(item, plan) if item.surroundings else simulate_item_scan(item, plan)
     features = GRID_FEATURES if item.surroundings and item.flat else ROOM_FEATURES
     visited = np.isin(np.arange(len(scan.building.rooms)), scan.visited)
@@ -250,7 +250,7 @@ def merge_family_weights(weights: dict[str, Any], family: Family, fitted: dict[s
 
 
 def _score_left_out(family: Family, scans: Sequence[Rows], settings: RoomOdds) -> dict[str, float]:
-    """Scores of a family's models on buildings that were left out of the fit, a fold at a time."""
+    """Return the scores of a family's models on buildings that were left out of the fit, a fold at a time."""
     fold = number_buildings([str(scan["building"]) for scan in scans]) % settings.folds
     guesses: dict[str, list[Array]] = {name: [] for name in family.lengths}
     for k in range(settings.folds):
@@ -293,7 +293,8 @@ def fit_family_weights(family: Family, scans: Sequence[Rows], l2: float) -> dict
 
 
 def _build_table(weights: dict[str, Any], family: Family, scan: Rows, name: str) -> tuple[Array, Array]:
-    """Inputs of a model and answers, of the rooms of a scan; none where the model needs poses and the scan has none."""
+    """Return the inputs of a model and answers, of the rooms of a scan; none where the model needs poses and the scan has
+    none."""
     if name != ENTERED_BY_POSES:
         return build_model_inputs(weights, family, scan["x"]), scan[ANSWER_OF[name]]
     if "posed.x" not in scan or not np.isfinite(scan["posed.p"]).all():
@@ -302,7 +303,7 @@ def _build_table(weights: dict[str, Any], family: Family, scan: Rows, name: str)
 
 
 def _fit_logistic(tables: Sequence[Array], answers: Sequence[Array], l2: float) -> Array:
-    """Weights of the most likely logistic model, pulled to 0 but for the constant."""
+    """Return the weights of the most likely logistic model, pulled to 0 but for the constant."""
     x, y = np.concatenate(tables), np.concatenate(answers)
     share = np.concatenate([np.full(len(table), 1 / np.sqrt(len(table))) for table in tables])
     share *= len(share) / share.sum()
@@ -338,8 +339,8 @@ def _score_family(family: Family, guesses: Mapping[str, Sequence[Array]]) -> dic
 
 
 def score_predictions(p: Array, y: Array) -> dict[str, float]:
-    """Area under the ROC curve (a half where all answers are alike), calibration error, log loss and share of answers that are
-    yes, of probabilities (n,) and answers (n,) bool."""
+    """Return the area under the ROC curve (a half where all answers are alike), calibration error, log loss and share of answers
+    that are yes, of probabilities (n,) and answers (n,) bool."""
     yes, no = int(y.sum()), int((~y).sum())
     above = (rankdata(p)[y].sum() - yes * (yes + 1) / 2) / (yes * no) if yes and no else 0.5
     p = np.clip(p, 1e-6, 1 - 1e-6)

@@ -146,8 +146,8 @@ def describe_provenance(folder: Path) -> dict[str, Any]:
 
 
 def describe_data(settings: Any) -> dict[str, Any]:
-    """Of each set that a task learns from or watches: its name, its recipe where that is known, and a digest of its manifest,
-    which names every file by a hash of what it was made from."""
+    """Describe, of each set that a task learns from or watches, its name, its recipe where that is known, and a digest of its
+    manifest, which names every file by a hash of what it was made from."""
     out = {}
     sets = ("data", "validation", *(["replay_data"] if getattr(settings, "replay", 0) else []))
     for key, value in vars(settings).items():

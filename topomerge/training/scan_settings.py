@@ -42,10 +42,12 @@ class PlanAugment:
 
 @dataclass
 class PlanSegmentation(RasterTask):
-    """Args:
-    steps: of an epoch; warmup: steps in which the rate rises.
-    crop: columns of a side, a multiple of 16.
-    widths: channels of the levels a to d down, and e to h up again.
+    """Settings of the task that trains the network of plans of storeys.
+
+    Args:
+        steps: of an epoch; warmup: steps in which the rate rises.
+        crop: columns of a side, a multiple of 16.
+        widths: channels of the levels a to d down, and e to h up again.
     """
 
     task: str = "plan_segmentation"
@@ -87,13 +89,15 @@ class GridSegmentation(PlanSegmentation):
 
 @dataclass
 class DrawingSegmentation(RasterTask):
-    """Args:
-    data, watched: plans that are drawn to learn from and to watch; heldout: to judge.
-    steps: of an epoch; warmup: steps in which the rate rises.
-    crop: px of a side of a page, a multiple of 32.
-    pages: that are at hand at a time; fresh: of them that are drawn anew in each step.
-    widths: channels of the page's own pixels and of the five levels below.
-    classes: weights of `networks.drawing.DRAWING_CLASSES` in the cross-entropy; dice: of the Dice loss beside it.
+    """Settings of the task that trains the network of drawn plans.
+
+    Args:
+        data, watched: plans that are drawn to learn from and to watch; heldout: to judge.
+        steps: of an epoch; warmup: steps in which the rate rises.
+        crop: px of a side of a page, a multiple of 32.
+        pages: that are at hand at a time; fresh: of them that are drawn anew in each step.
+        widths: channels of the page's own pixels and of the five levels below.
+        classes: weights of `networks.drawing.DRAWING_CLASSES` in the cross-entropy; dice: of the Dice loss beside it.
     """
 
     task: str = "drawing_segmentation"
@@ -152,12 +156,14 @@ class WallAugment:
 
 @dataclass
 class WallSegmentation(RasterTask):
-    """Args:
-    steps: of an epoch; warmup: steps in which the rate rises.
-    length: places of a stretch, even; at_holes: share of the stretches about the side of a door or window.
-    classes: weights of the classes in the cross-entropy.
-    widths: of `models.convolutional.WallNetwork`.
-    unseen: weight of places where nothing was seen.
+    """Settings of the task that trains the networks of walls.
+
+    Args:
+        steps: of an epoch; warmup: steps in which the rate rises.
+        length: places of a stretch, even; at_holes: share of the stretches about the side of a door or window.
+        classes: weights of the classes in the cross-entropy.
+        widths: of `models.convolutional.WallNetwork`.
+        unseen: weight of places where nothing was seen.
     """
 
     task: str = "wall_segmentation"
@@ -189,11 +195,13 @@ class WallSegmentation(RasterTask):
 
 @dataclass
 class WallDoors(TaskSettings):
-    """Args:
-    data, frameless, flat: scans that show walls, those of doors without frames, and slices and grid maps.
-    heldout, heldout_frameless, heldout_flat: likewise, of other buildings.
-    l2: to 0, of all weights but the constants.
-    folds: of scans, for the scores.
+    """Settings of the task that fits how much plans and walls say of a door.
+
+    Args:
+        data, frameless, flat: scans that show walls, those of doors without frames, and slices and grid maps.
+        heldout, heldout_frameless, heldout_flat: likewise, of other buildings.
+        l2: to 0, of all weights but the constants.
+        folds: of scans, for the scores.
     """
 
     task: str = "wall_doors"
@@ -211,10 +219,12 @@ class WallDoors(TaskSettings):
 
 @dataclass
 class Passages(TaskSettings):
-    """Args:
-    data: scans; heldout: of other buildings.
-    l2: of the weights to what the plan alone says.
-    folds: of scans, for the scores.
+    """Settings of the task that fits how much all evidence says of a door between two segments.
+
+    Args:
+        data: scans; heldout: of other buildings.
+        l2: of the weights to what the plan alone says.
+        folds: of scans, for the scores.
     """
 
     task: str = "passages"
@@ -228,9 +238,11 @@ class Passages(TaskSettings):
 
 @dataclass
 class DoorClassification(NetworkTask):
-    """Args:
-    hidden: units of each network; networks: that are averaged.
-    noise: standard deviations that features jitter by while training.
+    """Settings of the task that trains what tells whether a narrowing of the floor is a door.
+
+    Args:
+        hidden: units of each network; networks: that are averaged.
+        noise: standard deviations that features jitter by while training.
     """
 
     task: str = "door_classification"
@@ -249,12 +261,15 @@ class DoorClassification(NetworkTask):
 
 @dataclass
 class RoomOdds(TaskSettings):
-    """Args:
-    data: scans; open, closed: scans of buildings with their surroundings and ordinary ones, for what lies outside; grids: robots'
-        grids of buildings with their surroundings; heldout, heldout_open, heldout_grids: likewise, of other buildings.
-    fit: which of `scans`, `open` and `grids` to fit; the weights of the others stay those in use.
-    l2: to 0, of all weights but the constant.
-    folds: of scans, for the scores.
+    """Settings of the task that fits whether a room is one, whole, entered, and outside.
+
+    Args:
+        data: scans; open, closed: scans of buildings with their surroundings and ordinary ones, for what lies outside; grids:
+            robots' grids of buildings with their surroundings; heldout, heldout_open, heldout_grids: likewise, of other
+            buildings.
+        fit: which of `scans`, `open` and `grids` to fit; the weights of the others stay those in use.
+        l2: to 0, of all weights but the constant.
+        folds: of scans, for the scores.
     """
 
     task: str = "room_odds"

@@ -240,8 +240,8 @@ def _quiet_optuna() -> Iterator[None]:
 
 
 def _open_study(plan: Plan) -> Any:
-    """The study in the journal, with a sampler seeded by the run's seed and the number of trials so far: a search that goes on
-    asks what it would have asked."""
+    """Open the study in the journal, with a sampler seeded by the run's seed and the number of trials so far: a search that goes
+    on asks what it would have asked."""
     import optuna
     from optuna.storages import JournalStorage
     from optuna.storages.journal import JournalFileBackend

@@ -251,23 +251,28 @@ class Augment:
 
 @dataclass
 class Training(NetworkSettings):
-    """Args:
-    data: name of the set of pairs to train on: `cache`/`data`.jsonl, or the path of a manifest or packed file.
-    validation: likewise of the set to watch; empty: a tenth of the training buildings is held out.
-    path: of ``data=folder``: a folder of captures with a `pairs.yaml`; its own pairs are watched, where `validation` is not set.
-    limit: of the first pairs only; 0: all.
-    warmup: share of all steps in which the rate rises; then it falls to nothing.
-    clip: longest gradient.
-    init_from: `pretrained`, a run or a file, whose weights the whole network starts from; its settings are the network's, too.
-    geometry_from: run whose geometry encoder is the start.
-    freeze: of `FREEZE`, what keeps the weights that it starts from: `geometry`, or `encoders`, all but the last layers.
-    replay: share of the pairs of an epoch that are drawn from the set `replay_data`, so that what it taught is not forgotten.
-    overfit: train on one batch, without augmentation, and validate on it.
-    threads: that make batches, of each process; beside an accelerator as many as there are cores.
-    accelerator: of `ACCELERATORS`.
-    precision: of `PRECISIONS`; `auto`: bf16 on CUDA, 32 bits elsewhere.
-    batches: made on the `device` (`device_batches`), or by threads of the `host`; `auto`: on the device beside an accelerator.
-    graphs: run steps as CUDA graphs (`captured_step`) where batches are made on the card.
+    """Settings of the task that trains embedders of rooms.
+
+    Args:
+        data: name of the set of pairs to train on: `cache`/`data`.jsonl, or the path of a manifest or packed file.
+        validation: likewise of the set to watch; empty: a tenth of the training buildings is held out.
+        path: of ``data=folder``: a folder of captures with a `pairs.yaml`; its own pairs are watched, where `validation` is not
+            set.
+        limit: of the first pairs only; 0: all.
+        warmup: share of all steps in which the rate rises; then it falls to nothing.
+        clip: longest gradient.
+        init_from: `pretrained`, a run or a file, whose weights the whole network starts from; its settings are the network's,
+            too.
+        geometry_from: run whose geometry encoder is the start.
+        freeze: of `FREEZE`, what keeps the weights that it starts from: `geometry`, or `encoders`, all but the last layers.
+        replay: share of the pairs of an epoch that are drawn from the set `replay_data`, so that what it taught is not forgotten.
+        overfit: train on one batch, without augmentation, and validate on it.
+        threads: that make batches, of each process; beside an accelerator as many as there are cores.
+        accelerator: of `ACCELERATORS`.
+        precision: of `PRECISIONS`; `auto`: bf16 on CUDA, 32 bits elsewhere.
+        batches: made on the `device` (`device_batches`), or by threads of the `host`; `auto`: on the device beside an
+            accelerator.
+        graphs: run steps as CUDA graphs (`captured_step`) where batches are made on the card.
     """
 
     task: str = "embedding"
@@ -343,14 +348,14 @@ def check(settings: Training) -> None:
 
 
 def build_recipe_schema() -> type[Training]:
-    """`Training` with all of `configs/data/<name>.yaml` in the place of its name, as Hydra composes it."""
+    """Return `Training` with all of `configs/data/<name>.yaml` in the place of its name, as Hydra composes it."""
     from topomerge.datasets.pairs.items import Recipe
 
     return make_dataclass("Training", [("data", Recipe, field(default_factory=Recipe))], bases=(Training,))
 
 
 def convert_composed(given: Any) -> Training:
-    """`Training` out of what `build_recipe_schema` says: of the data only the name is needed."""
+    """Make `Training` out of what `build_recipe_schema` says: of the data only the name is needed."""
     from topomerge.datasets.pairs.own_pairs import check_own_path
 
     check_own_path(given.data.name, given.path)

@@ -97,7 +97,7 @@ def _describe_start(run: Path) -> str:
 
 
 def _gather(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """A row of an experiment: of several seeds mean and interval."""
+    """Return a row of an experiment: of several seeds mean and interval."""
     several = gather_seeds([{**row, "same": ""} for row in rows])
     best = sum(row["best"] for row in rows) / len(rows)
     return {**(several[0] if several else {**rows[0], "seeds": 1}), "best": best}
@@ -163,7 +163,7 @@ def gather_seeds(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _format_mean(values: Array) -> str:
-    """Mean with its interval; of two values, whose interval would tell nothing, with these."""
+    """Return the mean with its interval; of two values, whose interval would tell nothing, with these."""
     mean, low, high = estimate_mean(values) if len(values) > 2 else (values.mean(), values.min(), values.max())
     return f"{mean:.3f} [{low:.3f}, {high:.3f}]" if len(values) > 2 else f"{mean:.3f}, {low:.3f}–{high:.3f}"
 

@@ -29,12 +29,14 @@ class PlaceAugment:
 
 @dataclass
 class PlaceEvidence(RasterTask):
-    """Args:
-    steps: of an epoch; warmup: steps in which the rate rises.
-    hypotheses, inspected: of a pair, as of `MergeBelief`: the places are those of its hypotheses.
-    lookalikes: do those of `alike` that somebody can tell apart train, too?
-    half: 1 or 2: train on one half of the buildings only (`belief_hypotheses.assign_half`); 0: on all.
-    widths: channels of the convolutions; dropout: of what they give.
+    """Settings of the task that trains the network which tells whether two squares show one place.
+
+    Args:
+        steps: of an epoch; warmup: steps in which the rate rises.
+        hypotheses, inspected: of a pair, as of `MergeBelief`: the places are those of its hypotheses.
+        lookalikes: do those of `alike` that somebody can tell apart train, too?
+        half: 1 or 2: train on one half of the buildings only (`belief_hypotheses.assign_half`); 0: on all.
+        widths: channels of the convolutions; dropout: of what they give.
     """
 
     task: str = "place_evidence"
@@ -65,21 +67,23 @@ class PlaceEvidence(RasterTask):
 
 @dataclass
 class MergeBelief(TaskSettings):
-    """Args:
-    hypotheses: of a pair; inspected: how many of them are looked at more closely.
-    pose_strength, winner_strength, kinds_strength, plan_strength: of the models; the smaller, the simpler.
-    missed: weight of a pair whose right hypothesis is taken away.
-    plan_strict: weight of a place of the same plan, beside its prior: rather refused than wrong.
-    strict: weight of a wrong hypothesis where a slice or a drawing hides what tells storeys apart: rather refused than wrong.
-    folds: of buildings, for the scores.
-    floor: weight of a pair of the development floor; 0: it is not fitted to.
-    risk: false merges in a thousand pairs, drawn by the stated priors, that the threshold allows.
-    refit: all; closely (the models that rank rigid poses stay as they are); or plan (only the one of places of one plan is made
-        anew, and the risks are measured).
-    halves: runs of `place_evidence` on one half of the buildings each (half=1, half=2); a pair is judged by the network
-        that did not see its building. Empty: by the one that ships.
-    lookalikes: none, judged (left-out models are tried on them) or fitted (they train, too; `belief_lookalikes`).
-    alike, alike_heldout: the look-alikes to fit to and to judge on; alike_weight: of one of them.
+    """Settings of the task that fits the models by which hypotheses are ranked and accepted.
+
+    Args:
+        hypotheses: of a pair; inspected: how many of them are looked at more closely.
+        pose_strength, winner_strength, kinds_strength, plan_strength: of the models; the smaller, the simpler.
+        missed: weight of a pair whose right hypothesis is taken away.
+        plan_strict: weight of a place of the same plan, beside its prior: rather refused than wrong.
+        strict: weight of a wrong hypothesis where a slice or a drawing hides what tells storeys apart: rather refused than wrong.
+        folds: of buildings, for the scores.
+        floor: weight of a pair of the development floor; 0: it is not fitted to.
+        risk: false merges in a thousand pairs, drawn by the stated priors, that the threshold allows.
+        refit: all; closely (the models that rank rigid poses stay as they are); or plan (only the one of places of one plan is
+            made anew, and the risks are measured).
+        halves: runs of `place_evidence` on one half of the buildings each (half=1, half=2); a pair is judged by the network that
+            did not see its building. Empty: by the one that ships.
+        lookalikes: none, judged (left-out models are tried on them) or fitted (they train, too; `belief_lookalikes`).
+        alike, alike_heldout: the look-alikes to fit to and to judge on; alike_weight: of one of them.
     """
 
     task: str = "merge_belief"
@@ -126,14 +130,17 @@ class MergeBelief(TaskSettings):
 
 @dataclass
 class RoomMatching(NetworkTask):
-    """Args:
-    data: name of a set of pairs (`cache`/<name>.jsonl) or a manifest, and validation the one that is watched, as of `embedding`.
-    path: of ``data=folder``, as of `embedding`; ``evaluate.py task=room_matcher`` judges by the pairs of its test.
-    views: of each map that are changed, beside the one that is as it is.
-    width: numbers of a room within the network; layers: of attention.
-    without: parts that are left out (`models.room_matcher.MATCHER_PARTS`): votes, ways, facts, within, across.
-    wrong_turn: weight of pairs at a wrong turn; turn: of telling it from the right one.
-    steps: of an epoch; warmup: those in which the rate rises.
+    """Settings of the task that trains the network which matches rooms.
+
+    Args:
+        data: name of a set of pairs (`cache`/<name>.jsonl) or a manifest, and validation the one that is watched, as of
+            `embedding`.
+        path: of ``data=folder``, as of `embedding`; ``evaluate.py task=room_matcher`` judges by the pairs of its test.
+        views: of each map that are changed, beside the one that is as it is.
+        width: numbers of a room within the network; layers: of attention.
+        without: parts that are left out (`models.room_matcher.MATCHER_PARTS`): votes, ways, facts, within, across.
+        wrong_turn: weight of pairs at a wrong turn; turn: of telling it from the right one.
+        steps: of an epoch; warmup: those in which the rate rises.
     """
 
     task: str = "room_matcher"
@@ -164,9 +171,11 @@ class RoomMatching(NetworkTask):
 
 @dataclass
 class MatchOdds(TaskSettings):
-    """Args:
-    l2: to 0, of all weights but the constant.
-    folds: of buildings, for the scores.
+    """Settings of the task that fits how likely a hypothesis is right.
+
+    Args:
+        l2: to 0, of all weights but the constant.
+        folds: of buildings, for the scores.
     """
 
     task: str = "match_odds"
@@ -180,9 +189,11 @@ class MatchOdds(TaskSettings):
 
 @dataclass
 class MatchBelief(TaskSettings):
-    """Args:
-    l2: of all weights but the constant, to what matching says.
-    folds: of buildings, for the scores.
+    """Settings of the task that fits how likely matched rooms are one.
+
+    Args:
+        l2: of all weights but the constant, to what matching says.
+        folds: of buildings, for the scores.
     """
 
     task: str = "match_belief"
@@ -196,8 +207,10 @@ class MatchBelief(TaskSettings):
 
 @dataclass
 class FeatureScale(TaskSettings):
-    """Args:
-    shrink: share of the features' own variances in the covariance of the differences: few rooms give a noisy one.
+    """Settings of the task that measures by what the engineered features are scaled.
+
+    Args:
+        shrink: share of the features' own variances in the covariance of the differences: few rooms give a noisy one.
     """
 
     task: str = "feature_scale"

@@ -38,7 +38,7 @@ class MatchedPlaces(NamedTuple):
 
 
 def estimate_pose(a: Mapping[str, Array], b: Mapping[str, Array], certain: Array) -> Sim3 | None:
-    """T_ab under which the most matches, by their certainty, agree; None where no two places tell one.
+    """Return T_ab under which the most matches, by their certainty, agree; None where no two places tell one.
 
     Args:
         a, b: `pos`, `edge_pos` and `edge_index` of both graphs (`embedding.graph`).
@@ -136,7 +136,7 @@ def embed(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu") ->
 
 
 def _align_rows(a: Rows, b: Rows) -> tuple[Array, Array]:
-    """Rows of two maps of which the products are the mean cosines over turns (`compute_similarity`)."""
+    """Return the rows of two maps of which the products are the mean cosines over turns (`compute_similarity`)."""
     if not isinstance(a, TurnedRows) or not isinstance(b, TurnedRows):
         return np.asarray(a), np.asarray(b)
     mean: Array = np.sum([turn.probability * b.flatten(turn.quarters) for turn in estimate_turns(a, b)], axis=0)
@@ -144,7 +144,7 @@ def _align_rows(a: Rows, b: Rows) -> tuple[Array, Array]:
 
 
 def _build_rows(rows: Array, graph: Mapping[str, Tensor]) -> Rows:
-    """Of a map, with where its rooms are if they tell turns apart."""
+    """Return the rows of a map, with where its rooms are if they tell turns apart."""
     if rows.ndim == 2:
         return rows
     return TurnedRows(rows, rotate_to_walls({name: graph[name].numpy() for name in ("pos", "turn")}))
@@ -193,10 +193,10 @@ def score_pairs(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cp
 
 
 def validate(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu") -> dict[str, float]:
-    """Scores over all rooms with a partner, of both maps: recall@1, recall@5 and MRR, apart for those with and without a
-    near-identical twin; precision, recall and F1 of the assignment in which a room may stay alone, at the certainty
-    (`least`) that is best; and of the pairs with rooms in common (`mergeable`) the share whose matches give the true transform
-    within 0.5 m and 5 degrees (`merged`: `is_pose_right`)."""
+    """Return scores over all rooms with a partner, of both maps: recall@1, recall@5 and MRR, apart for those with and without a
+    near-identical twin; precision, recall and F1 of the assignment in which a room may stay alone, at the certainty (`least`)
+    that is best; and of the pairs with rooms in common (`mergeable`) the share whose matches give the true transform within 0.5 m
+    and 5 degrees (`merged`: `is_pose_right`)."""
     each = score_pairs(network, pairs, device)
     right = [good for one in each for good in one.right]
     merged = {"merged": float(np.mean(right)) if right else 0.0, "mergeable": float(len(right))}
@@ -205,7 +205,8 @@ def validate(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu")
 
 
 def _evaluate_merge(pair: GraphPair, certain: Array) -> list[bool]:
-    """Whether the matches of a pair give its true transform; empty where it has none or rooms in common, or scales differ."""
+    """Return whether the matches of a pair give its true transform; empty where it has none or rooms in common, or scales
+    differ."""
     truth = pair.transform.numpy()
     if not len(pair.matches) or not abs(truth[2, 2] - 1) < 1e-6:
         return []
@@ -215,15 +216,15 @@ def _evaluate_merge(pair: GraphPair, certain: Array) -> list[bool]:
 
 
 def _collect_places(graph: Mapping[str, Tensor]) -> dict[str, Array]:
-    """Where rooms and doors are; rooms that are neighbours by distance only have none."""
+    """Return where rooms and doors are; rooms that are neighbours by distance only have none."""
     arrays = {name: graph[name].numpy() for name in ("pos", "edge_pos", "edge_index", "edge_attr")}
     doors = is_door_edge(arrays)
     return {"pos": arrays["pos"], "edge_pos": arrays["edge_pos"][doors], "edge_index": arrays["edge_index"][:, doors]}
 
 
 def score_matches(ranks: Array, twins: Array, clear: Array, counts: Array) -> dict[str, float]:
-    """Ranks (n,), whether each room has a twin (n,), and whether both maps saw it well (n,); the sums of `count_pairs`
-    for each of `LEAST_CERTAINTIES`."""
+    """Score matches by their ranks (n,), whether each room has a twin (n,), and whether both maps saw it well (n,); and by the
+    sums of `count_pairs` for each of `LEAST_CERTAINTIES`."""
     matched, right, requested, got = counts.T
     precision, recall = right / np.maximum(matched, 1), got / np.maximum(requested, 1)
     f1 = 2 * precision * recall / np.maximum(precision + recall, 1e-9)

@@ -50,7 +50,8 @@ def fit(settings: WallDoors, log_line: LogFn) -> dict[str, float]:
 
 
 def fit_doors(settings: WallDoors, log_line: LogFn) -> FitResult:
-    """Weights of the models from all scans, and scores of those that were fitted without each building."""
+    """Fit the weights of the models from all scans; return them with the scores of those that were fitted without each
+    building."""
     recipes = (settings.data, settings.frameless, settings.flat)
     named = [scan for recipe in recipes for scan in build_candidates(recipe, settings, log_line)]
     scans, fold = [scan for _, scan in named], number_buildings([name for name, _ in named]) % settings.folds

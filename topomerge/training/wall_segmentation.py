@@ -150,7 +150,8 @@ def sample_stretch(scan: WallExample, middle: int, options: WallSegmentation, rn
 
 
 def _corrupt_strip(x: Array, augment: WallAugment, rng: np.random.Generator) -> Array:
-    """A strip with its face somewhat nearer or farther, without some of its points, and with what stands before it hidden."""
+    """Return a strip with its face somewhat nearer or farther, without some of its points, and with what stands before it
+    hidden."""
     x = np.roll(x, int(rng.integers(-augment.shift, augment.shift + 1)), axis=1)
     if rng.random() < augment.sparse:
         x = x * (rng.random(x.shape) > rng.uniform(0, augment.lost)).astype(np.float32)
@@ -166,8 +167,8 @@ def _corrupt_strip(x: Array, augment: WallAugment, rng: np.random.Generator) -> 
 
 
 def score_walls(examples: Sequence[WallExample], network: Run) -> dict[str, float]:
-    """F1 of each class over the places where anything was seen, the mean of those of doors, open or half open, and shut, and log
-    loss."""
+    """Return the F1 of each class over the places where anything was seen, the mean of those of doors, open or half open, and
+    shut, and log loss."""
     loss, table = 0.0, np.zeros((len(WALL_CLASSES), len(WALL_CLASSES)), np.int64)
     for scan in examples:
         for low, high in zip(scan.first[:-1], scan.first[1:], strict=True):
@@ -183,7 +184,7 @@ def score_walls(examples: Sequence[WallExample], network: Run) -> dict[str, floa
 
 
 def score_colour_classes(table: Array) -> dict[str, float]:
-    """F1 of each of `COARSE_CLASSES`, and the mean of those of doors.
+    """Return the F1 of each of `COARSE_CLASSES`, and the mean of those of doors.
 
     Args:
         table: (4, 4) how often each was taken for each.

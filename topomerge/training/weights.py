@@ -90,7 +90,7 @@ def _record_seconds(runs: Path, task: str, seconds: float) -> None:
 
 
 def _format_duration(seconds: Mapping[str, float], tasks: Sequence[str]) -> str:
-    """How long steps take, by what they took or by what is usual."""
+    """Tell how long steps take, by what they took or by what is usual."""
     hours = sum(seconds.get(task, 3600 * TASKS[task].hours) for task in tasks) / 3600
     return f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.0f} min"
 

@@ -32,7 +32,8 @@ def require(condition: bool, message: str, *values: object) -> None:
 
 
 def wrap_to_turn(angle: Any, turn: float) -> Any:
-    """The same angle, rad, in [0, turn): the remainder of next to nothing below 0 is `turn` itself by rounding, which is 0."""
+    """Return the same angle, rad, in [0, turn): the remainder of next to nothing below 0 is `turn` itself by rounding, which is
+    0."""
     rest = np.asarray(angle, float) % turn
     return np.where(rest < turn, rest, 0.0)
 
@@ -85,7 +86,7 @@ class VoxelGrid:
         shape: tuple[int, int, int] | None = None,
         properties: Mapping[str, Array] | None = None,
     ) -> VoxelGrid:
-        """A grid from cells in any order; a repeated cell comes once, with the properties of their first mention."""
+        """Build a grid from cells in any order; a repeated cell comes once, with the properties of their first mention."""
         cells = np.asarray(cells).reshape(-1, 3)
         if len(cells):  # before the codes: they hold 21 bits an axis, and a cell beyond would take the place of another
             require(np.issubdtype(cells.dtype, np.integer), "cells must be integers, not {}", cells.dtype)
@@ -137,7 +138,7 @@ class VoxelGrid:
         return self.origin, self.origin + np.asarray(self.shape) * self.edge
 
     def compute_cell_bounds(self, cells: Array) -> tuple[Array, Array]:
-        """Corners v_min and v_max of cells, m."""
+        """Return the corners v_min and v_max of cells, m."""
         low = self.origin + np.asarray(cells) * self.edge
         return low, low + self.edge
 
@@ -165,7 +166,7 @@ class VoxelGrid:
         return replace(self, cells=cells, properties={k: v[mask] for k, v in self.properties.items()})
 
     def replace_cells(self, cells: Array, properties: Mapping[str, Array] | None = None) -> VoxelGrid:
-        """Other cells (any order) of the same volume."""
+        """Return other cells (any order) of the same volume."""
         return VoxelGrid.from_cells(cells, self.origin, self.edge, self.shape, properties)
 
     def coarsen(self, factor: int) -> VoxelGrid:
@@ -304,6 +305,6 @@ class Sim3:
 
 
 def select_lowest_of_column(navigable: VoxelGrid) -> Array:
-    """Ascending rows of the cells that have no cell right below them: the floor proper, without its upward dilation. They are
-    found once; who asks again gets the same array."""
+    """Return the ascending rows of the cells that have no cell right below them: the floor proper, without its upward dilation.
+    They are found once; who asks again gets the same array."""
     return navigable._lowest_of_column

@@ -158,7 +158,7 @@ class Deformation:
         return min((f.growth[0] for f in self.fields if f is not None), default=1.0)
 
     def to_json(self) -> dict[str, Any]:
-        """As plain values, none rounded."""
+        """Return plain values, none rounded."""
         return {
             "floors_m": self.floors.tolist(),
             "reach_m": float(self.reach),

@@ -43,7 +43,7 @@ def parse_levelling(listed: Any) -> Array:
 
 
 def is_level(levelling: Array) -> bool:
-    """Is a levelling (4, 4) none, as that of a cloud that was level?"""
+    """Return whether a levelling (4, 4) is none, as that of a cloud that was level."""
     return bool(np.array_equal(levelling, np.eye(4)))
 
 
@@ -153,8 +153,8 @@ def is_mostly_unseen(rooms: Array) -> Array:
 
 
 def add_outline_odds(rooms: Array) -> Array:
-    """Rooms with what the outline alone says of them, for maps of which nothing better is known: those that are mostly unseen
-    were only looked into, all are rooms, and none is outside.
+    """Return the rooms with what the outline alone says of them, for maps of which nothing better is known: those that are mostly
+    unseen were only looked into, all are rooms, and none is outside.
 
     Args:
         rooms: (R,) ROOM_DTYPE; stays as it is.

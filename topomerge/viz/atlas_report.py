@@ -69,7 +69,7 @@ def render_atlas_html(
 
 
 def _render_component_html(result: AtlasResult, n: int, map: TopometricMap, title: str, stamp: str, tile: int | None) -> str:
-    """The page of one component: of one that is cut into tiles an overview, or the page of a tile."""
+    """Render the page of one component: of one that is cut into tiles an overview, or the page of a tile."""
     name, stamped, parts = f"{title}, joined map {n}", f"stamp-{n}", split_into_tiles(map)
     kind = f"{len(result.components[n])} maps of an atlas"
     if tile is not None:
@@ -90,7 +90,7 @@ def get_page_name(component: int, tile: int | None = None) -> str:
 
 
 def _render_tile(n: int, map: TopometricMap, parts: Sequence[Array], tile: int) -> tuple[list[Markup], dict[str, Any]]:
-    """A tile of a joined map: its sections, and what their scripts read. Rooms have the numbers of the whole map."""
+    """Render a tile of a joined map: its sections, and what their scripts read. Rooms have the numbers of the whole map."""
     rooms, part = parts[tile], select_tile(map, parts[tile])
     sheet, plans = lay_out(part)
     view = build_element(
@@ -112,7 +112,7 @@ def _render_tile(n: int, map: TopometricMap, parts: Sequence[Array], tile: int) 
 
 
 def _render_tiles_index(n: int, map: TopometricMap, parts: Sequence[Array]) -> Markup:
-    """The tiles of a joined map, which have pages of their own."""
+    """Render the tiles of a joined map, which have pages of their own."""
     rows = []
     for k, rooms in enumerate(parts):
         storeys = np.unique(map.rooms["storey"][rooms]).tolist()
@@ -123,7 +123,7 @@ def _render_tiles_index(n: int, map: TopometricMap, parts: Sequence[Array]) -> M
 
 
 def _render_joined_map(result: AtlasResult, n: int, map: TopometricMap, in_space: bool) -> tuple[list[Markup], dict[str, Any]]:
-    """The joined map of a component: its sections, and what their scripts read."""
+    """Render the joined map of a component: its sections, and what their scripts read."""
     prefix = f"m{n}-" if n else ""
     sheet, plans = lay_out(map, prefix)
     view = build_element(
@@ -137,7 +137,7 @@ def _render_joined_map(result: AtlasResult, n: int, map: TopometricMap, in_space
 
 
 def _render_index(result: AtlasResult, pages: Mapping[int, str]) -> Markup:
-    """The joined maps, which have pages of their own."""
+    """Render the index of the joined maps, which have pages of their own."""
     rows = [
         (
             _render_link(f"joined map {n}", file),
@@ -152,7 +152,7 @@ def _render_index(result: AtlasResult, pages: Mapping[int, str]) -> Markup:
 
 
 def _render_link(text: str, file: str | None) -> str:
-    """Words that lead to a file beside this one, if there is one."""
+    """Render words that lead to a file beside this one, if there is one."""
     return text if file is None else build_element("a", text, href=file)
 
 
@@ -175,7 +175,7 @@ def _format_names(result: AtlasResult, members: Iterable[int]) -> str:
 
 
 def _render_maps(result: AtlasResult, components: Sequence[int] | None = None, pages: Mapping[int, str] | None = None) -> Markup:
-    """Where the maps lie, those of some components or all."""
+    """Render where the maps lie, those of some components or all."""
     rows = []
     for n in range(len(result.components)) if components is None else components:
         members = result.components[n]

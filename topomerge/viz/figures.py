@@ -79,7 +79,7 @@ def save_figure(map: TopometricMap, path: str | Path) -> None:
 
 
 def _arrange(panels: int, frame: Frame, named: list[dict[int, Place]]) -> tuple[int, float]:
-    """Columns of panels, and inches a metre, so that the page is filled and most room numbers fit into their rooms."""
+    """Return the columns of panels, and inches a metre, so that the page is filled and most room numbers fit into their rooms."""
     width, height = (frame.high - frame.low).tolist()
     left, bottom, right, top = PANEL_MARGIN
 
@@ -97,7 +97,7 @@ def _arrange(panels: int, frame: Frame, named: list[dict[int, Place]]) -> tuple[
 
 
 def _create_panels(count: int, columns: int, inches: float, frame: Frame) -> tuple[Figure, list[Axes]]:
-    """A figure with one panel a storey, sized so that a metre measures `inches` everywhere."""
+    """Create a figure with one panel a storey, sized so that a metre measures `inches` everywhere."""
     width, height = ((frame.high - frame.low) * inches).tolist()
     left, bottom, right, top = PANEL_MARGIN
     rows = math.ceil(count / columns)
@@ -130,7 +130,7 @@ def _draw_cells(ax: Axes, plan: StoreyView, frame: Frame, colours: Any) -> None:
 
 
 def _draw_edges(ax: Axes, map: TopometricMap, storey: int, places: dict[int, Place]) -> None:
-    """Lines from room to door to room; of stairs the half that lies on this storey, with the room that they lead to."""
+    """Draw lines from room to door to room; of stairs the half that lies on this storey, with the room that they lead to."""
     labelled: set[int] = set()  # rooms above or below that a label names already
     for edge in map.edges:
         a, b = edge["rooms"].tolist()
@@ -156,7 +156,7 @@ def _draw_edges(ax: Axes, map: TopometricMap, storey: int, places: dict[int, Pla
 
 
 def _draw_rooms(ax: Axes, named: dict[int, Place], inches: float) -> None:
-    """A node with its number at each room; as large as the room lets it be, within what can be read and looks calm."""
+    """Draw a node with its number at each room; as large as the room lets it be, within what can be read and looks calm."""
     for room, place in sorted(named.items()):
         digits = 0.32 * len(str(room)) + 0.4  # half the width of the node, of a number one point high
         size = float(np.clip(place.clear * inches * 72 / digits, 6.0, 8.5))
@@ -178,7 +178,7 @@ def _label_panel(ax: Axes, map: TopometricMap, storey: int) -> None:
 
 
 def _draw_scale_bar(figure: Figure, frame: Frame, inches: float) -> None:
-    """A bar of a round length above the legend; it holds for every panel."""
+    """Draw a bar of a round length above the legend; it holds for every panel."""
     width = float((frame.high - frame.low).max())
     length = max((s for s in (0.1, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500) if s <= 0.2 * width), default=0.1)
     across, down = figure.get_size_inches()

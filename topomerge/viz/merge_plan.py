@@ -214,8 +214,8 @@ def render_blend_view(
     names: tuple[str, str] = ("a", "b"),
     overlay: Overlay | None = None,
 ) -> Markup:
-    """Both plans in the frame of a, with a slider that shows the one, the other or both; where one is bent, with arrows and a
-    slider from rigid to bent.
+    """Render both plans in the frame of a, with a slider that shows the one, the other or both; where one is bent, with arrows
+    and a slider from rigid to bent.
 
     Args:
         drawn: of `lay_out_pair`.
@@ -261,7 +261,7 @@ def render_blend_view(
 
 
 def _render_sliders(maps: Sequence[TopometricMap], names: tuple[str, str], swipes: bool) -> Markup:
-    """The slider that fades from one map to the other, and the one that wipes."""
+    """Render the slider that fades from one map to the other, and the one that wipes."""
     common = {"type": "range", "min": "0", "max": "1", "step": "0.01", "value": "0.5"}
     text = f"rom {names[0]} to {names[1]}"
     sliders = [build_element("input", **common, data_blend=True, aria_label=f"F{text}")]
@@ -283,7 +283,8 @@ class _OverlaySide:
 
 
 def pair_storeys(a: TopometricMap, b: TopometricMap, pose: Sim3) -> list[tuple[int | None, int | None]]:
-    """(storey of a, storey of b) that lie at one height, and those that lie at no other's; lowest first of a, then of b."""
+    """Return (storey of a, storey of b) that lie at one height, and those that lie at no other's; lowest first of a, then of
+    b."""
     floors_a = a.storeys["floor"] if len(a.storeys) else np.zeros(1)
     floors_b = pose.scale * b.storeys["floor"] + pose.translation[2] if len(b.storeys) else floors_a[:1]
     pairs: list[tuple[int | None, int | None]] = []
@@ -340,7 +341,7 @@ def _render_layer(side: _OverlaySide, storey: int, paper: Sheet, factor: int) ->
 
 
 def _render_outline(d: str, side: _OverlaySide, storey: int, name: str | None = None) -> Markup:
-    """An outline; of a bent map as it is bent, with the rigid one for the slider."""
+    """Render an outline; of a bent map as it is bent, with the rigid one for the slider."""
     if side.bend is None:
         return build_element("path", class_=name, d=d, fill_rule="evenodd")
     floor = float(side.map.storeys["floor"][storey]) if len(side.map.storeys) else 0.0

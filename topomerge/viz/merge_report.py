@@ -104,7 +104,7 @@ def compute_room_shades(odds: Array) -> Array:
 
 
 def _render_room(room: int, shown: Sequence[int], odds: Array, places: Places) -> Markup:
-    """A room's places, folded."""
+    """Render a room's places, folded."""
     name = render_room_link("a", room) if room >= 0 else Markup("outside rooms")
     text = f" {describe_log_odds(float(odds[room]))}, {len(shown)} shown" if room >= 0 else f" {len(shown)} shown"
     cards = [_render_card(k, places) for k in shown]
@@ -129,7 +129,7 @@ def _render_card(k: int, places: Places) -> Markup:
 
 
 def describe_log_odds(odds: float) -> str:
-    """Log odds in words."""
+    """Describe log odds in words."""
     if abs(odds) < 0.5:
         return "little evidence"
     times = np.exp(min(abs(odds), MOST_ODDS))
@@ -242,7 +242,7 @@ def render_merge_html(result: MergeResult) -> str:
 
 
 def _render_deformations(result: MergeResult) -> list[Markup]:
-    """Of many maps: a table of how each was bent."""
+    """Render, of many maps, a table of how each was bent."""
     where = result.placements if result.bends else {}
     names = [f"{k}: {Path(result.maps[k].source).name or 'map'}" for k in where]
     return (
@@ -275,7 +275,7 @@ def _render_observations(result: MergeResult) -> list[Markup]:
 
 
 def _render_figures(result: MergeResult) -> Markup:
-    """The figures that one wants first."""
+    """Render the figures that one wants first."""
     figures = [(str(len(m.rooms)), f"rooms of {name}") for name, m in zip("ab", result.maps, strict=True)]
     if result.map is not None:
         joined, pose = result.map, result.transforms[1]
@@ -294,7 +294,7 @@ def _render_figures(result: MergeResult) -> Markup:
 
 
 def _render_maps(result: MergeResult, drawn: tuple[Drawn, Drawn], within: tuple[Array, Array] | None) -> Markup:
-    """Both plans side by side, rooms that are one in one colour, and the table of them.
+    """Render both plans side by side, rooms that are one in one colour, and the table of them.
 
     Args:
         within: of `_find_joined_rooms`; None where nothing is joined.
@@ -335,7 +335,7 @@ def _compute_colours(result: MergeResult, within: tuple[Array, Array]) -> tuple[
 
 
 def _find_joined_rooms(result: MergeResult) -> tuple[Array, Array]:
-    """For each room of both maps the room of the joined map in which it lies, -1 none."""
+    """Return, for each room of both maps, the room of the joined map in which it lies, -1 none."""
     assert result.map is not None
     a, b = result.maps
     bends = result.bends
@@ -345,7 +345,7 @@ def _find_joined_rooms(result: MergeResult) -> tuple[Array, Array]:
 
 
 def _collect_partners(result: MergeResult, within: tuple[Array, Array]) -> dict[str, list[str]]:
-    """Room as the page calls it -> rooms that are the same one; `within`: of `_find_joined_rooms`."""
+    """Map each room, as the page calls it, to the rooms that are the same one; `within`: of `_find_joined_rooms`."""
     mates: dict[str, set[str]] = {}
 
     def tell(one: str, other: str) -> None:
@@ -362,7 +362,7 @@ def _collect_partners(result: MergeResult, within: tuple[Array, Array]) -> dict[
 
 
 def _render_matches(result: MergeResult, within: Array) -> Markup:
-    """The table of matches; `within`: room of the joined map of each room of a."""
+    """Render the table of matches; `within`: room of the joined map of each room of a."""
     a, b = result.maps
     columns = [(name, "number") for name in ("room of a", "area m²", "room of b", "area m²")]
     columns += [("probability", "text"), ("room of the joined map", "number")]

@@ -129,7 +129,8 @@ def _render_pairs(matches: Sequence[RoomMatch], a: TopometricMap, b: TopometricM
 
 
 def find_aligning_quarters(a: Array, b: Array) -> int:
-    """Quarter turns, counter-clockwise, after which most walls around rooms of b are where they are around their partners in a.
+    """Return the quarter turns, counter-clockwise, after which most walls around rooms of b are where they are around their
+    partners in a.
 
     Args:
         a, b: (M, CROP, CROP, len(CROP_PLANES)) of `crops`, a row for each match.
@@ -177,7 +178,7 @@ def _render_provenance(matching: Matching, a: TopometricMap, b: TopometricMap) -
 
 
 def _collect_partners(matches: Sequence[RoomMatch]) -> dict[str, Any]:
-    """Room as the page calls it -> its partners."""
+    """Map each room, as the page calls it, to its partners."""
     mates: dict[str, list[str]] = {}
     for match in matches:
         one, other = (f"{name}{room}" for name, room in zip("ab", match.rooms, strict=True))
@@ -276,7 +277,7 @@ def _render_view(changes: Changes) -> Markup:
 
 
 def _render_mark(k: int, change: Change, paper: Sheet, to_paper: Any) -> Markup:
-    """A change on the paper: an outline, a line, or a ring around a door; furniture that moved has an arrow."""
+    """Render a change on the paper: an outline, a line, or a ring around a door; furniture that moved has an arrow."""
     heights = np.full(len(change.shape), change.place[2])
     places = paper.convert_to_cm(to_paper(np.column_stack([change.shape, heights])))
     parts: list[Markup] = [build_element("title", _describe(change))]
@@ -320,7 +321,7 @@ def _render_list(changes: Changes) -> Markup:
 
 
 def _name_rooms(change: Change) -> str:
-    """Which doors or rooms of the maps a change is about."""
+    """Tell which doors or rooms of the maps a change is about."""
     what = {"door": "door", "room": "room"}.get(change.element, "")
     sides = [f"{what} {', '.join(map(str, n))} of {when}" for n, when in ((change.old, "old"), (change.new, "new")) if n]
     return " → ".join(sides) if what else ""

@@ -108,7 +108,7 @@ def locate_storey_cells(map: TopometricMap, frame: Frame) -> list[StoreyCells]:
 
 
 def _group_cells(cells: Array, storey: Array, frame: Frame, count: int) -> list[tuple[Array, Array]]:
-    """Rows of the cells of each storey below `count`, and their pixels."""
+    """Return the rows of the cells of each storey below `count`, and their pixels."""
     order = np.argsort(storey.astype(np.uint8 if count < 256 else np.int32), kind="stable")
     ends = np.cumsum(np.bincount(storey, minlength=count))[:count].tolist()
     x, y = ((cells[order, k] - frame.first[k]) // frame.step for k in (0, 1))
@@ -150,7 +150,7 @@ class Place:
 
 @lru_cache(maxsize=KEPT_DRAWINGS)
 def find_label_places(plan: StoreyView, frame: Frame) -> dict[int, Place]:
-    """Room -> the point of its area with most space around it; of nearly equal ones the nearest to the middle."""
+    """Map each room to the point of its area with most space around it; of nearly equal ones the nearest to the middle."""
     boxes = enumerate(ndimage.find_objects(plan.room + 1))
     return {i: find_label_place(plan.room[box] == i, plan.wall[box], box, frame) for i, box in boxes if box is not None}
 
@@ -254,7 +254,8 @@ def _compute_middle(room: Any) -> list[float]:
 
 
 def _merge_cells(cells: Array, labels: Array, most: int) -> tuple[int, Array, list[int], Array, Array]:
-    """Cells along an axis that become one, then for each drawn cell its number, the shape, kinds and each cell's kind."""
+    """Merge cells along an axis that become one; return also for each drawn cell its number, the shape, kinds and each cell's
+    kind."""
     longest = int(cells.max(initial=0)) + 1
     factor = -(-longest // LONGEST_AXIS)
     base = labels.max(axis=0, initial=0) + 1
@@ -273,7 +274,7 @@ def _merge_cells(cells: Array, labels: Array, most: int) -> tuple[int, Array, li
 
 
 def _find_most_common(number: Array, kind: Array, kinds: Array) -> tuple[Array, Array]:
-    """One row for each number on each storey: with the kind that most of its cells have, the lowest of equal ones."""
+    """Return one row for each number on each storey: with the kind that most of its cells have, the lowest of equal ones."""
     storey = kinds[:, 0]
     order = np.lexsort((kind, number))
     number, kind = number[order], kind[order]

@@ -76,7 +76,7 @@ class RerunLog:
         self._stream.disconnect()
 
     def _log_map(self, entity: str, map: TopometricMap, pose: Sim3) -> None:
-        """Cells, rooms and the ways between them."""
+        """Log cells, rooms and the ways between them."""
         rr, step = self._rerun, max(len(map.grid) // CELLS_SHOWN, 1)
         colours = np.vstack([assign_room_colours(map), [NO_LINK]])  # the last one is that of cells without a room
         cells = pose.apply(map.grid.compute_centroids()[::step])
@@ -97,7 +97,7 @@ class RerunLog:
         self._stream.log(f"{entity}/graph", rr.LineStrips3D(connections, radii=0.03))
 
     def _log_links(self, entity: str, result: AtlasResult, members: tuple[int, ...]) -> None:
-        """Where each map of a component begins, and the links between maps."""
+        """Log where each map of a component begins, and the links between maps."""
         rr = self._rerun
         places = {k: np.array(result.transforms[k].translation) for k in members}
         names = [result.names[k] for k in members]
@@ -110,6 +110,6 @@ class RerunLog:
 
 
 def _compute_bounds(map: TopometricMap, pose: Sim3) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest place (3,) of a map under a pose, m."""
+    """Return the lowest and highest place (3,) of a map under a pose, m."""
     cells = pose.apply(map.grid.compute_centroids())
     return cells.min(axis=0), cells.max(axis=0)

@@ -87,7 +87,7 @@ class Sheet:
 
 
 def build_rotation(angle: float) -> Array:
-    """(2, 2)."""
+    """Build the rotation (2, 2)."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s], [s, c]])
 
@@ -221,7 +221,7 @@ def trace(
 
 
 def _format_rings(pixels: Array, owner: Array, sheet: Sheet) -> Iterator[str]:
-    """Each closed ring, as steps in cm.
+    """Yield each closed ring, as steps in cm.
 
     Args:
         pixels: (n, 2) corners of one ring after the other, the first one of each twice.
@@ -313,7 +313,7 @@ def render_drawing(map: TopometricMap, sheet: Sheet, storey: int, layers: list[M
 
 
 def _render_scale_bar(height: int, margin: int, unit: float) -> Markup:
-    """A bar of a round length below the drawing; the page's script makes another when the drawing is zoomed."""
+    """Render a bar of a round length below the drawing; the page's script makes another when the drawing is zoomed."""
     lengths = [m * 10**k for k in range(-2, 6) for m in (1, 2, 5)]
     length = max((s for s in lengths if 100 * s <= 160 * unit), default=lengths[0])
     bar = build_element("path", d=f"M0 0v{6 * unit:.0f}h{100 * length:.0f}v{-6 * unit:.0f}")
@@ -322,7 +322,7 @@ def _render_scale_bar(height: int, margin: int, unit: float) -> Markup:
 
 
 def _render_axes(sheet: Sheet, margin: int, unit: float) -> Markup:
-    """The directions of the input's x and y, in the lower right corner."""
+    """Render the directions of the input's x and y, in the lower right corner."""
     width, height = sheet.size
     parts = []
     for name, angle in (("x", sheet.turn), ("y", sheet.turn + math.pi / 2)):
@@ -345,7 +345,8 @@ def _render_room(map: TopometricMap, sheet: Sheet, room: int, path: str, colour:
 
 
 def _render_landmarks(map: TopometricMap, sheet: Sheet, storey: int) -> list[Markup]:
-    """A mark with its text for each sign, tag, object and name of a storey whose place is known, of very many the surest."""
+    """Render a mark with its text for each sign, tag, object and name of a storey whose place is known, of very many the
+    surest."""
     table = map.landmarks.table
     shown = map.landmarks.is_kind(*SHOWN_KINDS) & np.isfinite(table["position"]).all(axis=1) & (table["storey"] == storey)
     rows = np.flatnonzero(shown)
@@ -364,7 +365,7 @@ def _render_landmarks(map: TopometricMap, sheet: Sheet, storey: int) -> list[Mar
 
 
 def _render_label(map: TopometricMap, sheet: Sheet, room: int, place: Place, name: str) -> Markup:
-    """Number, and its name or else its area; the page's script hides what has no room."""
+    """Render the number, and its name or else its area; the page's script hides what has no room."""
     x, y = sheet.locate((place.x, place.y))
     number = build_element("text", str(room), class_="number")
     area = build_element("text", shorten(name) if name else f"{map.rooms['area'][room]:.1f} m²", class_="size")
@@ -407,7 +408,7 @@ def _build_edge_attributes(map: TopometricMap, sheet: Sheet, i: int) -> dict[str
 
 
 def _render_stairs(map: TopometricMap, sheet: Sheet, storey: int, i: int, labelled: set[int]) -> Markup:
-    """Treads from the lower to the upper end with an arrow up, and a word where they lead, once for each room."""
+    """Render treads from the lower to the upper end with an arrow up, and a word where they lead, once for each room."""
     edge = map.edges[i]
     a, b = edge["rooms"].tolist()
     other = b if map.rooms["storey"][a] == storey else a
@@ -429,7 +430,7 @@ def _render_stairs(map: TopometricMap, sheet: Sheet, storey: int, i: int, labell
 
 
 def _render_flight(lower: tuple[int, int], upper: tuple[int, int], width: float, treads: bool) -> list[Markup]:
-    """An arrow up and, across it, treads 30 cm apart."""
+    """Render an arrow up and, across it, treads 30 cm apart."""
     (x, y), (x2, y2) = lower, upper
     length = math.hypot(x2 - x, y2 - y)
     u, v = (x2 - x) / length, (y2 - y) / length
@@ -444,7 +445,7 @@ def _render_flight(lower: tuple[int, int], upper: tuple[int, int], width: float,
 
 
 def _render_graph(map: TopometricMap, sheet: Sheet, storey: int, named: dict[int, Place]) -> list[Markup]:
-    """Lines from room to door to room; of stairs the half that lies on this storey."""
+    """Render lines from room to door to room; of stairs the half that lies on this storey."""
     parts = []
     for edge in map.edges:
         rooms = [room for room in edge["rooms"].tolist() if room in named and map.rooms["storey"][room] == storey]
@@ -463,7 +464,7 @@ def _render_graph(map: TopometricMap, sheet: Sheet, storey: int, named: dict[int
 
 
 def _render_narrows(map: TopometricMap, sheet: Sheet, storey: int) -> list[Markup]:
-    """Where rooms narrow: thin dashed lines between their areas, with the probability that these are two rooms."""
+    """Render where rooms narrow: thin dashed lines between their areas, with the probability that these are two rooms."""
     if not len(map.narrows):
         return []
     rooms = map.rooms[map.areas["room"][map.narrows["rooms"][:, 0]]]

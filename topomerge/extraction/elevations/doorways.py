@@ -134,7 +134,8 @@ def _find_most_common(rooms: Array, otherwise: int) -> int:
 
 
 def merge_openings(doorways: Array) -> tuple[Array, Array]:
-    """Doorways (D,) DOORWAY_DTYPE without those that are parts of one wide opening, and the width (D,) m of the surest part.
+    """Return doorways (D,) DOORWAY_DTYPE without those that are parts of one wide opening, and the width (D,) m of the surest
+    part.
 
     Of an opening wider than doors are, a wall shows where it begins and where it ends: two doorways of the same two rooms that
     meet end to end.
@@ -154,7 +155,7 @@ def merge_openings(doorways: Array) -> tuple[Array, Array]:
 
 
 def _join_parts(parts: Array) -> Array:
-    """The opening from the first end of its parts to the last one."""
+    """Return the opening from the first end of its parts to the last one."""
     out = parts[parts["probability"].argmax()].copy()
     along = np.array([-out["out"][1], out["out"][0]])
     at = (parts["centre"] - out["centre"])[:, :2] @ along
@@ -166,7 +167,7 @@ def _join_parts(parts: Array) -> Array:
 
 
 def _iter_runs(probability: Array) -> Iterator[tuple[int, int]]:
-    """First place and that after the last one of every stretch that is probably a door."""
+    """Yield the first place and that after the last one of every stretch that is probably a door."""
     likely = np.flatnonzero(np.diff(np.concatenate([[0], probability > DOOR_CHANCE, [0]]).astype(np.int8)))
     for start, stop in likely.reshape(-1, 2).tolist():
         if (stop - start) * PLACES * ALONG >= LEAST_WIDTH and probability[start:stop].max() >= LIKELY_DOOR:
@@ -174,14 +175,14 @@ def _iter_runs(probability: Array) -> Iterator[tuple[int, int]]:
 
 
 def _is_seen(strip: Array, start: int, stop: int) -> bool:
-    """Does the wall show around a stretch? Where there are hardly any points, floor that goes on is no doorway."""
+    """Return whether the wall shows around a stretch. Where there are hardly any points, floor that goes on is no doorway."""
     around = strip[max(start - SEEN_AROUND, 0) * PLACES : (stop + SEEN_AROUND) * PLACES, :, :BANDS]
     return int(np.count_nonzero(around)) >= LEAST_ELEMENTS
 
 
 def _is_thick(strip: Array, start: int, stop: int) -> bool:
-    """Do two surfaces show in a stretch, farther apart than those of a leaf, and nothing between them? Then a wall is there: a
-    niche of a door's size looks like a set-back leaf."""
+    """Return whether two surfaces show in a stretch, farther apart than those of a leaf, and nothing between them. Then a wall is
+    there: a niche of a door's size looks like a set-back leaf."""
     inner = (stop - start) // 4
     across = strip[(start + inner) * PLACES : (stop - inner) * PLACES, :, LEAF_BANDS].mean(axis=(0, 2))
     ends = np.flatnonzero(np.diff(np.concatenate([[0], across > SURFACE_FILL, [0]])))
@@ -190,7 +191,7 @@ def _is_thick(strip: Array, start: int, stop: int) -> bool:
 
 
 def _build_doorway(face: Array, room: int, doors: Array, start: int, stop: int) -> tuple[object, ...]:
-    """Row of DOORWAY_DTYPE of one stretch of a face, with the room before it."""
+    """Build the row of DOORWAY_DTYPE of one stretch of a face, with the room before it."""
     step = PLACES * ALONG
     probability = doors[start:stop].sum(axis=1)
     at = (np.average(np.arange(start, stop), weights=probability) + 0.5) * step
@@ -214,7 +215,7 @@ def _merge_faces(rows: Array) -> Array:
 
 
 def _merge_rows(rows: Array) -> Array:
-    """One row of several, by their probabilities; the other room is the likeliest that sees it from the other side."""
+    """Merge several rows into one, by their probabilities; the other room is the likeliest that sees it from the other side."""
     rows = rows[np.argsort(-rows["probability"], kind="stable")]
     out, weight = rows[0].copy(), rows["probability"]
     opposite = (rows["out"] @ out["out"] < 0) & (rows["rooms"][:, 0] != out["rooms"][0])

@@ -245,7 +245,7 @@ def _move_door(edge: Array, way: Array) -> Array:
 
 
 def _is_half_open(way: Array) -> bool:
-    """Does most of what speaks for a doorway speak for a leaf that stands half open?"""
+    """Return whether most of what speaks for a doorway speaks for a leaf that stands half open."""
     return bool(way["half"] >= HALF_SHARE)
 
 

@@ -40,7 +40,7 @@ LEAST_FILL = 0.15  # of the elements of a surface: in emptier ones nothing shows
 
 
 def iter_likely_stretches(probability: Array, likely: float, least: float) -> Iterator[tuple[int, int]]:
-    """First place and that after the last one of every stretch that probably shows one thing.
+    """Yield the first place and that after the last one of every stretch that probably shows one thing.
 
     Args:
         chance: (n,) probability of it in each place along a strip.
@@ -53,7 +53,7 @@ def iter_likely_stretches(probability: Array, likely: float, least: float) -> It
 
 
 def find_wall_depth(strip: Array, start: int, stop: int) -> int:
-    """Element across the strip in which most of the wall of a stretch lies (`compute_wall_profile`)."""
+    """Return the element across the strip in which most of the wall of a stretch lies (`compute_wall_profile`)."""
     return int(compute_wall_profile(strip, start, stop).argmax())
 
 
@@ -77,8 +77,8 @@ def measure_face_cover(strip: Array, start: int, stop: int, depth: int) -> Array
 
 
 def measure_vertical_extent(profile: Array) -> tuple[float, float]:
-    """m above the floor between which most bands of (13,) 0..1 are above a half, and as much of those below and above them as is;
-    nan where the end of the strip is one of them, or none is above."""
+    """Return the heights, m above the floor, between which most bands of (13,) 0..1 are above a half, and as much of those below
+    and above them as is; nan where the end of the strip is one of them, or none is above."""
     runs = np.flatnonzero(np.diff(np.concatenate([[0], profile > 0.5, [0]]))).reshape(-1, 2)
     if not len(runs):
         return np.nan, np.nan
@@ -209,7 +209,7 @@ def iter_same_windows(rows: Array) -> Iterator[Array]:
 
 
 def _build_window(face: Array, probability: Array, strip: Array, start: int, stop: int) -> tuple[object, ...]:
-    """Row of WINDOW_DTYPE of one stretch of a face."""
+    """Build the row of WINDOW_DTYPE of one stretch of a face."""
     depth = find_wall_depth(strip, start, stop)
     off = (depth + 0.5) * ACROSS - BEFORE + HALF_WALL
     middle = face["start"] + (start + stop) / 2 * PLACE * face["along"] + off * face["out"]
@@ -227,14 +227,14 @@ def _build_window(face: Array, probability: Array, strip: Array, start: int, sto
 
 
 def _measure_heights(strip: Array, start: int, stop: int, depth: int) -> tuple[float, float]:
-    """m above the floor of sill and head of a stretch, nan where they do not show: the bands of the face that are mostly empty,
-    and as much of those below and above them as is."""
+    """Return the heights of sill and head of a stretch, m above the floor, nan where they do not show: the bands of the face that
+    are mostly empty, and as much of those below and above them as is."""
     cover = measure_face_cover(strip, start, stop, depth)
     return (np.nan, np.nan) if cover is None else measure_vertical_extent(1 - cover)
 
 
 def _merge_windows(rows: Array, out: Array) -> Array:
-    """One window of what faces show of it, (k, 2) `out` away from their rooms: the likeliest, or what lies between the two
+    """Make one window of what faces show of it, (k, 2) `out` away from their rooms: the likeliest, or what lies between the two
     that are the likeliest on both sides of the wall."""
     window = rows[0].copy()
     opposite = np.flatnonzero(out @ out[0] < 0)

@@ -69,7 +69,8 @@ def find_boundary_columns(rooms: Sequence[PlacedRooms]) -> Array:
 def compute_door_log_odds(
     region: Array, edge: float, passages: Mapping[Pair, Passage], rooms: Sequence[PlacedRooms]
 ) -> dict[Pair, float]:
-    """Log odds of a door in each passage by all parts: below 0, they have one room on both sides; 0 where none knows both sides.
+    """Compute the log odds of a door in each passage by all parts: below 0, they have one room on both sides; 0 where none knows
+    both sides.
 
     Args:
         region: (nx, ny) region of each column, -1 none.
@@ -87,7 +88,7 @@ def compute_door_log_odds(
 
 
 def _score_separation(room: Array, certainty: Array, sides: tuple[Array, Array]) -> float:
-    """-1..1: does a part have one room on both sides, or two?
+    """Return whether a part has one room on both sides, or two: -1..1.
 
     Args:
         room: (nx, ny) its rooms, -1 none.

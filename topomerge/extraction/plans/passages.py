@@ -156,7 +156,8 @@ class _PassageMeasurer:
         return Passage((x, y), width, (dx, dy), (growth, *opens, length, lintel, cover, seen, step, *jambs, doorway, boundary))
 
     def _measure_above(self, a: int, b: int, x: int, y: int) -> tuple[float, float, float, float]:
-        """Depth of a lintel below both ceilings, was it seen, step between the ceilings, and growth of the clearance."""
+        """Return the depth of a lintel below both ceilings, whether it was seen, the step between the ceilings, and the growth of
+        the clearance."""
         plan, clearance = self.plan, self.clearance
         reach = int(np.ceil(LINTEL_REACH / plan.edge))
         box = slice(max(x - reach, 0), x + reach + 1), slice(max(y - reach, 0), y + reach + 1)
@@ -214,7 +215,7 @@ def predict_door(x: Array) -> Array:
 
 @lru_cache(maxsize=4)
 def read_classifier(path: Path) -> dict[str, Any]:
-    """Range, mean and scale of the features, and (weight, bias) of each layer.
+    """Read range, mean and scale of the features, and (weight, bias) of each layer.
 
     Raises:
         InputError: damaged, or trained with other features.

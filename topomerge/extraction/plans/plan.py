@@ -48,8 +48,8 @@ LEAST_SLAB = 0.1  # m at least, between a ceiling and the floor above it
 
 
 def locate_columns(plan: StoreyPlan, grid: VoxelGrid) -> tuple[Array, Array]:
-    """Where a plan lies in the grid that it was made of: (2,) int64 column that is element (0, 0), and (nx, ny) int64 level of
-    the floor."""
+    """Return where a plan lies in the grid that it was made of: (2,) int64 column that is element (0, 0), and (nx, ny) int64
+    level of the floor."""
     low = np.rint((plan.origin - grid.origin[:2]) / plan.edge).astype(np.int64)
     return low, np.rint((plan.floor - grid.origin[2]) / plan.edge - 0.5).astype(np.int64)
 
@@ -138,7 +138,7 @@ def _is_within(at: Array, size: Array) -> Array:
 
 
 def _interpolate_heights(cells: Array, low: Array, size: Array, nominal: int = 0) -> tuple[Array, Array, Array]:
-    """Level of the nearest of the given floor cells, where there is one, and how many columns away it is."""
+    """Return the level of the nearest of the given floor cells, where there is one, and how many columns away it is."""
     if not len(cells):
         return np.full(size, nominal), np.zeros(size, bool), np.full(size, 1e9)
     order = np.argsort(-cells[:, 2], kind="stable")  # the lowest is written last
@@ -185,7 +185,7 @@ def build_profile_bands(edge: float) -> HeightBands:
 
 
 def _is_filled_like_wall(profile: Array, bands: HeightBands) -> Array:
-    """Is the column filled like a wall, at the heights at which the sensor looked?"""
+    """Return whether the column is filled like a wall, at the heights at which the sensor looked."""
     filled = build_band_stack(profile, bands)
     filled = filled[is_observed_band(filled)]
     like = detect_wall_columns(filled, ROOM_WALLS)
@@ -199,7 +199,7 @@ def _is_filled_like_wall(profile: Array, bands: HeightBands) -> Array:
 
 
 def _estimate_ceiling(clear: Array, edge: float) -> Array:
-    """Ceiling of each column: the median of a few tiles around it, which lamps and lintels don't reach."""
+    """Estimate the ceiling of each column: the median of a few tiles around it, which lamps and lintels don't reach."""
     tile = _compute_tile_size(edge)
     nx, ny = (-(-s // tile) for s in clear.shape)
     padded = np.full((nx * tile, ny * tile), np.nan)
@@ -212,12 +212,12 @@ def _estimate_ceiling(clear: Array, edge: float) -> Array:
 
 
 def _compute_tile_size(edge: float) -> int:
-    """Columns a side of the tiles on which ceilings are measured."""
+    """Return the columns a side of the tiles on which ceilings are measured."""
     return max(round(BLOCK / edge), 1)
 
 
 def _compute_nanmedian(values: Array) -> Array:
-    """Median along the last axis of what is a number; nan where fewer than a tenth are."""
+    """Return the median along the last axis of what is a number; nan where fewer than a tenth are."""
     ordered = np.sort(values, axis=-1)  # nan last
     count = (~np.isnan(ordered)).sum(axis=-1)
     middle = np.take_along_axis(ordered, np.maximum(count - 1, 0)[..., None] // 2, axis=-1)[..., 0]
@@ -225,7 +225,7 @@ def _compute_nanmedian(values: Array) -> Array:
 
 
 def _is_below_ceiling(profile: Array, ceiling: Array, edge: float) -> Array:
-    """Columns over which the ceiling was seen with empty space below it: what stands there is no wall."""
+    """Return the columns over which the ceiling was seen with empty space below it: what stands there is no wall."""
     height = np.where(np.isnan(ceiling), 0.0, ceiling)
     out, bands = np.zeros(profile.shape, bool), build_profile_bands(edge)
     for level in np.unique(np.round(height / edge)):

@@ -105,7 +105,8 @@ def _average_turns(x: Array, network: Run, looks: int) -> Array:
 
 
 def _split_parts(known: Array) -> list[tuple[tuple[slice, slice], Array]] | None:
-    """Parts of a plan between which the network sees nothing: a box, and which of its columns the network sees anything from.
+    """Return the parts of a plan between which the network sees nothing: a box, and which of its columns the network sees
+    anything from.
 
     A plan of buildings far apart, or of a long bent corridor, so costs what is in it, not the rectangle around it.
 

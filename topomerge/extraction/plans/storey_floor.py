@@ -80,7 +80,8 @@ def _label_cells(label: Array, grid: VoxelGrid, plan: StoreyPlan, room: Array, f
 
 
 def find_cells_of_storey(grid: VoxelGrid, plan: StoreyPlan, room: Array, factor: int) -> tuple[Array, Array]:
-    """Rows of the occupied cells between floor and ceiling of a storey, in columns that have a room (nx, ny), and (k, 2) these.
+    """Return the rows of the occupied cells between floor and ceiling of a storey, in columns that have a room (nx, ny), and (k,
+    2) these.
 
     Args:
         factor: how many times longer the columns are than the cells.
@@ -99,7 +100,7 @@ def find_cells_of_storey(grid: VoxelGrid, plan: StoreyPlan, room: Array, factor:
 def _select_floor_cells(
     part: PartitionedStorey, navigable: VoxelGrid, in_storey: Array, factor: int
 ) -> tuple[Array, Array, Array]:
-    """Cells of a storey's floor, the column of the plan in which each lies, and whether somebody can stand there.
+    """Return the cells of a storey's floor, the column of the plan in which each lies, and whether somebody can stand there.
 
     These are its navigable cells, and below furniture all cells of a column of the plan at the level of its floor.
     """

@@ -34,7 +34,7 @@ class HeightBands:
     count: int
 
     def build_mask(self, low: float, high: float) -> int:
-        """Bits of the bands from `low` up to, not including, `high` m; of one at least, where any is as high."""
+        """Return the bits of the bands from `low` up to, not including, `high` m; of one at least, where any is as high."""
         first = min(max(round(low / self.step) + self.below, 0), self.count)
         last = min(max(round(high / self.step) + self.below, first + 1), self.count)
         return (1 << last) - (1 << first)
@@ -178,7 +178,7 @@ def detect_wall_columns(filled: Array, rule: WallRule) -> Array:
 
 
 def _spread_bands(filled: Array) -> Array:
-    """Bands that each column or one of the four beside it fills: a noisy wall is spread over columns."""
+    """Return the bands that each column or one of the four beside it fills: a noisy wall is spread over columns."""
     out = filled.copy()
     out[:, 1:] |= filled[:, :-1]
     out[:, :-1] |= filled[:, 1:]

@@ -41,7 +41,7 @@ def select_optimal_views(navigable: VoxelGrid, radius: float, height: float) -> 
 
 
 def find_local_maxima(grid: VoxelGrid, distance: Array, radius: float) -> Array:
-    """Ascending rows of cells whose distance is not below that of any cell within `radius` m (seeds 2.4.1, HDF_max).
+    """Return the ascending rows of cells whose distance is not below that of any cell within `radius` m (seeds 2.4.1, HDF_max).
 
     The octree answers radius(v, r) (seeds 2.2.1).
     """
@@ -109,7 +109,7 @@ def compute_jaccard_similarity(
 def cluster_markov(
     similarity: sparse.csr_array, inflation: float, threshold: float = 1e-4, most: int = 64, rounds: int = 100
 ) -> Array:
-    """Cluster of each node of a weighted graph.
+    """Return the cluster of each node of a weighted graph.
 
     Flow expands (M @ M) and inflates (entries to the power of `inflation`) until it settles; nodes whose flow ends at the same
     attractors form a cluster. The weights must be similarities: fed distances, the flow seeks out the unlike.
@@ -160,7 +160,7 @@ def compute_modularity(similarity: sparse.csr_array, cluster: Array) -> float:
 
 
 def cluster_views(similarity: sparse.csr_array, inflations: Sequence[float]) -> tuple[Array, float]:
-    """Clusters at the inflation of highest modularity, and that inflation; the smaller one of equals (seeds 2.6).
+    """Return the clusters at the inflation of highest modularity, and that inflation; the smaller one of equals (seeds 2.6).
 
     Args:
         similarity: (V, V) symmetric, with ones on the diagonal.
@@ -176,7 +176,7 @@ def cluster_views(similarity: sparse.csr_array, inflations: Sequence[float]) -> 
 
 
 def _renumber_by_first(labels: Array) -> Array:
-    """Labels numbered in the order in which they first occur."""
+    """Return labels numbered in the order in which they first occur."""
     _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int64)
     rank[np.argsort(first)] = np.arange(len(first))

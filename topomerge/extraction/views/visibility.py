@@ -60,7 +60,7 @@ class SparseVoxelOctree:
         return self.find_in_radius_many(centre[None], r)[1]
 
     def find_in_radius_many(self, centres: Array, r: float) -> tuple[Array, Array]:
-        """Radius queries around many centres at once, on all cores; up to 64 stay on the core that asks.
+        """Run radius queries around many centres at once, on all cores; up to 64 stay on the core that asks.
 
         Args:
             centres: (q, 3); integers are cells, of which the centroid is meant, floats are points in metres.
@@ -168,7 +168,7 @@ def find_visible_cells(
 
 
 def _cast_tile(octree: SparseVoxelOctree, views: Array, radius: float) -> tuple[Array, Array, Array]:
-    """Counts a view, words and masks for the views of one tile."""
+    """Return counts a view, words and masks for the views of one tile."""
     grid = octree.grid
     at, reach = (views - grid.origin) / grid.edge, radius / grid.edge
     margin = int(np.ceil(reach)) + 1
@@ -195,7 +195,7 @@ def _cast_tile(octree: SparseVoxelOctree, views: Array, radius: float) -> tuple[
 
 
 def _join_tiles(parts: list[tuple[Array, Array, Array, Array]], views: int, cells: int) -> Visibility:
-    """Tiles' results in the order of the views."""
+    """Join the tiles' results in the order of the views."""
     counts = np.zeros(views, np.int64)
     for group, count, _, _ in parts:
         counts[group] = count

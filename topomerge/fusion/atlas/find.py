@@ -123,7 +123,7 @@ def register_sightings(stored: StoredAtlas, map: TopometricMap, sightings: Seque
 
 
 def _score_maps(stored: StoredAtlas, rows: RoomRows, signature: str, new: Rows) -> Array:
-    """Votes for each map of an atlas, of the neighbours of the new map's rooms."""
+    """Count the votes for each map of an atlas, of the neighbours of the new map's rooms."""
     counts = [e.rooms for e in stored.entries]
     asked = compute_queries(new)
     flat = asked.reshape(-1, asked.shape[2])
@@ -141,7 +141,7 @@ def select_shortlist(scores: Array, number: int) -> list[int]:
 
 
 def rank_sightings(names: Sequence[str], rows: Sequence[Rows], new: Rows, number: int) -> tuple[Sighting, ...]:
-    """`find` with rows of length 1 of each map and of the new one."""
+    """Run `find` with rows of length 1 of each map and of the new one."""
     both = [_compute_similarity(new, of) for of in rows]
     alike, weight = [cosine for cosine, _ in both], [np.exp(VOTE_SHARPNESS * (cosine - 1)) * counted for cosine, counted in both]
     total = np.maximum(np.sum([w.sum(axis=1) for w in weight], axis=0), 1e-300)
@@ -152,7 +152,7 @@ def rank_sightings(names: Sequence[str], rows: Sequence[Rows], new: Rows, number
 
 
 def _find_mutual_pairs(cosine: Array) -> tuple[tuple[int, int, float], ...]:
-    """Rooms (R_new, R) that are each other's most alike one, and how alike; most alike first."""
+    """Find the rooms (R_new, R) that are each other's most alike one, and how alike; most alike first."""
     if not cosine.size:
         return ()
     best, back = cosine.argmax(axis=1), cosine.argmax(axis=0)

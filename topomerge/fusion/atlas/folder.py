@@ -92,7 +92,7 @@ def finish_change(folder: Path) -> None:
 
 
 def _resolve_inside(folder: Path, name: str) -> Path:
-    """A file of the atlas; an atlas of a stranger must not reach for files elsewhere, by its names or by links."""
+    """Return a file of the atlas; an atlas of a stranger must not reach for files elsewhere, by its names or by links."""
     path = folder / name
     if not path.parent.resolve().is_relative_to(folder.resolve()):
         raise ValueError(f"{name[:100]!r} lies elsewhere")
@@ -243,7 +243,7 @@ class StoredAtlas:
         return pairs
 
     def compute_relative_poses(self) -> dict[tuple[str, str], Sim3]:
-        """T_ij of the pairs that hold the components together, as they lie now, by the keys of both maps.
+        """Return the T_ij of the pairs that hold the components together, as they lie now, by the keys of both maps.
 
         Raises:
             InputError: atlas.json is damaged.
@@ -257,7 +257,7 @@ class StoredAtlas:
         return InputError(f"{self.folder / 'atlas.json'}: damaged; make the atlas again from its maps")
 
     def get_poses(self) -> dict[str, tuple[int, Sim3]]:
-        """Name of each map -> its component and its pose there.
+        """Map the name of each map to its component and its pose there.
 
         Raises:
             InputError: atlas.json is damaged.
@@ -293,7 +293,7 @@ def read_atlas(folder: str | Path) -> StoredAtlas:
 
 
 def read_finished(folder: Path) -> StoredAtlas:
-    """As `read_atlas`, of a folder in which no change was interrupted.
+    """Read, as `read_atlas`, a folder in which no change was interrupted.
 
     Raises:
         InputError: no atlas, or damaged.

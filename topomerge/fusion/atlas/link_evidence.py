@@ -62,7 +62,8 @@ class Link:
 
 
 def compute_shares(hypotheses: Sequence[PoseHypothesis]) -> tuple[list[float], float]:
-    """Probabilities of ranked hypotheses of a pair and of none of them; they sum to 1, and the first one keeps its own."""
+    """Return the probabilities of ranked hypotheses of a pair and of none of them; they sum to 1, and the first one keeps its
+    own."""
     best = float(np.clip(hypotheses[0].probability, LEAST_SHARE, 1 - LEAST_SHARE))
     others = sum(h.probability for h in hypotheses[1:])
     left = (1 - best) * (1 - NOT_NAMED)
@@ -132,13 +133,13 @@ class LinkEvidence:
         return _LinkScorer(self, a, b, pair, h, place_component(a, b, pair, h.transform) if move is None else move).score(least)
 
     def bound_log_odds(self, pair: tuple[int, int], h: PoseHypothesis) -> float:
-        """Log odds of a hypothesis of a pair where everything else speaks for it and all its rivals are ruled out."""
+        """Return the log odds of a hypothesis of a pair where everything else speaks for it and all its rivals are ruled out."""
         shares, none = compute_shares(self.hypotheses[pair])
         named = next((s for s, other in zip(shares, self.hypotheses[pair], strict=True) if other is h), LEAST_SHARE)
         return float(np.log(named / none)) + CLOSING_GAIN
 
     def is_same_pose(self, i: int, j: int, p: Sim3, q: Sim3, limits: tuple[float, float, float] = DRIFT_LIMITS) -> bool:
-        """Are two poses T_ij one, where the maps overlap?"""
+        """Return whether two poses T_ij are one, where the maps overlap."""
         return is_same_pose(p, q, self.checks.locate_place(i, j, p).mean(axis=0), limits)
 
     def get_source(self, i: int, j: int) -> Source:
@@ -150,7 +151,8 @@ class LinkEvidence:
         return Source((i, j), tuple((h.transform, share) for h, share in zip(ranked, shares, strict=True)), none)
 
     def get_composed_source(self, i: int, j: int, k: int) -> Source | None:
-        """Placements of maps i < j by the registrations of both with map k: each pose of the one with each of the other."""
+        """Return the placements of maps i < j by the registrations of both with map k: each pose of the one with each of the
+        other."""
         of = tuple(self.hypotheses.get((min(m, k), max(m, k))) for m in (i, j))
         if (i, j, k) not in self._composed or any(p is not q for p, q in zip(self._composed[i, j, k][0], of, strict=True)):
             self._composed[i, j, k] = (of[0], of[1]), self._compose_source(i, j, k)
@@ -171,7 +173,7 @@ class LinkEvidence:
         return Source((i, j), tuple(merged), max(1 - sum(share for _, share in merged), LEAST_SHARE), direct=False)
 
     def _list_poses(self, i: int, j: int) -> list[tuple[Sim3, float]]:
-        """T_ij of maps in any order, with their shares."""
+        """Return the T_ij of maps in any order, with their shares."""
         named = self.get_source(min(i, j), max(i, j)).named
         return [(pose if i < j else pose.inverse(), share) for pose, share in named]
 
@@ -206,7 +208,7 @@ class _LinkScorer:
         return Link(self.pair, self.h, -float(left), against[1])
 
     def _compute_pose(self, pair: tuple[int, int], move: Sim3) -> Sim3:
-        """T_ij of a pair (i < j) across, if component b lies so in a."""
+        """Return the T_ij of a pair (i < j) across, if component b lies so in a."""
         if (pair, move) not in self._poses:
             i, j = pair
             one, two = (i, j) if i in self.a else (j, i)
@@ -240,7 +242,8 @@ class _LinkScorer:
         return self._checks[pair, move]
 
     def _compute_any_log_odds(self) -> float:
-        """Log odds of the placement against none at all: of the surest registration that names it, and what others add."""
+        """Compute the log odds of the placement against none at all: of the surest registration that names it, and what others
+        add."""
         odds, supports = [], []
         for source in (*self.sources, *self.composed):
             share = self._compute_share(source)
@@ -273,7 +276,7 @@ class _LinkScorer:
         return sum_places(places), costs
 
     def _list_rivals(self) -> list[Sim3]:
-        """Other placements that sources name, those with the largest shares."""
+        """List the other placements that sources name, those with the largest shares."""
         named = [
             (share, source, pose)
             for source in (*self.sources, *self.composed)
@@ -291,7 +294,8 @@ class _LinkScorer:
         return rivals
 
     def _compute_lead(self, rival: Sim3) -> tuple[float, tuple[float, tuple[int, int] | None]]:
-        """Log odds of the placement against a rival one by what sources name; and the most that a pair says for the rival."""
+        """Compute the log odds of the placement against a rival one by what sources name; and the most that a pair says for the
+        rival."""
         named: list[tuple[float, bool, bool]] = []  # log odds, is the placement that loses named, too, is it seen
         loudest: tuple[float, tuple[int, int] | None] = (0.0, None)
         doubtful = any(

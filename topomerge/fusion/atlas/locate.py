@@ -53,15 +53,17 @@ LOOSE = 5.0  # m: how far a pose may slide where no wall holds it
 
 @dataclass(frozen=True)
 class LocateSettings:
-    """Args:
-    sure: probability from which on a place, or a few places together, is told.
-    absent: probability, against the likeliest place alone, from which on "not here" is told.
-    coarse: poses that are refined.
-    coarse_of_storey: … of one storey.
-    sample: columns of the scan by which these are refined and ranked.
-    judged: poses that are judged closely.
-    shown: runners-up that are told.
-    alike: places between which it "cannot tell", at most.
+    """Settings of `locate`.
+
+    Args:
+        sure: probability from which on a place, or a few places together, is told.
+        absent: probability, against the likeliest place alone, from which on "not here" is told.
+        coarse: poses that are refined.
+        coarse_of_storey: … of one storey.
+        sample: columns of the scan by which these are refined and ranked.
+        judged: poses that are judged closely.
+        shown: runners-up that are told.
+        alike: places between which it "cannot tell", at most.
     """
 
     sure: float = 0.9
@@ -149,7 +151,7 @@ class Location:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def serialise(self) -> dict[str, Any]:
-        """As plain values, for JSON; no room is None."""
+        """Return plain values, for JSON; no room is None."""
         places = [
             {
                 **asdict(p),
@@ -206,7 +208,7 @@ def prepare_query(scan: Any) -> Query:
 
 
 def _find_seen_space(scan: Scan) -> VoxelGrid | None:
-    """Cells that are empty in a scan of which nobody knows where it was taken; None where it shows no floor."""
+    """Find the cells that are empty in a scan of which nobody knows where it was taken; None where it shows no floor."""
     try:
         return extract(scan.grid).free
     except InputError:
@@ -214,7 +216,7 @@ def _find_seen_space(scan: Scan) -> VoxelGrid | None:
 
 
 def _raise_tall_columns(plan: Any) -> Any:
-    """A plan in which all that is tall is a wall: a single scan shows too little of a wall far away."""
+    """Return a plan in which all that is tall is a wall: a single scan shows too little of a wall far away."""
     if plan.sliced:
         return plan
     tall = plan.standing & plan.is_occupied(*TALL)
@@ -222,7 +224,7 @@ def _raise_tall_columns(plan: Any) -> Any:
 
 
 def _build_query(plans: Sequence[Any], place: Array | None, map: TopometricMap | None) -> Query:
-    """A query of the storey that shows most."""
+    """Build a query of the storey that shows most."""
     fields = PlanFields(max(plans, key=lambda p: int(p.wall.sum())))
     if len(fields.walls) < LEAST_WALLS:
         raise InputError("the scan shows hardly any walls: nothing can be compared; turn the sensor, or walk a few metres")
@@ -234,7 +236,7 @@ def _build_query(plans: Sequence[Any], place: Array | None, map: TopometricMap |
 
 
 def _build_bare_map(scan: Scan, free: VoxelGrid | None) -> TopometricMap:
-    """A map without rooms, for the landmarks of a scan."""
+    """Build a map without rooms, for the landmarks of a scan."""
     nowhere = np.zeros(0, np.int32)
     floor = VoxelGrid.from_cells(np.zeros((0, 3), np.int32), scan.grid.origin, scan.grid.edge, scan.grid.shape)
     tables = np.zeros(0, ROOM_DTYPE), np.zeros(0, EDGE_DTYPE), np.zeros(0, STOREY_DTYPE)
@@ -357,7 +359,7 @@ def compute_probabilities(judged: Sequence[JudgedPose], none: float) -> tuple[Ar
 
 
 def _place_in_building(own: IndexedMap, pose: Sim3, place: Array) -> Array:
-    """(4,) x, y, z m and yaw of the sensor in the frame of the building."""
+    """Return (4,) x, y, z m and yaw of the sensor in the frame of the building."""
     whole = own.pose @ pose
     return np.append(whole.apply(place[None])[0], whole.yaw)
 

@@ -63,7 +63,7 @@ class Memory:
         self._before: dict[tuple[Hashable, ...], Any] = {}  # … between that and the time before
 
     def keep(self, sources: Mapping[str, TopometricMap | str | Path]) -> None:
-        """These maps are asked about from now on; answers that were not asked for since the last time are dropped.
+        """Keep these maps, which are asked about from now on; drop answers that were not asked for since the last time.
 
         Args:
             sources: key -> map or `.tmap` file.
@@ -130,7 +130,8 @@ def _summarise_map(map: TopometricMap) -> MapSummary:
 
 
 def hash_map(map: TopometricMap) -> str:
-    """16 hexadecimal digits of a hash of cells, rooms, free space and landmarks; of a corrected map of its doors, too."""
+    """Compute the 16 hexadecimal digits of a hash of cells, rooms, free space and landmarks; of a corrected map of its doors,
+    too."""
     digest = hashlib.sha256()
     for grid in (map.grid, map.navigable, map.free):
         if grid is not None:
@@ -187,7 +188,7 @@ class Maps:
         return self.memory.get_file(self.keys[k])
 
     def get_prepared(self, k: int) -> Prepared:
-        """Plans, for registration."""
+        """Return plans, for registration."""
         memory, key = self.memory, self.keys[k]
 
         def make() -> Prepared:
@@ -197,7 +198,7 @@ class Maps:
         return memory.get_prepared(key, make)
 
     def answer(self, question: tuple[Hashable, ...], maps: Iterable[int], make: Callable[[], Made]) -> Made:
-        """`Memory.answer` to a question about some of the maps."""
+        """Return `Memory.answer` to a question about some of the maps."""
         return self.memory.answer((*question, *(self.keys[k] for k in maps)), make)
 
     def get_area(self, k: int) -> float:
@@ -213,11 +214,11 @@ class Maps:
         return self.answer(("middle",), (k,), lambda: self.get_prepared(k).middle)
 
     def is_sliced(self, k: int) -> bool:
-        """Is a storey a slice, which has no planes?"""
+        """Return whether a storey is a slice, which has no planes."""
         return self.answer(("sliced",), (k,), lambda: any(v.plan.sliced for v in self.get_prepared(k).storeys))
 
     def has_landmarks(self, k: int) -> bool:
-        """Does it hold landmarks that testify?"""
+        """Return whether it holds landmarks that testify."""
         return self.answer(("landmarks",), (k,), lambda: self.get_prepared(k).has_landmarks)
 
     def get_rows(self, k: int) -> Rows:
@@ -244,7 +245,7 @@ class MapFiles(Mapping[int, TopometricMap]):
 def bend_maps(
     maps: Maps, poses: Mapping[int, Sim3], pairs: Sequence[tuple[int, int]], scaled: bool
 ) -> tuple[dict[int, Sim3], dict[int, Deformation], str]:
-    """`bend_together` of some maps, by their numbers."""
+    """Run `bend_together` on some maps, by their numbers."""
     names = sorted(poses)
     places = tuple((names.index(i), names.index(j)) for i, j in pairs)
 

@@ -155,7 +155,8 @@ def find_rooms_near(map: TopometricMap, at: Array) -> tuple[int, ...]:
 
 
 def serialise_contradiction(c: Contradiction) -> dict[str, Any]:
-    """A contradiction as plain values: numbers of both maps, rooms of each, its middle, m, and the area of the walls, m2."""
+    """Return a contradiction as plain values: numbers of both maps, rooms of each, its middle, m, and the area of the walls,
+    m2."""
     return {"maps": c.maps, "rooms": c.rooms, "at": [round(v, 2) for v in c.middle], "m2": round(c.area, 2)}
 
 
@@ -200,7 +201,7 @@ def find_hypotheses(
 
 
 def _propose_room_poses(maps: Maps, i: int, j: int, scale: str) -> list[Sim3]:
-    """Poses T_ij of matched rooms."""
+    """Propose the poses T_ij of matched rooms."""
     if maps.get_prepared(j).order < maps.get_prepared(i).order:
         return [pose.inverse() for pose in _propose_room_poses(maps, j, i, scale)]
     a, b = maps[i], maps[j]
@@ -220,7 +221,7 @@ class Checks:
         self._places: dict[tuple[int, int], list[tuple[Sim3, Array]]] = {}
 
     def locate_place(self, i: int, j: int, pose: Sim3) -> Array:
-        """`place` of maps i and j (i < j) under T_ij."""
+        """Return the `place` of maps i and j (i < j) under T_ij."""
 
         def compute() -> Array:
             return locate_place(self.maps.get_prepared(i).storeys, self.maps.get_prepared(j).storeys, pose)
@@ -231,7 +232,7 @@ class Checks:
         return _get_or_compute(self._places, (i, j), pose, self.maps.get_middle(j), make)
 
     def refine_pose(self, i: int, j: int, pose: Sim3) -> Sim3:
-        """T_ij after the fine registration (i < j); as it was where a map is a slice, which has no planes."""
+        """Return T_ij after the fine registration (i < j); as it was where a map is a slice, which has no planes."""
         if self.maps.is_sliced(i) or self.maps.is_sliced(j):
             return pose
 
@@ -275,7 +276,7 @@ class Checks:
         return Check(moved, score_pose(features, conflicts) + landmarks, True, features, conflicts)
 
     def _score_landmarks(self, i: int, j: int, pose: Sim3) -> float:
-        """Log odds of what landmarks say of T_ij, at most as much as walls may say."""
+        """Return the log odds of what landmarks say of T_ij, at most as much as walls may say."""
         if not (self.maps.get_prepared(i).has_landmarks and self.maps.get_prepared(j).has_landmarks):
             return 0.0
         support = score_landmarks(self.maps[i], self.maps[j], pose).support
@@ -295,13 +296,14 @@ def _get_or_compute(
 
 
 def compute_excess_conflict(f: Mapping[str, float]) -> float:
-    """Share of the walls that stand on free floor of the other map, above what true poses have; 0 where it is so little that it
-    may be noise."""
+    """Return the share of the walls that stand on free floor of the other map, above what true poses have; 0 where it is so
+    little that it may be noise."""
     return max(f["conflict_share"] - POSE_USUAL_CONFLICT, 0.0) if f["conflict"] > LEAST_CONFLICT else 0.0
 
 
 def score_pose(f: Mapping[str, float], conflicts: Sequence[Conflict] | None = None) -> float:
-    """Log odds for a pose that other maps propose. Little in common says little: only walls on free floor speak against it.
+    """Return the log odds for a pose that other maps propose. Little in common says little: only walls on free floor speak
+    against it.
 
     Of hypotheses of simulated training pairs, nine in ten of the right ones have a plausibility above -4, one in twenty of the
     wrong ones; walls on free floor are more than `POSE_USUAL_CONFLICT` of the walls in one of twenty right ones, in three of four
@@ -322,7 +324,7 @@ def score_pose(f: Mapping[str, float], conflicts: Sequence[Conflict] | None = No
 
 
 def is_same_pose(p: Sim3, q: Sim3, at: Array, limits: tuple[float, float, float] = DRIFT_LIMITS) -> bool:
-    """Are two poses of a map one, near a point (3,) of it?"""
+    """Return whether two poses of a map are one, near a point (3,) of it."""
     return all(d <= limit for d, limit in zip(pose_difference(p, q, at), limits, strict=True))
 
 

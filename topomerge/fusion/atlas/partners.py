@@ -42,7 +42,8 @@ NAMED_PARTNERS = 2  # that its signs, tags and radio speak of, however it lies
 
 
 def compute_vectors(rows: Rows, turns: int = 0) -> Array:
-    """(R, D), or (R, 4 D) of turned rows, in single precision and of length 1: the rooms of a map that is turned so often."""
+    """Compute (R, D), or (R, 4 D) of turned rows, in single precision and of length 1: the rooms of a map that is turned so
+    often."""
     flat = rows.flatten(turns) if isinstance(rows, TurnedRows) else rows
     out: Array = (flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)).astype(np.float32)
     return out
@@ -54,7 +55,8 @@ def compute_queries(rows: Rows) -> Array:
 
 
 def find_nearest(table: Array, asked: Array, count: int = ROOM_NEIGHBOURS, but: tuple[int, int] = (0, 0)) -> tuple[Array, Array]:
-    """Rows of a table (N, D) that are most alike to each of (Q, D), and their cosines: (Q, n) each, n of count and N the less.
+    """Find the rows of a table (N, D) that are most alike to each of (Q, D), and their cosines: (Q, n) each, n of count and N the
+    less.
 
     Exact, by products of matrices; most alike first, of equal ones the first.
 
@@ -80,7 +82,7 @@ def _search_blocks(table: Array, asked: Array, count: int, but: tuple[int, int])
 
 
 def _find_highest(values: Array, count: int) -> Array:
-    """Places of the highest values of each row, highest first."""
+    """Return the places of the highest values of each row, highest first."""
     if count < values.shape[1]:
         best = np.sort(np.argpartition(-values, count - 1, axis=1)[:, :count], axis=1)
     else:
@@ -111,7 +113,7 @@ def list_owners(counts: Sequence[int]) -> Array:
 
 
 def iter_most_similar(rows: Sequence[Rows], number: int) -> Iterator[tuple[int, ...]]:
-    """For each map those of the others that its rooms look most like, at most `number`, most alike first; exact.
+    """Yield for each map those of the others that its rooms look most like, at most `number`, most alike first; exact.
 
     None for a map without rooms, and none that has no room among the neighbours.
     """
@@ -130,12 +132,13 @@ def iter_most_similar(rows: Sequence[Rows], number: int) -> Iterator[tuple[int, 
 
 
 def build_coarse_key(maps: Maps, i: int, j: int) -> tuple[str, str]:
-    """Under which `Memory.coarse` holds two maps."""
+    """Build the key under which `Memory.coarse` holds two maps."""
     return min(maps.keys[i], maps.keys[j]), max(maps.keys[i], maps.keys[j])
 
 
 def compute_coarse_log_odds(maps: Maps, i: int, j: int, scale: str = "fixed") -> float:
-    """Log odds that the best rigid pose of two maps is right, seen by itself; what is in `Memory.coarse` is not made again.
+    """Compute the log odds that the best rigid pose of two maps is right, seen by itself; what is in `Memory.coarse` is not made
+    again.
 
     Drift lowers them: of a real floor some right pairs have -7, as strangers of few rooms have.
     """
@@ -184,7 +187,7 @@ class PairTask:
 
 @cache
 def _get_memory() -> Memory:
-    """Of this process: a map that comes in many pairs is prepared once."""
+    """Return the memory of this process: a map that comes in many pairs is prepared once."""
     return Memory()
 
 
@@ -202,7 +205,7 @@ def register_pair(task: PairTask) -> tuple[PoseHypothesis, ...]:
 
 
 def start_processes(jobs: int) -> Workers:
-    """So many processes of this machine."""
+    """Start so many processes of this machine."""
     from joblib import Parallel, delayed
 
     def run(work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
@@ -251,8 +254,8 @@ def find_partners(
     end: float = np.inf,
     workers: Workers | None = None,
 ) -> tuple[list[list[int]], bool]:
-    """For each map those that it may be registered with, best first, and whether all was looked at. A map without rooms names the
-    largest ones.
+    """Find for each map those that it may be registered with, best first, and whether all was looked at. A map without rooms
+    names the largest ones.
 
     Args:
         linked: pairs that may be registered however they look.
@@ -281,7 +284,7 @@ def find_partners(
 
 
 def _list_similar_maps(maps: Maps) -> list[list[int]]:
-    """For each map those that its rooms look most like, most alike first; all others where they are few."""
+    """List for each map those that its rooms look most like, most alike first; all others where they are few."""
     count = len(maps)
     if count <= FEW_MAPS:
         return [[m for m in range(count) if m != k] for k in range(count)]
@@ -291,7 +294,7 @@ def _list_similar_maps(maps: Maps) -> list[list[int]]:
 
 
 def _list_named_maps(maps: Maps) -> list[list[int]]:
-    """For each map those that its landmarks speak of most; none where all maps are registered with each other anyway."""
+    """List for each map those that its landmarks speak of most; none where all maps are registered with each other anyway."""
     readings = [k for k in range(len(maps)) if len(maps) > FEW_MAPS and maps.has_landmarks(k)]
     out: list[list[int]] = [[] for _ in range(len(maps))]
     if len(readings) > 1:
@@ -302,8 +305,8 @@ def _list_named_maps(maps: Maps) -> list[list[int]]:
 
 
 def _score_partners(maps: Maps, named: list[list[int]], scale: str, end: float) -> tuple[dict[tuple[int, int], float], bool]:
-    """Log odds of the pairs; those are all, if time allowed and there is a choice. Map by map, so that few are in memory; those
-    that look most alike first, if time may end."""
+    """Return the log odds of the pairs; those are all, if time allowed and there is a choice. Map by map, so that few are in
+    memory; those that look most alike first, if time may end."""
     ranks: dict[tuple[int, int], int] = {}
     for k, of in enumerate(named):
         for place, m in enumerate(of):

@@ -214,7 +214,7 @@ def turn_points(points: Array, yaw: float) -> Array:
 
 
 def _draw_rooms(map: TopometricMap, plans: Sequence[StoreyPlan]) -> Iterable[Array]:
-    """(nx, ny) int16 room of the columns of each plan, -1 none: of the floor that is nearest within `ROOM_REACH`."""
+    """Draw the (nx, ny) int16 room of the columns of each plan, -1 none: of the floor that is nearest within `ROOM_REACH`."""
     floor = map.navigable.compute_centroids()
     level = np.array([plan.floor_guess for plan in plans])
     owner = np.abs(floor[:, 2:] - level).argmin(axis=1) if len(floor) else np.zeros(0, int)
@@ -272,7 +272,7 @@ SHAPES |= {"rooms": (np.int16, 2)}
 
 
 def _check(arrays: Mapping[str, Array], name: str, path: Path | None) -> Array:
-    """An array of a file, if it is what stands there.
+    """Return an array of a file, if it is what stands there.
 
     Raises:
         InputError: it is not.
@@ -331,7 +331,7 @@ class _TurnedQuery:
         self.cache: dict[tuple[int, tuple[int, int]], tuple[Array, Array, Array, float]] = {}
 
     def correlate(self, storey: IndexedStorey) -> list[tuple[float, Sim3]]:
-        """Score, and pose without height, at the best peaks of each likely yaw."""
+        """Return the score, and the pose without height, at the best peaks of each likely yaw."""
         coarse = storey.coarse
         nx, ny = (_find_size(n, self.reach) for n in coarse.walls.shape)
         room = ((0, nx - coarse.walls.shape[0]), (0, ny - coarse.walls.shape[1]))
@@ -361,12 +361,13 @@ class _TurnedQuery:
 
 
 def _find_size(cells: int, reach: float) -> int:
-    """Cells of an image that holds a storey and a scan beside it; few different ones, so that much is shared."""
+    """Return the size, cells, of an image that holds a storey and a scan beside it; few different ones, so that much is
+    shared."""
     return int(fft.next_fast_len(int(np.ceil((cells + reach / COARSE_CELL) / 16)) * 16, real=True))
 
 
 def _find_peaks(image: Array, shape: tuple[int, ...]) -> list[tuple[float, int, int]]:
-    """Score and shift, in cells, of the highest peaks; a shift beyond the storey is one back."""
+    """Return the score and shift, in cells, of the highest peaks; a shift beyond the storey is one back."""
     tops = np.where(image >= ndimage.maximum_filter(image, 3, mode="wrap"), image, -np.inf).ravel()
     best = np.argpartition(-tops, PEAKS)[:PEAKS]
     peaks = []
@@ -390,7 +391,7 @@ def score_roughly(fields: PlanFields, query: PlanFields, poses: Sequence[PoseHyp
 
 
 def _measure_share(points: Array, mask: Array, fields: PlanFields, pose: Sim3) -> float:
-    """Share of points (n, 2) of a scan that lie on columns of a mask."""
+    """Measure the share of points (n, 2) of a scan that lie on columns of a mask."""
     at = turn_points(points, pose.yaw) + pose.translation[:2]
     cells = np.floor((at - fields.plan.origin) / fields.plan.edge).astype(np.int64)
     cells = cells[((cells >= 0) & (cells < mask.shape)).all(axis=1)]

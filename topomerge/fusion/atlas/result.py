@@ -66,7 +66,7 @@ class AtlasResult:
         return next(n for n, members in enumerate(self.components) if k in members)
 
     def get_probability(self, component: int) -> float:
-        """Of the weakest link of a component; 0 for a map alone."""
+        """Return the probability of the weakest link of a component; 0 for a map alone."""
         probabilities = [link.probability for link in self.links if link.maps[0] in self.components[component]]
         return min(probabilities, default=0.0)
 
@@ -126,7 +126,7 @@ def _iter_sentences(atlas: AtlasResult) -> Iterator[str]:
 
 
 def _format_rooms(rooms: Sequence[int], name: str) -> str:
-    """Rooms of a map in words."""
+    """Return the rooms of a map in words."""
     if not rooms:
         return f"no room of {name}"
     return f"room{'s' * (len(rooms) > 1)} {', '.join(map(str, rooms))} of {name}"

@@ -44,7 +44,7 @@ ADDING, SEARCHING = 64, 128  # rooms looked at on the way when one is added and 
 
 
 def check_graph(graph: bytes, count: int, size: int, links: int) -> None:
-    """Does a graph hold vectors (count, size), and does every link lead to one of them?
+    """Check that a graph holds vectors (count, size), and that every link leads to one of them.
 
     Args:
         links: most of a room at each level; at the lowest twice as many.
@@ -85,7 +85,7 @@ def check_graph(graph: bytes, count: int, size: int, links: int) -> None:
 
 
 def _check_links(whole: Array, places: Array, most: int, present: Array) -> None:
-    """Lists at these bytes, each the number of links and then so many rooms, which must be `present` at this level."""
+    """Check the lists at these bytes, each the number of links and then so many rooms, which must be `present` at this level."""
     for k in range(0, len(places), LISTS_AT_ONCE):
         lists = _read_integers(whole, places[k : k + LISTS_AT_ONCE], 1 + most)
         to = lists[:, 1:][np.arange(most) < lists[:, :1]]
@@ -173,14 +173,14 @@ class RoomRows:
 
 
 def _list_array_names(entries: Iterable[Entry]) -> set[str]:
-    """Names of the arrays of some maps."""
+    """List the names of the arrays of some maps."""
     return {name for e in entries for name in (e.key, f"{e.key}.places")}
 
 
 def check_made_for(
     path: Path, arrays: Mapping[str, Array], signature: str, keys: Collection[str], written: Iterable[str]
 ) -> None:
-    """Is a file of this embedder, and for some of the maps with these keys?
+    """Check that a file is of this embedder, and for some of the maps with these keys.
 
     Args:
         arrays: of the file, `embedder` among them.
@@ -247,7 +247,7 @@ class RoomsIndex:
         self.keys, self.counts = [*self.keys, *keys], [*self.counts, *counts]
 
     def find_nearest(self, asked: Array, count: int = ROOM_NEIGHBOURS) -> tuple[Array, Array]:
-        """`neighbours.nearest` by the index: most of them, and cosines to about .01."""
+        """Find the rows of `neighbours.nearest` by the index: most of them, and cosines to about .01."""
         hits = self._graph.search(
             self._quantise(np.concatenate([asked, asked[:1]])), count
         )  # one alone has another kind of answer

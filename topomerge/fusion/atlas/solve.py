@@ -115,7 +115,7 @@ def solve(
     memory: Memory | None = None,
     schedule: SolvingSchedule | None = None,
 ) -> AtlasResult:
-    """As `atlas`, of any number of maps, one or none, too.
+    """Solve, as `atlas`, for any number of maps, one or none, too.
 
     Args:
         names: of the maps, for messages; their sources if None.
@@ -151,7 +151,7 @@ def _check_maps(
     scale: str,
     memory: Memory,
 ) -> tuple[list[str], list[str], list[str]]:
-    """Names, keys and warnings of the maps, which are looked at one after the other."""
+    """Return the names, keys and warnings of the maps, which are looked at one after the other."""
     map_names: list[str] = []
     map_keys: list[str] = []
     warnings: list[str] = []
@@ -212,7 +212,8 @@ class _Explorer:
         self.rounds = 0  # of assembling since then
 
     def explore(self, end: float = np.inf, workers: Workers | None = None) -> Assembly:
-        """The assembly that more registrations would not change; after the end of the time that of those that were made."""
+        """Return the assembly that more registrations would not change; after the end of the time, that of those that were
+        made."""
         self.partners, examined = find_partners(self.maps, self.linked, self.scale, (time.perf_counter() + end) / 2, workers)
         self.tried.update({pair: self._register(*pair) for pair in self.linked if self._is_registered(*pair)})
         while True:
@@ -234,7 +235,8 @@ class _Explorer:
                     self.tried[i, j] = self._register(i, j)
 
     def _iter_next_pairs(self, assembly: Assembly, counts: Array, late: bool = False) -> Iterator[tuple[int, int]]:
-        """For each map its most promising partner in another component, and where it is not surely connected one in its own.
+        """Yield for each map its most promising partner in another component, and where it is not surely connected one in its
+        own.
 
         Args:
             counts: pairs that were tried, of each map.
@@ -278,7 +280,7 @@ class _Explorer:
 def _build_result(
     assembly: Assembly, explorer: _Explorer, names: Sequence[str], order: Sequence[int], rigid: bool, fine: bool = True
 ) -> AtlasResult:
-    """All by the places of the maps as they were given, in the frames of the first ones."""
+    """Return all by the places of the maps as they were given, in the frames of the first ones."""
     transforms: dict[int, Sim3] = {}
     residuals: dict[int, float] = {}
     bends: dict[int, Deformation] = {}
@@ -322,7 +324,7 @@ def _build_result(
 def _iter_contradictions(
     explorer: _Explorer, poses: Mapping[int, Sim3], order: Sequence[int], back: Sim3
 ) -> Iterator[Contradiction]:
-    """Where maps of a component contradict each other, by the places of the maps as they were given.
+    """Yield where maps of a component contradict each other, by the places of the maps as they were given.
 
     Args:
         poses: of the maps, in a frame that `back` takes to that of the component.
@@ -340,7 +342,7 @@ def _iter_contradictions(
 
 
 def _reorder_links(links: Iterable[Link], order: Sequence[int]) -> tuple[Link, ...]:
-    """Links by the places of the maps as they were given, the lower one first."""
+    """Return the links by the places of the maps as they were given, the lower one first."""
     return tuple(sorted((_renumber_link(link, order) for link in links), key=lambda link: link.maps))
 
 

@@ -91,7 +91,7 @@ def serialise_component(atlas: AtlasResult, stored: StoredAtlas, n: int) -> dict
 
 
 def serialise_atlas(atlas: AtlasResult, stored: StoredAtlas, components: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """atlas.json, see docs/outputs.md."""
+    """Return atlas.json, see docs/outputs.md."""
     into = {k: members[0] for members in atlas.components for k in members}
     moved = sorted(k for k, first in into.items() if k != first or atlas.transforms[k] != Sim3())
     lying = {
@@ -284,7 +284,7 @@ def build_entry(name: str, map: TopometricMap, stored: StoredAtlas) -> Entry:
 
 
 def _follow_journal(folder: Path, entry: Entry) -> Entry:
-    """The entry of a map with the corrections that its journal has by now."""
+    """Return the entry of a map with the corrections that its journal has by now."""
     version = read_journal(find_journal(folder / entry.file)).version
     if version == entry.edits:
         return entry
@@ -380,7 +380,8 @@ def _write(path: Path, text: str) -> None:
 def _write_joined_maps(
     atlas: AtlasResult, components: Sequence[dict[str, Any]], before: StoredAtlas, place: Path
 ) -> Mapping[int, TopometricMap]:
-    """The joined maps, written one after the other, copied where the atlas had the same before; read when they are asked for."""
+    """Write the joined maps, one after the other; those are copied where the atlas had the same before; read when they are asked
+    for."""
     files = {}
     for n, component in enumerate(components):
         if len(component["maps"]) < 2:
@@ -403,7 +404,7 @@ def _write_joined_maps(
 def _write_pages(
     atlas: AtlasResult, components: Sequence[dict[str, Any]], before: StoredAtlas, place: Path, title: str, page: Report
 ) -> dict[int, str]:
-    """Of more joined maps than one page shows, or larger ones, the pages of each, written like the maps."""
+    """Write, of more joined maps than one page shows, or larger ones, the pages of each, like the maps."""
     joined = [n for n, component in enumerate(components) if "map" in component]
     if len(joined) <= JOINED_ON_ONE_PAGE and not any("tiles" in components[n] for n in joined):
         return {}
@@ -432,6 +433,6 @@ def _copy_component(
 
 
 def _iter_stamps(stamp: str, components: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str]]:
-    """By what each page is told: name, stamp."""
+    """Yield by what each page is told: name, stamp."""
     yield "stamp", stamp
     yield from ((f"stamp-{n}", component["shown"]) for n, component in enumerate(components) if "shown" in component)

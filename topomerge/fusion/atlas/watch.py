@@ -61,7 +61,7 @@ class Source:
 
 
 def read_sources(folder: Path) -> dict[str, Source]:
-    """Path -> what it gave; nothing where the file is missing, damaged or of another format."""
+    """Map each path to what it gave; nothing where the file is missing, damaged or of another format."""
     try:
         listing = json.loads((folder / SOURCES_FILE).read_text(encoding="utf-8"))
         if listing["format"] != SOURCES_FORMAT:
@@ -94,8 +94,8 @@ def list_simulation_files(folder: Path) -> tuple[str, ...]:
 
 
 def compute_stamp(path: Path, options: str) -> str:
-    """Hash of the names, sizes and times of change of a file, or of all files of a folder, and of the options that it is read
-    with; empty where it is gone."""
+    """Compute a hash of the names, sizes and times of change of a file, or of all files of a folder, and of the options that it
+    is read with; empty where it is gone."""
     try:
         of = [(_name_file(p, path), p.stat().st_size, p.stat().st_mtime_ns) for p in files_of(path)]
     except OSError:
@@ -151,8 +151,8 @@ class LongerVersion:
 
 
 def find_longer_version(name: str, old: TopometricMap, new: TopometricMap, stored: StoredAtlas) -> LongerVersion | None:
-    """Where a new map lies in the one before, if it is a longer version of it: if their registration is believed as a link of the
-    atlas would be, and the new map has most rooms of the one before.
+    """Return where a new map lies in the one before, if it is a longer version of it: if their registration is believed as a link
+    of the atlas would be, and the new map has most rooms of the one before.
 
     Args:
         name: of the old map in the atlas.
@@ -369,7 +369,7 @@ class _Plan:
             self.watch.tell(line, is_warning)
 
     def _add_map(self, requested: Change, reading: _ReadFile, map: TopometricMap, before: Source | None) -> tuple[Change, Source]:
-        """The change with one more map."""
+        """Return the change with one more map."""
         stored, name = requested.stored, reading.path.name
         entry = build_entry(reading.path.stem, map, stored)
         same = stored.find_name(entry.key)
@@ -446,7 +446,7 @@ def iter_changes(after: Mapping[str, int], before: Mapping[str, int]) -> Iterato
 
 
 def _iter_groups(names: list[str], component: Mapping[str, int]) -> Iterator[list[str]]:
-    """Names by their component."""
+    """Yield names by their component."""
     for n in dict.fromkeys(component[name] for name in names):
         yield [name for name in names if component[name] == n]
 

@@ -118,7 +118,7 @@ def _iter_room_nodes(map: TopometricMap) -> Iterator[Json]:
 
 
 def _iter_room_edges(map: TopometricMap) -> Iterator[Json]:
-    """Rooms to their building, and to each other."""
+    """Yield the edges from rooms to their building, and to each other."""
     for r in range(len(map.rooms)):
         yield _build_edge(encode_symbol("B", 0), encode_symbol("R", r))
     for (a, b), connections in _group_edges_by_pair(map.edges).items():
@@ -126,7 +126,7 @@ def _iter_room_edges(map: TopometricMap) -> Iterator[Json]:
 
 
 def _group_edges_by_pair(table: Array) -> dict[tuple[int, int], list[Any]]:
-    """The rows of an edge table by the pair that they join, in order: the library refuses a second edge of a pair."""
+    """Group the rows of an edge table by the pair that they join, in order: the library refuses a second edge of a pair."""
     connections: dict[tuple[int, int], list[Any]] = {}
     for way in table:
         a, b = sorted(way["rooms"].tolist())
@@ -136,14 +136,15 @@ def _group_edges_by_pair(table: Array) -> dict[tuple[int, int], list[Any]]:
 
 
 def _describe_edges(edges: list[Any], kind: str = "") -> Json:
-    """Kind and width (m) of the widest way, then each way with its centre (m); a given kind stands for that of all."""
+    """Describe the kind and width (m) of the widest way, then each way with its centre (m); a given kind stands for that of
+    all."""
     listed = [{"kind": kind or str(w["kind"]), "width": float(w["width"]), "centre": w["centre"].tolist()} for w in edges]
     widest = max(listed, key=lambda way: way["width"])
     return {"kind": widest["kind"], "width": widest["width"], "ways": listed}
 
 
 def _iter_places(map: TopometricMap) -> Iterator[tuple[Json, list[Json]]]:
-    """Each place with the edges that lead to it: areas first, then the ways between rooms."""
+    """Yield each place with the edges that lead to it: areas first, then the ways between rooms."""
     colours, floors = assign_room_colours(map), build_floor_polygons(map)
     owner, centres = _compute_area_centres(map, floors)
     narrows: dict[int, list[Json]] = {}
@@ -170,7 +171,7 @@ def _iter_places(map: TopometricMap) -> Iterator[tuple[Json, list[Json]]]:
 
 
 def _iter_objects(map: TopometricMap) -> Iterator[tuple[Json, list[Json]]]:
-    """Each object, sign and tag whose place is known, with the edge to its parent."""
+    """Yield each object, sign and tag whose place is known, with the edge to its parent."""
     table = map.landmarks.table
     known = np.isfinite(table["position"]).all(axis=1) & map.landmarks.is_kind("object", "text", "tag")
     owner, centres = _compute_area_centres(map, build_floor_polygons(map)) if known.any() else (np.zeros(0), np.zeros((0, 3)))

@@ -139,7 +139,7 @@ def _iter_windows(map: TopometricMap, place: Place, storey: int | None) -> Itera
 
 
 def _iter_landmarks(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
-    """A point each; its `position` stays in metres. Readings of radio are as many as points of a cloud and are left out."""
+    """Yield a point each; its `position` stays in metres. Readings of radio are as many as points of a cloud and are left out."""
     for k, row in enumerate(serialise_landmarks(map.landmarks.select(~map.landmarks.is_kind("radio", "pressure")))):
         if storey in (None, row["storey"]):
             at = None if row["position"] is None else place(np.array([row["position"]]))[0]
@@ -186,7 +186,7 @@ def _iter_openings(map: TopometricMap, place: Place, storey: int | None) -> Iter
 
 
 def _list_side_rooms(wall: Any) -> list[int | None]:
-    """Rooms on both sides of a wall or a window; null where none was seen."""
+    """List the rooms on both sides of a wall or a window; null where none was seen."""
     return [r if r >= 0 else None for r in wall["rooms"].tolist()]
 
 
@@ -218,7 +218,8 @@ def _check_near(map: TopometricMap) -> None:
 
 
 def _build_geodetic_transform(origin: Origin) -> Place:
-    """Longitude and latitude of points in the plane that touches the ellipsoid at the origin; their z stays."""
+    """Build the transform to the longitude and latitude of points in the plane that touches the ellipsoid at the origin; their z
+    stays."""
     lat, lon, heading = (math.radians(v) for v in (origin.latitude, origin.longitude, origin.heading))
     up = np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
     east = np.array([-math.sin(lon), math.cos(lon), 0.0])

@@ -74,7 +74,7 @@ def _read_row(row: Any, *left_out: str) -> dict[str, Any]:
 
 
 def _rename_position(values: dict[str, Any], name: str) -> dict[str, Any]:
-    """The point `name_x` … as x, y and z, which programs take as a position."""
+    """Name the point `name_x` … as x, y and z, which programs take as a position."""
     return {key.removeprefix(f"{name}_"): value for key, value in values.items()}
 
 

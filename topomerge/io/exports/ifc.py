@@ -274,7 +274,7 @@ class _BuildingModel(Model):
         return element
 
     def add_opening(self, opening: Any, wall: Any, voided: Any, door: Any) -> None:
-        """An opening in a wall; a door fills it."""
+        """Add an opening to a wall, which a door fills."""
         low = float(opening["centre"][2])
         span = low, float(opening["height"]) or IFC_LINTEL
         element = self._cut_wall(f"opening {opening['edge']}", build_wall_polygon(wall, opening, CUT_THROUGH), wall, span, voided)
@@ -284,14 +284,15 @@ class _BuildingModel(Model):
             )
 
     def add_window_opening(self, k: int, pane: Any, wall: Any, voided: Any, window: Any) -> None:
-        """The hole in a wall that a window fills."""
+        """Add the hole in a wall that a window fills."""
         low = float(pane["centre"][2] + pane["sill"])
         span = low, float(pane["head"] - pane["sill"])
         element = self._cut_wall(f"pane {k}", build_wall_polygon(wall, pane, CUT_THROUGH), wall, span, voided)
         self.create_rooted("IfcRelFillsElement", element.GlobalId, RelatingOpeningElement=element, RelatedBuildingElement=window)
 
     def _cut_wall(self, name: str, outline: Any, wall: Any, span: tuple[float, float], voided: Any) -> Any:
-        """A hole in a wall; `span`: where it begins, m in the input's frame, and its height, at most up to the wall's top."""
+        """Cut a hole into a wall; `span`: where it begins, m in the input's frame, and its height, at most up to the wall's
+        top."""
         low, height = span
         storey_height = float(self.map.storeys["floor"][wall["storey"]])
         top = min(low + height, float(wall["high"]) + CUT_THROUGH)
@@ -321,7 +322,7 @@ class _BuildingModel(Model):
         return self.create_rooted("IfcDoor", f"door {i}", ObjectPlacement=at, Representation=body, **attributes)
 
     def add_edge_properties(self, i: int, edge: Any, element: Any) -> None:
-        """How likely a door, an opening or a flight is one, and whether one could walk through."""
+        """Tell how likely a door, an opening or a flight is one, and whether one could walk through."""
         properties = [self._create_property("Confidence", "IfcReal", float(edge["confidence"]))]
         properties += [self._create_property(name, "IfcBoolean", bool(edge[name.lower()])) for name in ("Open", "Half")]
         self._define(element, self._set("IfcPropertySet", f"Topomerge_{str(edge['kind']).title()}", i, HasProperties=properties))
@@ -354,7 +355,7 @@ class _BuildingModel(Model):
         return element
 
     def add_flight(self, i: int, edge: Any, storey: Any) -> Any:
-        """Stairs or a ramp, as a sloping plate."""
+        """Add stairs or a ramp, as a sloping plate."""
         low, high = (edge[end] - self.shift - (0, 0, storey.Elevation) for end in ("lower", "upper"))
         views = [
             self.create_representation(
@@ -374,7 +375,7 @@ class _BuildingModel(Model):
         )
 
     def _create_plate(self, low: Array, high: Array, run: float, width: float) -> Any:
-        """A parallelogram that stands upright along the flight, drawn out sideways."""
+        """Create a parallelogram that stands upright along the flight, drawn out sideways."""
         ahead = (high - low)[:2] / run
         aside = np.array([ahead[1], -ahead[0]])
         x, y = low[:2] - aside * width / 2
@@ -389,7 +390,7 @@ class _BuildingModel(Model):
         return self.create("IfcExtrudedAreaSolid", **swept)
 
     def list_annotated(self, s: int) -> list[int]:
-        """Signs, tags and objects of a storey whose place is known."""
+        """List the signs, tags and objects of a storey whose place is known."""
         landmarks = self.map.landmarks
         known = np.isfinite(landmarks.table["position"]).all(axis=1) & (landmarks.table["storey"] == s)
         return np.flatnonzero(known & landmarks.is_kind("text", "tag", "object")).tolist()  # type: ignore[no-any-return]
@@ -403,7 +404,7 @@ class _BuildingModel(Model):
         return note
 
     def add_boundary(self, i: int | str, space: Any, element: Any, side: str = "INTERNAL") -> None:
-        """A space is bounded by an element, which leads out of it, to a space on the other side that is INTERNAL or EXTERNAL."""
+        """Bound a space by an element, which leads out of it, to a space on the other side that is INTERNAL or EXTERNAL."""
         attributes = {"RelatingSpace": space, "RelatedBuildingElement": element, "InternalOrExternalBoundary": side}
         kind = "VIRTUAL" if element.is_a("IfcVirtualElement") else "PHYSICAL"
         self.create_rooted("IfcRelSpaceBoundary", f"{i} {space.GlobalId}", PhysicalOrVirtualBoundary=kind, **attributes)

@@ -89,7 +89,7 @@ def _add_link(parent: Any, name: str, id: str) -> None:
 
 
 def _add_description(parent: Any, name: str, **fields: Any) -> None:
-    """Description and name. Viewers read the first as key="value" pairs."""
+    """Add description and name. Viewers read the first as key="value" pairs."""
     if fields:
         _add_element(parent, "description", space=GML).text = ":".join(f'{key}="{value}"' for key, value in fields.items())
     _add_element(parent, "name", space=GML).text = replace_forbidden(name)
@@ -144,7 +144,7 @@ def _add_wall(member: Any, id: str, wall: Any, plan: shapely.Polygon, low: float
 
 
 def _build_wall_bodies(structure: PlanStructure) -> list[list[tuple[shapely.Polygon, float, float]]]:
-    """Of each wall its prisms: plan, foot and top, m. No two of a storey cover each other, and none a room."""
+    """Build of each wall its prisms: plan, foot and top, m. No two of a storey cover each other, and none a room."""
     bodies = []
     tree, rooms = (
         shapely.STRtree(shapes := [build_wall_polygon(wall) for wall in structure.walls]),
@@ -171,7 +171,7 @@ def _split_polygons(shape: Any) -> list[shapely.Polygon]:
 
 
 def _iter_faces(floor: shapely.Polygon, low: float, high: float) -> Iterator[list[Array]]:
-    """The faces of a prism, each a list of closed rings (k, 3), seen counter-clockwise from outside."""
+    """Yield the faces of a prism, each a list of closed rings (k, 3), seen counter-clockwise from outside."""
     rings = [np.asarray(ring.coords)[:, :2] for ring in (floor.exterior, *floor.interiors)]  # the inner ones run clockwise
     yield [_lift_ring(ring[::-1], low) for ring in rings]
     yield [_lift_ring(ring, high) for ring in rings]
@@ -237,7 +237,7 @@ def _add_graph(root: Any, map: TopometricMap, points: list[Array]) -> None:
 
 
 def _add_landmarks(layers: Any, map: TopometricMap) -> None:
-    """The layer of landmarks; a layer without states is none."""
+    """Add the layer of landmarks; a layer without states is none."""
     rows = serialise_landmarks(map.landmarks.select(~map.landmarks.is_kind("radio", "pressure")))
     if not rows:
         return
@@ -255,7 +255,7 @@ def _add_landmarks(layers: Any, map: TopometricMap) -> None:
 
 
 def _add_transition(member: Any, i: int, edge: Any, points: list[Array]) -> None:
-    """The way from room to room through the middle of a door or along a flight; its weight is its length, m."""
+    """Add the way from room to room through the middle of a door or along a flight; its weight is its length, m."""
     a, b = edge["rooms"].tolist()
     flight = [edge["lower"], edge["upper"]] if points[a][2] <= points[b][2] else [edge["upper"], edge["lower"]]
     way = np.array([points[a], *(flight if is_flight(edge) else [edge["centre"]]), points[b]])

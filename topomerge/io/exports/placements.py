@@ -121,7 +121,7 @@ def _parse_frame_pose(frames: tuple[str, str], entry: Mapping[str, Any], levelle
 
 
 def _choose_frame_names(sources: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Names of frames, no two alike: letters, digits, `_` and `/`, as ROS has them."""
+    """Choose the names of frames, no two alike: letters, digits, `_` and `/`, as ROS has them."""
     if names and len(names) != len(sources):
         raise InputError(
             f"--frames: gives {len(names)} names, but there are {len(sources)} maps; give one for each, in their order"

@@ -146,7 +146,7 @@ def _write(text: str, path: Path) -> None:
 
 
 def _dump(value: Any) -> str:
-    """A value as JSON, which YAML reads as its own in one line."""
+    """Return a value as JSON, which YAML reads as its own in one line."""
     return json.dumps(value, ensure_ascii=False, allow_nan=False)
 
 

@@ -83,7 +83,7 @@ def rasterize_occupancy(map: TopometricMap, storey: int) -> Occupancy:
 
 
 def _find_floor_cells(map: TopometricMap, storey: int) -> Array:
-    """Rows of the navigable cells of a storey: of its rooms, and those of no room that are nearest to its floor."""
+    """Return the rows of the navigable cells of a storey: of its rooms, and those of no room that are nearest to its floor."""
     label = map.navigable_room
     of = np.full(len(label), -1)
     inside = label >= 0
@@ -195,7 +195,7 @@ def plan_storey_route(map: TopometricMap, grid: Occupancy, storey: int, first: i
 
 
 def _add_room(route: Route, map: TopometricMap, grid: Occupancy, clear: Array, r: int, doors: dict[int, int]) -> None:
-    """The middle of a room, its doors and the ways between them."""
+    """Add the middle of a room, its doors and the ways between them."""
     edges = [(int(i), map.edges[i]) for i in np.flatnonzero((map.edges["rooms"] == r).any(axis=1))]
     inside = grid.free & (grid.room == r)
     if not inside.any():
@@ -253,7 +253,7 @@ def _find_exit_pixel(reached: Array, grid: Occupancy, point: Array, out: Array) 
 
 
 def _find_middle(inside: Array, clear: Array) -> Pixel:
-    """Of the pixels with most space around them the nearest to the middle of the room."""
+    """Return, of the pixels with most space around them, the nearest to the middle of the room."""
     space = np.where(inside, clear, -1.0)
     options = np.argwhere(space >= 0.85 * space.max())
     middle = np.argwhere(inside).mean(axis=0)
@@ -293,7 +293,7 @@ def _add_tree(
     root: Pixel,
     middle: int,
 ) -> None:
-    """Ways from the root to all leaves (pixel -> node), with a node at every fork and bend."""
+    """Add the ways from the root to all leaves (pixel -> node), with a node at every fork and bend."""
     if root in leaves:
         route.links.append((middle, leaves[root]))
     nodes = {**leaves, root: middle}
@@ -323,7 +323,7 @@ def _add_chain(route: Route, grid: Occupancy, mask: Array, clear: Array, chain: 
 
 
 def _compute_predecessors(mask: Array, clear: Array, size: float, root: Pixel) -> dict[Pixel, Pixel]:
-    """Pixel -> the next one on the way to the root, for all pixels of the mask that are joined to it."""
+    """Map each pixel to the next one on the way to the root, for all pixels of the mask that are joined to it."""
     number = np.full(np.add(mask.shape, 2), -1)
     pixels = np.argwhere(mask)
     number[tuple((pixels + 1).T)] = np.arange(len(pixels))
@@ -344,7 +344,8 @@ def _compute_predecessors(mask: Array, clear: Array, size: float, root: Pixel) -
 
 
 def _simplify_chain(chain: Array, mask: Array, clear: Array, give: float) -> list[int]:
-    """Rows of a chain of pixels between which straight ways keep as much space (give or take, m) as the chain does, or AWAY."""
+    """Return the rows of a chain of pixels between which straight ways keep as much space (give or take, m) as the chain does, or
+    AWAY."""
     turns = [0]
     ahead = [len(chain) - 1]
     while ahead:
@@ -423,7 +424,7 @@ def _prepare_images(folder: Path, name: str, grid: Occupancy) -> list[tuple[Path
 
 
 def _build_keepout(map: TopometricMap, grid: Occupancy) -> Occupancy:
-    """Occupied: the floor of rooms that are probably outside; everything else is free."""
+    """Build a map in which the floor of rooms that are probably outside is occupied; everything else is free."""
     outside = np.append(map.rooms["outside"] >= LIKELY_OUTSIDE, False)[grid.room]  # room -1: the last one
     return replace(grid, free=~outside, occupied=outside)
 

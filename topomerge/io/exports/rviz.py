@@ -83,7 +83,8 @@ def _iter_topics(map: TopometricMap, markers: _MarkerFactory) -> Iterator[tuple[
 
 
 def _build_latched_qos() -> Any:
-    """Reliable and transient local: who comes late gets the newest message, as of a latched topic."""
+    """Build the quality of service that is reliable and transient local: who comes late gets the newest message, as of a latched
+    topic."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
     never = QosTime(9223372036, 854775807)

@@ -47,7 +47,7 @@ def join(sources: Sequence[Source], target: Path, doubt: Doubt) -> Tally:
 
 
 def _save_ply(source: Source, target: Path) -> int:
-    """Vertices with all their properties; faces and other elements stay to the byte."""
+    """Write the vertices with all their properties; faces and other elements stay to the byte."""
     path = source.path
     header = ply.read_header(path)
     vertex = header.find("vertex")
@@ -68,7 +68,7 @@ def _save_ply(source: Source, target: Path) -> int:
 
 
 def _save_pcd(source: Source, target: Path) -> int:
-    """Points with all their fields, and the sensor's viewpoint."""
+    """Write the points with all their fields, and the sensor's viewpoint."""
     path = source.path
     header = pcd.read_header(path)
     if header.kind != "binary" or not {"x", "y", "z"} <= set(header.dtype.names or ()):

@@ -160,7 +160,7 @@ def _encode_pose(pose: Array) -> bytes:
 
 
 def _change(data: bytes, changes: Mapping[int, Change]) -> bytes:
-    """A message in which submessages are changed; others stay as they are."""
+    """Return a message in which submessages are changed; others stay as they are."""
     fields: list[Field] = [
         (number, kind, changes[number](value) if kind == BYTES and number in changes and isinstance(value, bytes) else value)
         for number, kind, value in parse_message(data)
@@ -169,7 +169,7 @@ def _change(data: bytes, changes: Mapping[int, Change]) -> bytes:
 
 
 def _renumber(data: bytes, field: int, first: int) -> bytes:
-    """A message whose number of a trajectory is moved up; 0 is not written in Protocol Buffers."""
+    """Return a message whose number of a trajectory is moved up; 0 is not written in Protocol Buffers."""
     if not first:
         return data
     fields = parse_message(data)
@@ -182,7 +182,7 @@ def _move_pose(data: bytes, motion: Motion) -> bytes:
 
 
 def _join_graphs(states: Sequence[_State], doubt: Doubt) -> tuple[bytes, int]:
-    """The pose graph of all, and how many constraints join them."""
+    """Return the pose graph of all, and how many constraints join them."""
     parts, seen = [], set[str]()
     nodes: list[list[Key]] = []
     places: list[Array] = []
@@ -245,7 +245,7 @@ def _encode_constraint(submap: tuple[int, Key], start: Array, node: tuple[int, K
 
 
 def _move_options(state: _State) -> bytes:
-    """Options of the trajectories; where one began in another one, that has another number now."""
+    """Return the options of the trajectories; where one began in another one, that has another number now."""
 
     def renumber(data: bytes) -> bytes:
         return _renumber(data, 2, state.first)

@@ -118,7 +118,8 @@ def join(sources: Sequence[Source], target: Path, doubt: Doubt) -> Tally:
 
 
 def _read_placed(base: sqlite3.Connection, newest: _Session) -> list[int]:
-    """Numbers of the nodes and, below 0, tags that have optimised poses in the joined database; older ones hold none."""
+    """Return the numbers of the nodes and, below 0, tags that have optimised poses in the joined database; older ones hold
+    none."""
     row = base.execute("SELECT opt_ids FROM Admin").fetchone() if newest.version >= OPTIMISED_SINCE else None
     ids: list[int] = decode_matrix(row[0], "opt_ids").ravel().tolist() if row is not None and row[0] else []
     return ids
@@ -155,7 +156,7 @@ def _read_session(source: Source) -> _Session:
 
 
 def _read_columns(path: Path, base: sqlite3.Connection) -> dict[str, dict[str, tuple[str, bool, bool]]]:
-    """Type, is it needed, and is it the key, of each column of each table that RTAB-Map has."""
+    """Return the type, whether it is needed, and whether it is the key, of each column of each table that RTAB-Map has."""
     found: dict[str, dict[str, tuple[str, bool, bool]]] = {}
     for name, sql in base.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'").fetchall():
         if name not in TABLES:
@@ -245,7 +246,7 @@ def _get_most(base: sqlite3.Connection, schema: str, kind: str) -> int:
 
 
 def _renumber_tags(session: _Session, placed: dict[int, Array], joined: dict[int, Array]) -> tuple[dict[int, int], list[str]]:
-    """New numbers of tags that lie elsewhere in the sessions before, where they are other ones."""
+    """Return new numbers of tags that lie elsewhere in the sessions before, where they are other ones."""
     reported: list[str] = []
     fresh: dict[int, int] = {}
     for tag in sorted((k for k in placed if k < 0 and k in joined), reverse=True):
@@ -268,7 +269,7 @@ def _copy_table(base: sqlite3.Connection, name: str, session: _Session, steps: d
 
 
 def _write_value(base: sqlite3.Connection, table: str, column: str, steps: dict[str, Any], tags: dict[int, int]) -> str:
-    """The expression of a column of the source in the joined table."""
+    """Return the expression of a column of the source in the joined table."""
     kind = TABLES[table].get(column)
     if kind == LABEL:  # two nodes of one name would break the index
         ending = _choose_ending(base)
@@ -293,7 +294,8 @@ def _choose_ending(base: sqlite3.Connection) -> str:
 
 
 def _copy_admin(base: sqlite3.Connection, session: _Session) -> None:
-    """The version and the preview; all that is drawn of one session's optimised graph is left out: RTAB-Map draws it again."""
+    """Copy the version and the preview; all that is drawn of one session's optimised graph is left out: RTAB-Map draws it
+    again."""
     known = {row[1] for row in base.execute("PRAGMA main.table_info(Admin)")}
     columns = [c for c in ("version", "preview_image") if c in known and c in session.tables["Admin"]]
     base.execute(f"INSERT INTO main.Admin ({', '.join(columns)}) SELECT {', '.join(columns)} FROM source.Admin LIMIT 1")
@@ -325,7 +327,7 @@ def _insert_link(base: sqlite3.Connection, newest: _Session, ends: tuple[int, in
 
 
 def _finish(base: sqlite3.Connection, newest: _Session, joined: dict[int, Array]) -> None:
-    """The optimised poses of all, one state of the memory, indexes, and the triggers that date what is added later."""
+    """Write the optimised poses of all, one state of the memory, indexes, and the triggers that date what is added later."""
     version = ".".join(map(str, newest.version))
     base.execute("UPDATE Admin SET version = ?", (version,))
     if newest.version >= OPTIMISED_SINCE and joined:

@@ -61,7 +61,7 @@ class _Graph:
     edges: dict[tuple[int, int], Json] = field(default_factory=dict)
 
     def list_nodes(self, layer: int) -> list[int]:
-        """Ids of the nodes of a layer, agents and other partitions left out."""
+        """List the ids of the nodes of a layer, agents and other partitions left out."""
         return [k for k, node in self.nodes.items() if node["layer"] == layer and not node.get("partition", 0)]
 
     def get_places(self, ids: Sequence[int]) -> Array:
@@ -69,7 +69,7 @@ class _Graph:
         return np.array([self.nodes[k]["attributes"]["position"] for k in ids], np.float64).reshape(-1, 3)
 
     def find_parents(self) -> dict[int, int]:
-        """Child -> its parent, of neighbouring layers."""
+        """Map each child to its parent, of neighbouring layers."""
         parents: dict[int, int] = {}
         for a, b in self.edges:
             high, low = (a, b) if self.nodes[a]["layer"] > self.nodes[b]["layer"] else (b, a)
@@ -189,7 +189,7 @@ def _move_points(point: Any, motion: Motion) -> list[float]:
 
 
 def _turn(quaternion: Any, turn: Array) -> Any:
-    """A quaternion turned; as it is where it is none, as in nodes that never had one."""
+    """Turn a quaternion; leave it as it is where it is none, as in nodes that never had one."""
     values = np.array([quaternion[axis] for axis in "xyzw"], np.float64)
     if not np.isfinite(values).all() or abs(float(np.linalg.norm(values)) - 1) > UNIT:
         return quaternion
@@ -198,7 +198,7 @@ def _turn(quaternion: Any, turn: Array) -> Any:
 
 
 def _share_labels(graph: _Graph, joined: _Graph) -> _Graph:
-    """Numbers of classes as the joined graph counts them, where both name their classes."""
+    """Return the numbers of classes as the joined graph counts them, where both name their classes."""
     own, base = (dict((g.about.get("metadata") or {}).get("labelspaces") or {}) for g in (graph, joined))
     spaces = {
         name: ({int(n): str(w) for n, w in own[name]}, {str(w): int(n) for n, w in base[name]}) for name in own if name in base
@@ -224,7 +224,7 @@ def _share_labels(graph: _Graph, joined: _Graph) -> _Graph:
 
 
 def _renumber(graph: _Graph, joined: _Graph) -> _Graph:
-    """The graph with ids, and numbers of vertices, that the joined one does not use."""
+    """Return the graph with ids, and numbers of vertices, that the joined one does not use."""
     highest: dict[int, int] = {}
     for k in joined.nodes:
         highest[k >> LETTER] = max(highest.get(k >> LETTER, -1), k & ((1 << LETTER) - 1))
@@ -252,7 +252,7 @@ def find_same_nodes(joined: _Graph, graph: _Graph) -> dict[int, int]:
 
 
 def _get_object_reach(a: Json, b: Json) -> float:
-    """How far two nodes of one class may be apart, m; below 0 for two classes."""
+    """Return how far two nodes of one class may be apart, m; below 0 for two classes."""
     same = [(node.get("semantic_label"), str(node.get("name") or "").split("(")[0]) for node in (a, b)]
     alike = same[0][0] == same[1][0] and (same[0][0] != 2**32 - 1 or same[0][1] == same[1][1])
     sizes = [max((node.get("bounding_box") or {}).get("dimensions") or (0.0,)) for node in (a, b)]
@@ -260,7 +260,7 @@ def _get_object_reach(a: Json, b: Json) -> float:
 
 
 def _pair_nearest(joined: _Graph, graph: _Graph, layer: int, reach: Any) -> dict[int, int]:
-    """Nodes of a layer that are within reach of each other, the nearest pairs first, each node once."""
+    """Pair nodes of a layer that are within reach of each other, the nearest pairs first, each node once."""
     old, new = joined.list_nodes(layer), graph.list_nodes(layer)
     if not old or not new:
         return {}
@@ -279,7 +279,7 @@ def _pair_nearest(joined: _Graph, graph: _Graph, layer: int, reach: Any) -> dict
 
 
 def _pair_rooms(joined: _Graph, graph: _Graph, pairs: Mapping[int, int]) -> dict[int, int]:
-    """Rooms most of whose places are those of one room; rooms without places by their middles."""
+    """Pair rooms most of whose places are those of one room; rooms without places by their middles."""
     old, new = joined.find_parents(), graph.find_parents()
     votes: dict[int, Counter[int]] = {}
     sizes = Counter(room for k, room in new.items() if graph.nodes[k]["layer"] == PLACES)
@@ -302,7 +302,8 @@ def _pair_rooms(joined: _Graph, graph: _Graph, pairs: Mapping[int, int]) -> dict
 
 
 def _unite(joined: _Graph, graph: _Graph, pairs: Mapping[int, int], name: str) -> _Graph:
-    """Both graphs as one; of a node that both have the first one's attributes stay, with the name and vertices of the other."""
+    """Return both graphs as one; of a node that both have the first one's attributes stay, with the name and vertices of the
+    other."""
     nodes = dict(joined.nodes)
     for k, node in graph.nodes.items():
         if k not in pairs:

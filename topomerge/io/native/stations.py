@@ -70,7 +70,7 @@ def join(sources: Sequence[Source], target: Path, doubt: Doubt) -> Tally:
 
 
 def _read_inner(stream: IO[bytes], place: int, size: int) -> bytes:
-    """Bytes of a section, without the checksums between them."""
+    """Return the bytes of a section, without the checksums between them."""
     stream.seek(place - place % PAGE)
     inside = place % PAGE
     pages = -(-(inside + size + 4) // INNER) + 1
@@ -80,7 +80,7 @@ def _read_inner(stream: IO[bytes], place: int, size: int) -> bytes:
 
 
 def _find_binary_end(place: int, size: int, whole: int) -> int:
-    """Where, counted without checksums, the new header is to begin: in the old one's place if that is the last section."""
+    """Return where, counted without checksums, the new header is to begin: in the old one's place if that is the last section."""
     inner = place // PAGE * INNER + place % PAGE
     last = inner + size + INNER >= whole // PAGE * INNER
     return inner if last else whole // PAGE * INNER

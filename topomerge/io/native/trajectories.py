@@ -56,7 +56,7 @@ def join(sources: Sequence[Source], target: Path, doubt: Doubt) -> Tally:
 
 
 def _detect_layout(path: Path) -> str | None:
-    """KITTI, TUM or EuRoC, by how many numbers stand in a line and by which of them are a rotation; None: neither."""
+    """Return KITTI, TUM or EuRoC, by how many numbers stand in a line and by which of them are a rotation; None: neither."""
     with path.open(encoding="utf-8-sig", errors="replace") as stream:
         lines = stream.read(HEADER_LENGTH).splitlines(keepends=True)
     lines = lines[:-1] if len(lines) > 1 and not lines[-1].endswith("\n") else lines
@@ -113,7 +113,7 @@ def _move(source: Source, layout: str, poses: Array) -> Array:
 
 
 def _fill_rows(layout: str, rows: Array, poses: Array, moved: Array) -> Array:
-    """The numbers of each line: poses, and the velocity of EuRoC, which is that in the fixed frame."""
+    """Return the numbers of each line: poses, and the velocity of EuRoC, which is that in the fixed frame."""
     if layout == "KITTI":
         return moved[:, :3].reshape(-1, KITTI_NUMBERS)
     out = rows.copy()

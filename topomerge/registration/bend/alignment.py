@@ -110,7 +110,7 @@ class Alignment:
         return self._convert_measurements((i, j), own, parts)
 
     def _iter_facing(self, i: int, j: int) -> Iterator[tuple[int, int, Array]]:
-        """Storeys of two maps on one level, of i and of j, with the pieces of i there; those with walls in both."""
+        """Yield the storeys of two maps on one level, of i and of j, with the pieces of i there; those with walls in both."""
         for mine, theirs in self.match_storeys(i, j):
             chosen = np.flatnonzero(self.maps[i].pieces.storey == mine)
             if len(chosen) and len(self.maps[j].storeys[theirs].walls):
@@ -123,8 +123,8 @@ class Alignment:
         return float(np.sqrt(square / weight)) if weight > 0 else float("nan")
 
     def _convert_measurements(self, pair: Pair, own: Array, parts: Sequence[tuple[Array, ...]]) -> Measurements:
-        """Pieces, moves and information in a map's own frame as measurements in the common one. Information counts half: both
-        maps see the same walls."""
+        """Convert pieces, moves and information in a map's own frame to measurements in the common one. Information counts half:
+        both maps see the same walls."""
         i, j = pair
         chosen = np.concatenate([np.zeros(0, np.int64), *(p[0] for p in parts)])
         others, shares = self.compute_shares(i, j, chosen)
@@ -206,7 +206,7 @@ class Alignment:
         return settled
 
     def _estimate_drift(self, settled: SettledMoves, owner: Array) -> None:
-        """Of each map, by how much less than usual its shifts and turns drift; `owner` (j,): the map of each joint."""
+        """Estimate, of each map, by how much less than usual its shifts and turns drift; `owner` (j,): the map of each joint."""
         expected_strain = settled.expected_strain
         for k in range(len(self.maps)):
             expected = expected_strain[owner == k]

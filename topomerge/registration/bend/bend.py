@@ -78,7 +78,7 @@ def bend_plan(plan: StoreyPlan, forward: Callable[[Array], Array], back: Callabl
 
 
 def _sample_line(begin: tuple[int, int], end: tuple[int, int]) -> Array:
-    """Points every column from a corner to the next one."""
+    """Return points every column from a corner to the next one."""
     many = max(abs(end[0] - begin[0]), abs(end[1] - begin[1]), 1)
     out: Array = np.linspace(begin, end, many + 1)
     return out
@@ -199,7 +199,7 @@ def bend_together(
 def _iter_stiffer(
     maps: Sequence[Prepared], poses: Sequence[Sim3], pairs: Sequence[tuple[int, int]], scaled: bool, usual: Sequence[Drift]
 ) -> Iterator[tuple[Alignment, SettledMoves | None]]:
-    """The maps settled with their usual drift, then with less and less of it, for as long as they are asked for."""
+    """Yield the maps settled with their usual drift, then with less and less of it, for as long as they are asked for."""
     for share in STIFFER:
         alignment = Alignment(maps, poses, pairs, scaled)
         yield alignment, settle_all(alignment, [Drift(share * d.shift, share * d.turn) for d in usual])
@@ -223,7 +223,7 @@ def settle_all(alignment: Alignment, drifts: Sequence[Drift]) -> SettledMoves | 
 
 
 def _explain_rigid(a: Prepared, b: Prepared, pose: Sim3, drift: Sequence[Drift]) -> str:
-    """Why two maps can't be bent onto each other; empty where they can."""
+    """Tell why two maps can't be bent onto each other; empty where they can."""
     if drift[0].rigid and drift[1].rigid:
         return NEITHER_BENDS
     if not pair_storeys(a.storeys, b.storeys, pose.translation[2], pose.scale):

@@ -139,7 +139,7 @@ def settle(anchors: Array, joints: Joints, measured: Measurements, prior: Array)
 
 
 def _factor(normal: sparse.spmatrix) -> SuperLU:
-    """The normal equations, which are symmetric and positive, factored: their order is chosen once for rows and columns."""
+    """Factor the normal equations, which are symmetric and positive: their order is chosen once for rows and columns."""
     return splu(normal.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
@@ -173,7 +173,8 @@ def _build_effect(place: Array, anchors: Array) -> Array:
 
 
 def _build_sparse(blocks: Array, rows: Array, pieces: Array, shape: tuple[int, int]) -> sparse.csr_matrix:
-    """Blocks (m, r, 4) as a sparse matrix: block k in rows r * rows[k].. and at piece pieces[k]; those at one place are added."""
+    """Return blocks (m, r, 4) as a sparse matrix: block k in rows r * rows[k].. and at piece pieces[k]; those at one place are
+    added."""
     _, high, wide = blocks.shape
     i = (high * rows)[:, None, None] + np.arange(high)[None, :, None] + np.zeros((1, 1, wide), int)
     j = (UNKNOWNS * pieces)[:, None, None] + np.arange(wide)[None, None, :] + np.zeros((1, high, 1), int)
@@ -181,7 +182,7 @@ def _build_sparse(blocks: Array, rows: Array, pieces: Array, shape: tuple[int, i
 
 
 def _multiply_blocks(blocks: Array, rows: sparse.csr_matrix) -> sparse.csr_matrix:
-    """Blocks (m, 3, 3) along the diagonal, times a sparse matrix of 3 m rows."""
+    """Multiply blocks (m, 3, 3) along the diagonal by a sparse matrix of 3 m rows."""
     many = len(blocks)
     first = 3 * np.arange(many)[:, None, None]
     columns = first + np.arange(3)[None, None, :] + np.zeros((1, 3, 1), int)
@@ -190,12 +191,12 @@ def _multiply_blocks(blocks: Array, rows: sparse.csr_matrix) -> sparse.csr_matri
 
 
 def _replace_values(matrix: sparse.csr_matrix, values: Array) -> sparse.csr_matrix:
-    """Other values at the same places."""
+    """Put other values at the same places."""
     return sparse.csr_matrix((values, matrix.indices, matrix.indptr), matrix.shape)
 
 
 def _build_joint_rows(anchors: Array, joints: Joints) -> sparse.csr_matrix:
-    """Differences of moves at the places between pieces, in standard deviations."""
+    """Return the differences of moves at the places between pieces, in standard deviations."""
     many = len(joints.pieces)
     middle = anchors[joints.pieces].mean(axis=1).reshape(-1, 2)
     ends = joints.pieces.T.ravel()
@@ -205,7 +206,7 @@ def _build_joint_rows(anchors: Array, joints: Joints) -> sparse.csr_matrix:
 
 
 def _build_measured_rows(anchors: Array, measured: Measurements) -> sparse.csr_matrix:
-    """Shift and turn of the measured pieces against the others."""
+    """Build the rows of the shift and turn of the measured pieces against the others."""
     many, count = measured.others.shape
     pieces = np.concatenate([measured.piece, measured.others.T.ravel()])
     shares = np.concatenate([np.ones(many), -measured.shares.T.ravel()])

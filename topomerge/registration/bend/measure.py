@@ -72,8 +72,8 @@ class Target:
 
 
 def _build_rasters(fields: PlanFields, main: float) -> tuple[Array, Array, Array, Array]:
-    """With a rim of `DISTANCE_CAP`: (5, nx, ny) uint8 steps of distance to walls that may face each sector, and to any; the
-    corner of the raster, m; (nx, ny) float32 what a wall on free floor loses; and (nx, ny) bool, was it seen?"""
+    """Build, with a rim of `DISTANCE_CAP`: (5, nx, ny) uint8 steps of distance to walls that may face each sector, and to any;
+    the corner of the raster, m; (nx, ny) float32 what a wall on free floor loses; and (nx, ny) bool, whether it was seen."""
     rim = int(np.ceil(DISTANCE_CAP / fields.plan.edge))
     wall, face = np.pad(fields.plan.wall, rim), np.pad(fields.face, ((rim, rim), (rim, rim), (0, 0)))
     two_sided = np.abs(face).max(axis=2) == 0
@@ -112,8 +112,8 @@ def sample_walls(pieces: Pieces) -> tuple[Array, Array]:
 def measure(
     pieces: Pieces, sampled: tuple[Array, Array], chosen: Array, moves: Array, into: Sim3, target: Target, window: Window
 ) -> tuple[Array, Array]:
-    """Moves (k, 3) of the chosen pieces onto a storey of the other map, shift and turn in the pieces' frame, and their
-    information (k, 3, 3); no more than what the window allows.
+    """Measure the moves (k, 3) of the chosen pieces onto a storey of the other map, shift and turn in the pieces' frame, and
+    their information (k, 3, 3); no more than what the window allows.
 
     Args:
         chosen: (k,) pieces.
@@ -151,7 +151,8 @@ def measure(
 
 
 def _fit_gaussian(scores: Array, shifts: Array, yaws: Array) -> tuple[Array, Array]:
-    """Means (k, 3) and information (k, 3, 3) of the moves that scores (k, Y, S, S) leave likely, beyond that of the window."""
+    """Return the means (k, 3) and information (k, 3, 3) of the moves that scores (k, Y, S, S) leave likely, beyond that of the
+    window."""
     y, x, z = np.meshgrid(yaws, shifts, shifts, indexing="ij")
     moves = np.column_stack([x.ravel(), z.ravel(), y.ravel()])
     flat = scores.reshape(len(scores), -1)
@@ -251,7 +252,8 @@ def measure_lines(
 
 
 def _bound_information(information: Array) -> Array:
-    """Information (k, 3, 3) after the floor of what can be known is added to its covariance, in each of its own directions."""
+    """Return the information (k, 3, 3) after the floor of what can be known is added to its covariance, in each of its own
+    directions."""
     unit = np.diag([LINE_FLOOR[0], LINE_FLOOR[0], LINE_FLOOR[1]])
     back = np.linalg.inv(unit)
     values, vectors = np.linalg.eigh(unit @ information @ unit)

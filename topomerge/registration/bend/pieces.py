@@ -93,7 +93,7 @@ def _build_storey_pieces(fields: PlanFields, number: int, rooms: Array | None) -
 
 
 def _merge_small_pieces(walls: Array, owner: Array) -> Array:
-    """Owners without pieces of fewer than `LEAST_WALLS` columns, whose walls go to the nearest other piece."""
+    """Return the owners without pieces of fewer than `LEAST_WALLS` columns, whose walls go to the nearest other piece."""
     count = np.bincount(owner)
     small = count[owner] < LEAST_WALLS
     if small.any() and not small.all():
@@ -103,7 +103,7 @@ def _merge_small_pieces(walls: Array, owner: Array) -> Array:
 
 
 def _find_joints(walls: Array, owner: Array, anchors: Array) -> tuple[Array, Array]:
-    """Pieces whose walls come near each other, and how far their middles lie apart, m."""
+    """Return the pieces whose walls come near each other, and how far their middles lie apart, m."""
     near = cKDTree(walls).query_pairs(1.0, output_type="ndarray")
     ends = owner[near]
     ends = ends[ends[:, 0] != ends[:, 1]]
@@ -114,7 +114,7 @@ def _find_joints(walls: Array, owner: Array, anchors: Array) -> tuple[Array, Arr
 
 
 def _find_bridges(joints: Array, anchors: Array) -> Array:
-    """Joints that connect what is in several parts: each to the nearest piece of another part."""
+    """Return the joints that connect what is in several parts: each to the nearest piece of another part."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -153,7 +153,7 @@ def _find_wall_rooms(fields: PlanFields, map: TopometricMap) -> Array:
 
 
 def _stack_pieces(parts: Sequence[Pieces]) -> Pieces:
-    """The pieces of all storeys, each joined with the nearest one of the storey below."""
+    """Stack the pieces of all storeys, each joined with the nearest one of the storey below."""
     if not parts:
         none = np.zeros(0, np.int64)
         flat = np.zeros((0, 2))
@@ -202,8 +202,8 @@ def _load_fitted_drifts() -> dict[str, Any]:
 
 
 def detect_sensor(map: TopometricMap | VoxelGrid) -> str:
-    """The sensor of a map: the one that its parameters name; else a drawing or a slice where it looks like one, or unknown. A
-    name that nobody fitted a drift to says nothing."""
+    """Return the sensor of a map: the one that its parameters name; else a drawing or a slice where it looks like one, or
+    unknown. A name that nobody fitted a drift to says nothing."""
     named = map.parameters.get("sensor") if isinstance(map, TopometricMap) else None
     if isinstance(named, str) and named in _load_fitted_drifts():
         return named
