@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ def box(guid: str, kind: str, low: tuple[float, float, float], high: tuple[float
     return ModelElement(guid, kind, f"{kind} {guid}", vertices, faces.astype(np.int64))
 
 
+@cache
 def scan(shift: float = 0.0, gone: bool = False) -> TopometricMap:
     """A hall of 12 x 8 m, with walls at x = 4 (moved by `shift`) and x = 8."""
     scene = Scene().shell(0, 0, 12, 8).wall((4 + shift, 0), (4 + shift, 8), doors=(2.0,))
@@ -98,6 +100,7 @@ def test_a_wall_that_is_not_there_is_missing_and_one_that_is_not_modelled_is_new
     assert [c.kind for c in reverse.changes if c.element == "wall"] == ["wall new"]
 
 
+@cache
 def scan_side(shift: float) -> TopometricMap:
     """A hall with three walls across it, and of the partition at its end, 12 cm thick, only the side of the hall."""
     scene = Scene().shell(0, 0, 7.94 + shift, 8)

@@ -98,6 +98,7 @@ def test_processes_start_before_the_maps_are_asked_for(clouds: list[str], began:
         loaded = list(maps)
         assert not list_children()  # they do not wait for the end of the command
     assert [one.map.source for one in loaded] == clouds[:2] and len(began) == 1
+    assert all(one.parts is None for one in loaded)  # they are drawn for who asks
     with inputs.InputMaps(clouds[:2], choose(2)):
         pass  # a command that refuses what it was given
     assert not list_children()
@@ -107,7 +108,6 @@ def test_what_registration_needs_is_drawn_where_a_map_is_extracted(clouds: list[
     with inputs.InputMaps(clouds[:2], choose(2), prepares=True) as maps:
         loaded = list(maps)
     assert len(began) == 1 and all(one.parts is not None and one.parts["surface"] is not None for one in loaded)
-    assert all(one.parts is None for one in iter_input_maps(clouds[:2], choose(2)))
 
 
 def test_forked_processes_do_not_outlive_the_first(clouds: list[str]) -> None:

@@ -217,6 +217,19 @@ def reader(path: Path) -> Callable[[Path], int]:
 
 
 def write_corpus(folder: Path) -> dict[str, Path]:
+    """Name -> file of every format, in a folder."""
+    found = write_plain(folder)
+    return (
+        found
+        | write_native(folder, found)
+        | write_walks(folder)
+        | write_plans(folder)
+        | write_embedder(folder)
+        | write_atlas(folder)
+    )
+
+
+def write_plain(folder: Path) -> dict[str, Path]:
     """Name -> file, in a folder: those of `samples`, and pictures, a map and a folded scene."""
     from PIL import Image
 
@@ -258,14 +271,7 @@ def write_corpus(folder: Path) -> dict[str, Path]:
     np.savez(found["plain.npz"], points=samples.box_points(50), poses=np.eye(4)[None], pose_of=np.zeros(50, np.int32))
     found["pairs.yaml"] = folder / "pairs.yaml"
     found["pairs.yaml"].write_text(OWN_PAIRS)
-    return (
-        found
-        | write_native(folder, found)
-        | write_walks(folder)
-        | write_plans(folder)
-        | write_embedder(folder)
-        | write_atlas(folder)
-    )
+    return found
 
 
 def list_edits() -> list[Edit]:

@@ -12,12 +12,12 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
-from tests.fuzz.corpus import write_corpus
+from tests.fuzz.corpus import write_corpus, write_plain
 
 ROOT = Path(__file__).parent.parent.parent
 PATIENCE = 60.0  # s for one input, by the clock: others may want the processor, too
@@ -76,16 +76,18 @@ class Worker:
 
 
 @cache
-def valid_files() -> tuple[tempfile.TemporaryDirectory[str], dict[str, str]]:
-    """The corpus in a folder that this process keeps, and its files by name."""
+def valid_files(write: Callable[[Path], dict[str, Path]]) -> tuple[tempfile.TemporaryDirectory[str], dict[str, str]]:
+    """The corpus, or a part of it, in a folder that this process keeps, and its files by name."""
     folder = tempfile.TemporaryDirectory()
-    return folder, {name: str(path) for name, path in write_corpus(Path(folder.name)).items()}
+    return folder, {name: str(path) for name, path in write(Path(folder.name)).items()}
 
 
 @contextmanager
 def started(folder: Path, only: Sequence[str] = ()) -> Iterator[tuple[Worker, list[str]]]:
     """A worker that has read the valid files, or those named; and their names."""
-    corpus, files = valid_files()
+    corpus, files = valid_files(write_plain if only else write_corpus)
+    if not set(only) <= set(files):
+        corpus, files = valid_files(write_corpus)
     folder.mkdir(parents=True)
     names = list(only or files)
     (folder / "names.json").write_text(json.dumps({"files": files, "tried": names}))

@@ -196,7 +196,7 @@ def test_a_tag_that_the_other_map_lacks_speaks_for_another_place_by_hand():
     assert min(lead(found).values()) > 2.5  # one of three is missing
 
 
-def test_a_million_tags_are_bounded_work():
+def test_many_tags_are_bounded_work():
     rng = np.random.default_rng(0)
     at = rng.uniform(*HALL.grid.bounds, (2000, 3))
     many = with_signs([f"tag:{k}" for k in range(2000)], at, "tag")
@@ -235,9 +235,9 @@ def test_kinds_that_one_map_lacks_say_nothing():
     assert LandmarkEvidence().apply(UNIFORM) == pytest.approx(UNIFORM)
 
 
-def test_a_million_landmarks_are_bounded_work():
+def test_many_landmarks_are_bounded_work():
     rng = np.random.default_rng(0)
-    count = 1_000_000
+    count = 100_000
     table = np.zeros(count, build_landmarks("text", ["x"], "t").table.dtype)
     many = build_landmarks("text", [f"{k}" for k in range(1000)], "hostile")
     table["value"], table["position"] = rng.integers(1000, size=count), rng.uniform(0, 20, (count, 3))

@@ -158,9 +158,9 @@ def test_all_rooms_101_are_no_quarrel_and_many_contradictions_are_counted() -> N
 
 @pytest.mark.longer
 @pytest.mark.parametrize("hostile", ["spread", "one place", "one string"])
-def test_a_million_landmarks_need_no_pairs(hostile: str) -> None:
-    """Each pair of equal ones would be 10^11 of them."""
-    random, many = np.random.default_rng(0), 250_000
+def test_many_landmarks_need_no_pairs(hostile: str) -> None:
+    """Each pair of equal ones would be 10^9 of them."""
+    random, many = np.random.default_rng(0), 50_000
     table = build_landmarks("text", ["x"], "a").table.repeat(many)
     position = random.uniform(0, 500, (many, 3)) if hostile == "spread" else np.zeros((many, 3))
     if hostile == "one string":

@@ -188,10 +188,10 @@ def test_hardly_anything_says_nothing():
 
 
 @pytest.mark.longer
-@pytest.mark.parametrize("names", [50, 200_000])
-def test_a_million_readings_are_bounded(names):
+@pytest.mark.parametrize("names", [50, 20_000])
+def test_many_readings_are_bounded(names):
     rng = np.random.default_rng(0)
-    scan = rng.integers(0, 20_000, 1_000_000)
+    scan = rng.integers(0, 20_000, 100_000)
     places = rng.uniform(0, 200, (20_000, 3)) * (1, 1, 0)
     values = [f"{k:x}" for k in rng.integers(0, names, len(scan)).tolist()]
     heard = build_landmarks("radio", values, "test", places[scan], number=rng.uniform(-90, -40, len(scan)), group=scan)

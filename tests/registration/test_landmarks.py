@@ -9,7 +9,7 @@ from tests.scenes_map import building
 from topomerge.landmarks.evidence import LandmarkEvidence, score_landmarks
 from topomerge.registration.pipeline import register
 from topomerge.registration.posterior import MOST_BY_LANDMARKS, POSTERIOR, update_posterior
-from topomerge.types import Landmarks, Sim3, build_landmarks, move_landmarks
+from topomerge.types import Sim3, build_landmarks, move_landmarks
 
 EACH = {**dict.fromkeys(POSTERIOR, 0.1), "here": 0.4}
 
@@ -44,6 +44,12 @@ def bare():
     return register(HALL, twin(HALL))
 
 
+@pytest.fixture(scope="module")
+def agree():
+    """Both maps with the same signs."""
+    return register(with_signs(HALL, NUMBERS), told(HALL, NUMBERS))
+
+
 def test_landmarks_of_one_map_alone_change_nothing(bare):
     one_sided = register(with_signs(HALL, NUMBERS), twin(HALL))
     assert one_sided.probability == bare.probability and one_sided.transform == bare.transform
@@ -51,8 +57,7 @@ def test_landmarks_of_one_map_alone_change_nothing(bare):
     assert one_sided.landmarks == bare.landmarks == LandmarkEvidence() and bare.walls == bare.probability
 
 
-def test_signs_that_agree_raise_and_those_that_contradict_refuse(bare):
-    agree = register(with_signs(HALL, NUMBERS), told(HALL, NUMBERS))
+def test_signs_that_agree_raise_and_those_that_contradict_refuse(bare, agree):
     other = register(with_signs(HALL, NUMBERS), told(HALL, [t.replace("2.1", "3.1") for t in NUMBERS]))
     assert agree.probability > bare.probability and "agree" in agree.landmarks.list_sentences()[0]
     assert other.probability < 0.05 and other.posterior["storey"] + other.posterior["wing"] > 0.8
@@ -60,12 +65,11 @@ def test_signs_that_agree_raise_and_those_that_contradict_refuse(bare):
     assert sum(agree.posterior.values()) == pytest.approx(1.0) and other.walls > other.probability
 
 
-def test_signs_choose_among_places_that_walls_do_not_tell_apart():
-    first = register(with_signs(HALL, NUMBERS), told(HALL, NUMBERS))
+def test_signs_choose_among_places_that_walls_do_not_tell_apart(agree):
     shifted = [*NUMBERS[2:], "2.118", "2.119"]  # the same walls, two rooms on along the corridor
     second = register(with_signs(HALL, NUMBERS), told(HALL, shifted))
     at = doors(HALL)[:1]
-    off = np.linalg.norm(second.transform.apply(at) - first.transform.apply(at))
+    off = np.linalg.norm(second.transform.apply(at) - agree.transform.apply(at))
     assert off > 3.0 or second.probability < 0.2
 
 
@@ -98,4 +102,3 @@ def test_hostile_landmarks_do_no_harm(bare):
     assert abs(same.probability - bare.probability) < 0.1
     nan = replace(HALL, landmarks=build_landmarks("text", NUMBERS, "x", np.full((8, 3), np.nan)))
     assert register(nan, told(HALL, NUMBERS)).probability == bare.probability
-    assert register(replace(HALL, landmarks=Landmarks()), twin(HALL)).probability == bare.probability

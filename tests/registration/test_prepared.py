@@ -36,14 +36,15 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return calls
 
 
-def test_of_what_was_sent_nothing_is_drawn_again(halves, drawn):
+def test_of_what_was_sent_nothing_is_drawn_again_and_where_walls_decide_no_descriptor_is_needed(halves, drawn, monkeypatch):
+    monkeypatch.setattr(learned, "load_embedder", lambda *_: pytest.fail("the embedder was loaded"))
     parts = [pickle.loads(pickle.dumps(prepare(map).pack())) for map in halves]
     once = ["Target", "build_pieces", "build_plans", "build_surface", "build_wall_lines", "sample_walls"]
     assert sorted(drawn) == sorted(once * 2)
     sent = tm.merge([unpack_prepared(part, map) for part, map in zip(parts, halves, strict=True)])
     assert sorted(drawn) == sorted(once * 2)
     here = tm.merge(list(halves))
-    assert sent.transforms == here.transforms and sent.probability == here.probability
+    assert here.merged and sent.transforms == here.transforms and sent.probability == here.probability
     assert sent.map is not None and here.map is not None and np.array_equal(sent.map.room, here.map.room)
 
 
@@ -63,14 +64,6 @@ def test_any_number_of_threads_finds_the_same(halves, drawn):
 def test_plans_that_are_too_large_are_not_sent(halves, monkeypatch):
     monkeypatch.setattr(prepared, "SENT_COLUMNS", 10)
     assert prepare(halves[0]).pack() is None
-
-
-def test_a_merge_that_walls_decide_needs_no_descriptor(halves, monkeypatch):
-    def refuse(*_: object) -> None:
-        raise AssertionError("the embedder was loaded")
-
-    monkeypatch.setattr(learned, "load_embedder", refuse)
-    assert tm.merge(list(halves)).merged
 
 
 def test_joints_are_pairs_of_pieces_whose_walls_are_near():

@@ -49,9 +49,9 @@ def test_the_other_way_round_is_the_inverse(halves, joined):
 
 
 @pytest.mark.longer
-@pytest.mark.parametrize("up", [0.0, 0.035, 0.07])
-def test_bent_maps_lie_as_high_as_rigid_ones(points, up):
+def test_bent_maps_lie_as_high_as_rigid_ones(points):
     """Bending is level: the height is that of the fine registration, finer than a cell."""
+    up = 0.035
     raised = Sim3(MOVE.yaw, (*MOVE.translation[:2], up))
     a, b = grid_of(part(points, high=(11, 9))), grid_of(part(points, (3, -99), (14.5, 9)), raised)
     bent, rigid = register(a, b), register(a, b, rigid=True)

@@ -43,18 +43,28 @@ def run_studio(folder: Path, *words: str) -> Iterator[tuple[str, subprocess.Pope
 
 
 @contextmanager
-def open_browser(**settings: Any) -> Iterator[Any]:
-    """A context of a browser; what its pages complain of fails the test."""
+def start_browser() -> Iterator[Any]:
+    """A browser, which starts in a second or two; each test has a context of its own."""
     sync_api = pytest.importorskip("playwright.sync_api")
-    program, complaints = browser(), []
+    program = browser()
     with sync_api.sync_playwright() as driver:
         chromium = driver.chromium.launch(executable_path=program, args=list(FLAGS))
-        context = chromium.new_context(**{"viewport": {"width": 1280, "height": 800}, **settings})
-        context.set_default_timeout(WAIT)
-        context.on("weberror", lambda error: complaints.append(str(error.error)))
-        context.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
-        yield context
+        yield chromium
         chromium.close()
+
+
+@contextmanager
+def open_context(chromium: Any, **settings: Any) -> Iterator[Any]:
+    """A context of a browser; what its pages complain of fails the test."""
+    complaints: list[str] = []
+    context = chromium.new_context(**{"viewport": {"width": 1280, "height": 800}, **settings})
+    context.set_default_timeout(WAIT)
+    context.on("weberror", lambda error: complaints.append(str(error.error)))
+    context.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+    try:
+        yield context
+    finally:
+        context.close()
     expected = ("status of 409", "status of 400", "net::ERR_")  # that a test asks for, and a server that has ended
     assert not [line for line in complaints if not any(words in line for words in expected)], complaints
 

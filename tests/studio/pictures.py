@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import topomerge as tm
-from tests.studio.browser import WAIT, MapPage, open_browser, run_studio
+from tests.studio.browser import WAIT, MapPage, open_context, run_studio, start_browser
 from topomerge.cli.main import main as run_command
 from topomerge.edits.journal import build_edit
 
@@ -51,7 +51,8 @@ def take(page: Any, name: str, images: Path) -> None:
 
 def photograph(folder: Path, images: Path) -> None:
     """Go the way of docs/studio.md and take its pictures."""
-    with run_studio(folder) as (address, _), open_browser(viewport={"width": 1200, "height": 750}) as context:
+    size = {"width": 1200, "height": 750}
+    with run_studio(folder) as (address, _), start_browser() as chromium, open_context(chromium, viewport=size) as context:
         west, east = "ground floor west.tmap", "ground floor east.tmap"
         one = MapPage(context, address, west)
         page = one.page

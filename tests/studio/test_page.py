@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from tests.scenes_map import building
-from tests.studio.browser import MapPage, open_browser, run_studio
+from tests.studio.browser import MapPage, open_context, run_studio, start_browser
 from topomerge.edits.journal import MAP_OPS
 from topomerge.io.maps import save_map
 from topomerge.types import WINDOW_DTYPE
@@ -38,9 +38,15 @@ def folder(tmp_path: Path) -> Path:
     return root
 
 
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    with start_browser() as one:
+        yield one
+
+
 @pytest.fixture
-def context(folder: Path) -> Iterator[Any]:
-    with run_studio(folder) as (address, _), open_browser() as one:
+def context(folder: Path, chromium: Any) -> Iterator[Any]:
+    with run_studio(folder) as (address, _), open_context(chromium) as one:
         one.address = address
         yield one
 
@@ -272,9 +278,9 @@ def save_two(folder: Path) -> None:
         save_map(office_map(k), folder / f"{name}.tmap")
 
 
-def test_a_merge_shows_each_step_and_is_cancelled(tmp_path: Path) -> None:
+def test_a_merge_shows_each_step_and_is_cancelled(tmp_path: Path, chromium: Any) -> None:
     save_two(tmp_path)
-    with run_studio(tmp_path) as (address, _), open_browser() as context:
+    with run_studio(tmp_path) as (address, _), open_context(chromium) as context:
         page = context.new_page()
         page.goto(address)
         page.wait_for_selector("li[data-path]")
@@ -296,7 +302,7 @@ def test_a_merge_shows_each_step_and_is_cancelled(tmp_path: Path) -> None:
         assert "Merged" in page.inner_text(".verdict")
 
 
-def test_maps_are_matched_and_moved_by_hand_snapped_and_accepted(tmp_path: Path) -> None:
+def test_maps_are_matched_and_moved_by_hand_snapped_and_accepted(tmp_path: Path, chromium: Any) -> None:
     from tests.fusion.atlas.atlas_scenes import office_map, truth
     from topomerge.fusion.fuse import match_common_rooms
     from topomerge.matching.poses import pose_difference
@@ -304,7 +310,7 @@ def test_maps_are_matched_and_moved_by_hand_snapped_and_accepted(tmp_path: Path)
 
     save_two(tmp_path)
     rooms, _ = match_common_rooms(office_map(0), office_map(2), truth(0, 2))
-    with run_studio(tmp_path) as (address, _), open_browser() as context:
+    with run_studio(tmp_path) as (address, _), open_context(chromium) as context:
         page = context.new_page()
         page.goto(address)
         page.wait_for_selector("li[data-path]")
@@ -361,9 +367,9 @@ def test_maps_are_matched_and_moved_by_hand_snapped_and_accepted(tmp_path: Path)
         assert sorted(ops) == ["accept_merge", "match_rooms", "match_rooms"]
 
 
-def test_a_thousand_rooms_are_panned(tmp_path: Path) -> None:
+def test_a_thousand_rooms_are_panned(tmp_path: Path, chromium: Any) -> None:
     save_map(building(50, 10), tmp_path / "large.tmap")
-    with run_studio(tmp_path) as (address, _), open_browser() as context:
+    with run_studio(tmp_path) as (address, _), open_context(chromium) as context:
         one = MapPage(context, address, "large.tmap")
         assert one.page.evaluate("() => studio.plan.rooms") == 1010
         before = one.page.evaluate("() => [studio.canvas.frames, studio.canvas.view.x]")
@@ -380,8 +386,9 @@ def test_a_thousand_rooms_are_panned(tmp_path: Path) -> None:
         assert one.page.inner_text(".side h2") == "Room 40"
 
 
-def test_a_tablet_pinches_and_taps(folder: Path) -> None:
-    with run_studio(folder) as (address, _), open_browser(has_touch=True, viewport={"width": 800, "height": 1100}) as context:
+def test_a_tablet_pinches_and_taps(folder: Path, chromium: Any) -> None:
+    tablet = {"has_touch": True, "viewport": {"width": 800, "height": 1100}}
+    with run_studio(folder) as (address, _), open_context(chromium, **tablet) as context:
         one = MapPage(context, address, "house.tmap")
         room = one.room(3)
         one.page.touchscreen.tap(*one.point(room["x"], room["y"]))
@@ -422,9 +429,9 @@ def test_a_tablet_pinches_and_taps(folder: Path) -> None:
         assert lines(folder)[-1]["op"] == "undo"
 
 
-def test_ctrl_c_ends_the_server_and_its_job(folder: Path) -> None:
+def test_ctrl_c_ends_the_server_and_its_job(folder: Path, chromium: Any) -> None:
     (folder / "in").mkdir()
-    with run_studio(folder) as (address, process), open_browser() as context:
+    with run_studio(folder) as (address, process), open_context(chromium) as context:
         page = context.new_page()
         page.goto(address)
         page.wait_for_selector("li[data-path]")

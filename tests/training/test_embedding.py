@@ -173,10 +173,11 @@ def test_a_run_is_a_folder(settings, tmp_path):
 
 
 def weights(folder: Path) -> bytes:
-    return (folder / ("embedder.onnx" if folder.name == "best" else "embedder.safetensors")).read_bytes()
+    return (folder / "embedder.safetensors").read_bytes()
 
 
 @pytest.mark.longer
+@pytest.mark.usefixtures("unexported")  # equal weights give equal files: tests/networks/test_network.py
 def test_resumed_equals_uninterrupted(settings, tmp_path, monkeypatch):
     settings.network = replace(SMALL, geometry=Geometry(["scalars", "pointnet"], width=16))
     fit(replace(settings, name="whole"), quiet)

@@ -203,6 +203,7 @@ def test_seeds_are_gathered_with_mean_and_interval(settings, tmp_path):
 
 
 @pytest.mark.longer
+@pytest.mark.usefixtures("unexported")
 def test_two_processes_take_the_step_of_one_with_all_pairs(settings, tmp_path):
     """torchrun with gloo: rooms of the other process are negatives, with gradients; weights end as those of one process."""
     same = replace(settings, epochs=2, batch=2, augment=replace(settings.augment, rooms=0.0, edges=0.0, jitter=0.0))

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 import pytest
@@ -32,8 +31,8 @@ def test_buildings_of_every_kind_are_sound(kind: str, storeys: int) -> None:
     assert all(s.is_valid and s.exterior.is_ccw for s in shapes)
     areas = np.array([s.area for s in shapes])
     assert areas.min() > REALISTIC["room"][0] and areas.max() < REALISTIC["room"][1]
-    for a, b in combinations(range(len(shapes)), 2):
-        if building.rooms[a].storey == building.rooms[b].storey:
+    for a, b in shapely.STRtree(shapes).query(shapes, "intersects").T.tolist():
+        if a < b and building.rooms[a].storey == building.rooms[b].storey:
             assert shapes[a].intersection(shapes[b]).area < 1e-6
     widths = building.doors["width"]
     assert widths.min() >= REALISTIC["door"][0] and widths.max() <= REALISTIC["door"][1]

@@ -385,7 +385,7 @@ def test_rooms_that_match_are_those_of_the_simulator(houses: Path, cache: Path) 
 @pytest.mark.longer
 def test_train_and_evaluate(houses: Path, cache: Path, tmp_path: Path) -> None:
     words = ["data=folder", f"path={houses}", f"cache={cache}", f"runs={tmp_path}", "name=own", "logger=none", "epochs=2"]
-    best = train(compose_settings([*words, "experiment=surroundings", "batch=1"]), quiet)
+    best = train(compose_settings([*words, "experiment=gat_scalars", "batch=1"]), quiet)
     assert 0 <= best["val/recall@1"] <= 1 and best["val/rooms"] > 0
     told = json.loads((tmp_path / "own" / "config.json").read_text())
     assert told["data"].endswith("-train.jsonl") and told["validation"].endswith("-val.jsonl")

@@ -44,8 +44,8 @@ def test_features_do_not_change_when_all_is_turned():
 
 
 @pytest.mark.longer
-@pytest.mark.parametrize("yaw", [0.4, -3.1])
-def test_a_turned_room_is_brought_back(yaw):
+def test_a_turned_room_is_brought_back():
+    yaw = -3.1
     truth = Sim3(yaw, (4.0, -7.0, 0.5))
     here, there = room(), room(truth)
     pose = estimate_pose(there, here)

@@ -39,9 +39,14 @@ def partners(flats):
     return rooms
 
 
+@pytest.fixture(scope="module")
+def clusters(flats, partners):
+    """Poses of the matched rooms."""
+    return estimate_room_poses(*flats, partners, np.ones(len(partners)))
+
+
 @pytest.mark.longer
-def test_rooms_that_match_agree_about_the_pose(flats, partners):
-    clusters = estimate_room_poses(*flats, partners, np.ones(len(partners)))
+def test_rooms_that_match_agree_about_the_pose(clusters):
     metres, degrees = off(clusters[0][0], MOVE.inverse(), tuple(MOVE.apply(np.array([[6.0, 4.0, 1.0]]))[0]))
     assert metres < 0.1 and degrees < 0.5
     assert [w for _, w in clusters] == sorted((w for _, w in clusters), reverse=True)
@@ -79,9 +84,8 @@ def test_merge_by_rooms_is_for_two_maps_and_by_surfaces_for_one_scale(flats):
 
 
 @pytest.mark.longer
-def test_the_same_maps_give_the_same_poses(flats, partners):
-    first, again = (estimate_room_poses(*flats, partners, np.ones(len(partners))) for _ in range(2))
-    assert again == first
+def test_the_same_maps_give_the_same_poses(flats, partners, clusters):
+    assert estimate_room_poses(*flats, partners, np.ones(len(partners))) == clusters
 
 
 def test_without_open3d_the_message_says_what_to_install(flats, monkeypatch):
