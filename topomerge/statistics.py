@@ -62,12 +62,12 @@ def bootstrap_mean(values: Array, groups: Array, rounds: int = 2000, seed: int =
 
 
 def format_interval(values: Array, groups: Array, digits: int = 2, unit: float = 1.0) -> str:
-    """Return a mean with its interval by `bootstrap`, `0.62 [0.50, 0.71]`; of fewer than eight groups with the range of the
+    """Return a mean with its interval by `bootstrap_mean`, `0.62 [0.50, 0.71]`; of fewer than eight groups with the range of the
     groups' means instead, `0.71, 0.62–0.91 (4 buildings)`; a dash where there is no value. A share that is 0 or 1 throughout has
     the `compute_exact_interval` over groups: drawing equal values again says nothing.
 
     Args:
-        values, groups: as of `bootstrap`.
+        values, groups: as of `bootstrap_mean`.
         digits: behind the point.
         unit: what values are multiplied by: 100 for per cent.
     """
@@ -97,7 +97,7 @@ def _sum_groups(values: Array, groups: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Probabilities against what came true (`calibration`).
+    """Probabilities against what came true (`measure_calibration`).
 
     Args:
         error: expected calibration error: mean over all of the distance between a bin's two shares; nan where there are none.

@@ -61,7 +61,7 @@ def build_answers(rows: Sequence[Row], verdicts: Mapping[str, PeerVerdict]) -> l
 
 
 def load_answers(what: str, verdicts: Mapping[str, PeerVerdict]) -> list[Row]:
-    """Load the `answers` of a set of pairs; none where nothing was measured."""
+    """Load the answers (`build_answers`) of a set of pairs; none where nothing was measured."""
     return build_answers(read_result_rows(what), verdicts)
 
 
@@ -173,7 +173,7 @@ LINES = {  # colour, dashes
 
 
 def draw_curves(groups: Mapping[str, Sequence[Row]], path: Path) -> None:
-    """Draw a panel a group of rows (`answers`), a line a method; the dot is at the threshold of the verdict."""
+    """Draw a panel a group of rows (`build_answers`), a line a method; the dot is at the threshold of the verdict."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.2 * len(groups), 4.0), layout="constrained", facecolor="white")

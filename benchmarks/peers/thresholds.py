@@ -38,7 +38,7 @@ class PeerVerdict:
 
     Args:
         variant: of the peer, by its name in the rows of `run.py`.
-        score: ``inliers``, ``fitness`` or ``fitness_icp`` (`peer_methods.PeerAnswer`).
+        score: ``inliers``, ``fitness`` or ``fitness_icp`` (`methods.PeerAnswer`).
         at_least: of the score; None: nothing is believed.
         residual_at_most: m, of the residual that goes with the score; None: any.
         precision, recall: on the training pairs.

@@ -45,7 +45,7 @@ def build_building(
         parameters: kept with the building, beside the difficulty.
 
     Raises:
-        InputError: no plans, or one that no building could have (`check_plan`), or a stair too steep (`staircase`).
+        InputError: no plans, or one that no building could have (`check_plan`), or a stair too steep (`build_staircase`).
     """
     difficulty = difficulty or Difficulty()
     seed = int(rng) if isinstance(rng, int | np.integer) else -1

@@ -233,7 +233,7 @@ def draw_module(layout: str, rng: np.random.Generator) -> ModulePlan:
 
 
 def make_row(module: ModulePlan, count: int, difficulty: Difficulty, seed: int, name: str) -> ModuleRow:
-    """Make a row of modules, unfurnished (`refurnish` puts things into it); door leaves hang alike in all modules.
+    """Make a row of modules, unfurnished (`replace_furniture` puts things into it); door leaves hang alike in all modules.
 
     Args:
         difficulty: its `lintels` (all or none), `open` and `half` are used.

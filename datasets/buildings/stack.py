@@ -139,7 +139,7 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Plans of one building, lowest storey first, in one frame, ready for `erect`.
+    """Plans of one building, lowest storey first, in one frame, ready for `build_building`.
 
     Args:
         fits: of each storey but the lowest one.

@@ -1,6 +1,6 @@
 """A building that is known exactly, its difficulty, and which real building it is of.
 
-A storey as drawn on paper: rooms, walls, openings and stairs. `erect` turns plans into a `Building`.
+A storey as drawn on paper: rooms, walls, openings and stairs. `build_building` turns plans into a `Building`.
 
 Lengths are metres, heights are above the storey's floor. Free space is the rooms' polygons, minus the walls, plus the
 openings: polygons may therefore run along the walls' faces (then no walls need be given: what lies between rooms is solid) or
@@ -350,7 +350,7 @@ class Flight:
             ahead and to the right. The lower landing lies just before it.
         heading: rad, the way one first goes up.
         width: m, across (both flights of a dog-leg; the diameter of a spiral).
-        length: m, along; `erect` fills it exactly.
+        length: m, along; `build_building` fills it exactly.
     """
 
     kind: str

@@ -44,7 +44,7 @@ class Example:
     """A cached pair.
 
     Args:
-        a, b: graphs of the two maps (`embedding.graph`), with `build_true_room` (-1: none), `true_iou` and `true_one`.
+        a, b: graphs of the two maps (`embedding.graph`), with `true_room` (-1: none), `true_iou` and `true_one`.
         matches: (M, 2) extracted rooms of a and of b that are the same true room; rooms may be in several.
         transform: (4, 4) float64 T_ab; nan where there is none.
         about: sensors, overlap, kind, building, ...

@@ -187,7 +187,8 @@ class PlanRecipe:
         folder: of the real data; empty: procedural buildings only.
         flat: slices, robots' grids and drawings alone; sparse: share of scans that lose most of their points, there;
             frameless: share of scans whose doors mostly have no frame, there.
-        surroundings: do the buildings stand in the open, so that sensors see gardens, streets and fans of rays (`open_scans`)?
+        surroundings: do the buildings stand in the open, so that sensors see gardens, streets and fans of rays
+            (`simulate_open_scan`)?
     """
 
     name: str = "plan_scans"

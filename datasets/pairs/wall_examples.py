@@ -92,7 +92,7 @@ def compute_true_classes(building: Building, walls: Elevations, frame: Sim3, shi
 
 
 def list_cupboards(building: Building) -> Sequence[tuple[float, ...]]:
-    """List, as `_doors`, the furniture that stands before walls and is as high as a table or higher."""
+    """List, as `_list_doors`, the furniture that stands before walls and is as high as a table or higher."""
     things = building.things
     tall = np.isin(things["kind"], CUPBOARDS) & (things["size"][:, 2] >= LEAST_CUPBOARD)
     rows = []
@@ -104,7 +104,7 @@ def list_cupboards(building: Building) -> Sequence[tuple[float, ...]]:
 
 
 def list_niches(building: Building) -> Sequence[tuple[float, ...]]:
-    """List, as `_doors`, the recesses of walls."""
+    """List, as `_list_doors`, the recesses of walls."""
     return [(*n["centre"].tolist(), float(n["direction"]), float(n["width"]), float(n["depth"])) for n in building.niches]
 
 
@@ -281,7 +281,7 @@ def make_walls(item: WallItem, plan: Plan | None) -> WallExample:
 
 
 def _simulate_flat(building: Building, visited: Array, seed: int, rng: np.random.Generator) -> tuple[str, PointCloud, Any]:
-    """Simulate, as `_seen`, by a 2D laser or as a grid map."""
+    """Simulate, as `_simulate_scan`, by a 2D laser or as a grid map."""
     if rng.random() >= SLICE_SHARE:
         return "drawn", simulate_grid_map(building, visited, rng), None
     cloud, shift = scan_with_drift(building, "laser2d", visited, rng, seed)

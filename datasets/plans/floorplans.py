@@ -1,4 +1,4 @@
-"""Plans of real buildings, read from the formats that their owners publish, one `Plan` a storey for `erect`.
+"""Plans of real buildings, read from the formats that their owners publish, one `Plan` a storey for `build_building`.
 
 | file | format | reader |
 |---|---|---|

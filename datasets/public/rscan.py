@@ -2,7 +2,7 @@
 
     3RScan.json                        scenes: `reference` scan, and `scans` of later days with their `transform`
     <scan>/mesh.refined.v2.obj         mesh, m, z up (first version: mesh.refined.obj)
-    <scan>/mesh.refined.0.010000.segs.v2.json, semseg.v2.json    objects (see `annotation.read_objects`)
+    <scan>/mesh.refined.0.010000.segs.v2.json, semseg.v2.json    objects (see `scannet.read_objects`)
 
 A transform maps a later scan into the reference: 16 numbers, column by column, as the owners' own reader has it. Their FAQ says
 that translations are in mm, but their code applies them to metres as they are: metres they are here, unless one is beyond any

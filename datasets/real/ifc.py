@@ -1,6 +1,6 @@
 """Building models against scans of them: the rays are simulated, the walls they meet are the model's own.
 
-The scanner walks through the spaces and doors of the model, as `plan_ifc` reads them, and its rays are cast at the model's
+The scanner walks through the spaces and doors of the model, as `plans.ifc` reads them, and its rays are cast at the model's
 triangles: every built element but the door leaves. The other map is the model itself, its surfaces sampled all round.
 Floors that the model lacks are added to both.
 """
@@ -69,7 +69,7 @@ def load_model_building(path: Path) -> Building:
     the lowest floor is at 0.
 
     Raises:
-        InputError: what `plan_ifc` and the reader of IFC refuse; floors of the plans that are not at the model's heights.
+        InputError: what `plans.ifc` and the reader of IFC refuse; floors of the plans that are not at the model's heights.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the folder")

@@ -1,7 +1,7 @@
 """One office building mapped in three years by robots of the STRANDS project (published with ROSE2, Luperto et al.).
 
 The maps' relation is not published. It was measured: walls correlated over all turns in steps of 3° and then 0.5° on rasters of
-0.5 and 0.25 m, refined by `wall_fit.fit_walls`, and looked at as overlay. The map of 2017 goes on from that of 2016 in the same
+0.5 and 0.25 m, refined by `sources.fit_walls`, and looked at as overlay. The map of 2017 goes on from that of 2016 in the same
 frame, so these two agree to the pixel where nothing has moved; 2015 was mapped on its own.
 """
 

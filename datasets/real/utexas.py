@@ -2,7 +2,7 @@
 partial grids.
 
 The line maps' relation to the grids is not published. It was measured: first turned and moved by hand, then refined by
-`wall_fit.fit_walls` (all changes were below 0.3° and 0.1 m) and looked at as overlay. Walls agree to a decimetre or two; the grid
+`sources.fit_walls` (all changes were below 0.3° and 0.1 m) and looked at as overlay. Walls agree to a decimetre or two; the grid
 of floor 4 is bent and misses them by up to 2 m in its north-east, floor 1's was put together from two maps.
 Floors 1 and 3 contain the partial grids pixel by pixel, moved by whole pixels: 1n and 1s are its two wings, 3ne the north of 3.
 Rooms are those of BWI, also for the line maps, which have none.

@@ -193,8 +193,8 @@ def classify_origin(row: Row) -> str:
 
 
 def compute_calibration(rows: Sequence[Row]) -> Calibration:
-    """Compute the `calibration` of the probabilities of pairs, in ten bins, or fewer where a bin of those above the mass near
-    zero would have fewer than `PER_BIN`."""
+    """Compute the calibration (`measure_calibration`) of the probabilities of pairs, in ten bins, or fewer where a bin of those
+    above the mass near zero would have fewer than `PER_BIN`."""
     above = sum(r["probability"] >= NEAR_ZERO for r in rows)
     return measure_calibration([r["probability"] for r in rows], [is_good(r) for r in rows], min(max(above // PER_BIN, 1), 10))
 

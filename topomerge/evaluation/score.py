@@ -247,7 +247,7 @@ def is_within(error: tuple[float, float, float], flat: bool, limits: tuple[float
 def count_merges(pair: EvaluationPair, verdict: Mapping[str, Any], floors: Sequence[Array] = ()) -> Row:
     """Count, of a pair: `near`, `fine`: the best pose is right within 0.5 m and 5 degrees, 0.1 m and 1 degree; `merged`: believed
     and near; `false`: believed and not; `refused`: right but not believed; `mergeable`: the maps have something in common;
-    `every_room`: it puts, not bent, every shared room within 0.1 m of its true place; `find_rooms_near`: so many of the
+    `every_room`: it puts, not bent, every shared room within 0.1 m of its true place; `rooms_near`: so many of the
     `rooms_shared`; `place`: where it puts the middle of what both saw, m, and its yaw, degrees.
 
     Args:

@@ -3,7 +3,7 @@
 Rooms: procedural buildings by five sensors, and sealed plans of real buildings, scanned. Merges: pairs of grids as those that the
 belief in merges is judged on (`datasets.pairs.grid_pairs`), two scans of each sealed plan, both halves of each sealed robot grid
 (one capture: what it shows is less than two), robot grids of two places, and sealed buildings of published sets. How rooms are
-ranked: `sealed_ranking`.
+ranked: `count_pair_ranks`.
 """
 
 from __future__ import annotations

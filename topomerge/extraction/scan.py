@@ -37,7 +37,7 @@ class Scan:
         free: cells that the file says are empty, or None.
         source: where it comes from.
         warnings: what the user should know.
-        crossed: cells that its rays crossed (`free_space.with_crossed_cells`); None where that is unknown.
+        crossed: cells that its rays crossed (`navigable.add_crossed_cells`); None where that is unknown.
         levelling: (4, 4) that took the points of a tilted cloud into the frame of the grid; None where it was level.
         raised: is it a robot's grid or a drawing, whose walls were all raised alike (`slices.is_raised`)?
         flat: is it a slice, in which nothing tells walls from what else stands about (`slices.is_slice`)?

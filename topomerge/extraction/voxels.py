@@ -156,7 +156,7 @@ def voxelise(
     fine: LatticeCells | None = None,
 ) -> VoxelGrid:
     """Return the occupied cells of a point cloud, with the properties ``count``, the number of points in each, and ``offset``,
-    where in it they lie on average (`cell_means`).
+    where in it they lie on average (`compute_cell_means`).
 
     V_min is a multiple of the edge length, so the cells of a cloud do not depend on what else is in the file or on its order.
 

@@ -213,7 +213,7 @@ class Assembler:
         return whole
 
     def _assemble(self) -> Assembly:
-        """Run `build`, of all maps at once."""
+        """Assemble, as `build`, all maps at once."""
         banned: set[tuple[int, int]] = set()
         while True:  # ends: each time one more pair is banned
             assembly = self._grow(banned)

@@ -54,7 +54,7 @@ def resample_cells(grid: VoxelGrid, placement: Placement | Sim3, origin: Array, 
 
 
 def _find_filled_cells(grid: VoxelGrid, chosen: slice, placement: Placement, origin: Array, edge: float) -> tuple[Array, Array]:
-    """Return `resampled` of some cells; cells may come twice."""
+    """Return what `resample_cells` does of some cells; cells may come twice."""
     pose, ratio = placement.pose, placement.pose.scale * grid.edge / edge
     wide = ratio * _find_stretch(placement.bend) * np.sqrt(0.5) + pose.scale * _find_slant(placement.bend, grid.edge) / edge
     places = grid.compute_centroids(grid.cells[chosen])
@@ -146,7 +146,7 @@ def transform_means(
     counts little. Of cells whose points are not known nothing is said.
 
     Args:
-        rows: (n,) of the grid's cells that fill the cells (n, 3) of the lattice, as of `resampled`.
+        rows: (n,) of the grid's cells that fill the cells (n, 3) of the lattice, as of `resample_cells`.
     """
     if "offset" not in grid.properties:
         return np.full((len(cells), 3), 0.5), np.zeros(len(cells))
@@ -169,7 +169,7 @@ def unite_codes(*codes: Array) -> Array:
 
 
 def decode_cells(codes: Array) -> Array:
-    """Return (n, 3) int64, the cells of `encoded`."""
+    """Return (n, 3) int64, the cells of `encode_cells`."""
     cells: Array = voxels.decode(codes).astype(np.int64) - CODE_OFFSET
     return cells
 

@@ -61,7 +61,7 @@ def interpolate_drift(knots, x, y):  # type: ignore[no-untyped-def]  # pragma: n
 
 @njit(cache=True, nogil=True)
 def interpolate_drifts(knots, places):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Return the (n, 2) `drift` of places (n, 2) float64."""
+    """Return the (n, 2) drift (`interpolate_drift`) of places (n, 2) float64."""
     out = np.zeros((len(places), 2))
     for k in range(len(places)):
         out[k, 0], out[k, 1] = interpolate_drift(knots, places[k, 0], places[k, 1])

@@ -327,7 +327,8 @@ def _count_in_bricks(
 
 
 def _split(points: NDArray[Any], shift: NDArray[Any], edge: float) -> Occupied:
-    """Return `occupied` for an extent too large for a table: a table around the median point, the points far from it sorted."""
+    """Return what `find_occupied_cells` does for an extent too large for a table: a table around the median point, the points far
+    from it sorted."""
     cells, parts = np.empty((len(points), 3), np.int64), np.zeros((len(points), 3), np.uint8)
     convert_to_lattice(points, shift, edge, cells, parts)
     finite = cells[:, 0] != np.iinfo(np.int64).min

@@ -202,7 +202,7 @@ def find_in_balls(
     cells: NDArray[np.int32], nodes: Nodes, table: NDArray[np.int32], centres: NDArray[np.float64], radius: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the CSR (indptr, ascending rows) of the cells within `radius` of (q, 3) centres, all in cells; `table` is
-    `lookup.build`'s."""
+    `voxels.build`'s."""
     indptr = np.zeros(len(centres) + 1, np.int64)
     rows = np.empty(0, np.int64)
     if not len(cells):

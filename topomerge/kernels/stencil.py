@@ -16,7 +16,7 @@ from topomerge.kernels import compile_ahead, run_in_slices
 from topomerge.kernels.voxels import find_row
 
 LEAST_CELLS = 2048  # of a slice
-Arrays2 = tuple[NDArray[Any], NDArray[Any]]  # table and bricks of `lookup.build`; offsets and weights of a stencil
+Arrays2 = tuple[NDArray[Any], NDArray[Any]]  # table and bricks of `voxels.build`; offsets and weights of a stencil
 _ONES = np.array([bin(i).count("1") for i in range(256)], np.int64)
 
 

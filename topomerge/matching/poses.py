@@ -139,7 +139,7 @@ def find_distinct_poses(poses: PoseArrays, point: Array, tolerance: PoseToleranc
 def select_distinct_hypotheses(
     hypotheses: Sequence[PoseHypothesis], point: Array, tolerance: PoseTolerance
 ) -> list[PoseHypothesis]:
-    """Return the first of each group of hypotheses whose poses are one. Arguments as of `distinct`."""
+    """Return the first of each group of hypotheses whose poses are one. Arguments as of `find_distinct_poses`."""
     return [
         hypotheses[row]
         for row in find_distinct_poses(PoseArrays.from_transforms([h.transform for h in hypotheses]), point, tolerance).tolist()

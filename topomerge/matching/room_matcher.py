@@ -183,7 +183,8 @@ def build_rooms_seen(rows: TurnedRows, quarters: int = 0) -> RoomsSeen:
 
 
 def run_network(a: RoomsSeen, b: RoomsSeen, matcher: Matcher) -> RoomOdds:
-    """Run the network on two maps as they are turned, stage by stage: before each of them, pairs of rooms vote (`agreement`)."""
+    """Run the network on two maps as they are turned, stage by stage: before each of them, pairs of rooms vote
+    (`compute_agreement`)."""
     feeds: dict[str, Array] = {}
     for side, map in (("a", a), ("b", b)):
         feeds |= {f"rows_{side}": map.rows, f"facts_{side}": map.facts, f"places_{side}": map.places - map.places.mean(axis=0)}
@@ -283,7 +284,7 @@ def find_best_scale(of_a: Rows, of_b: Rows, rows_at: RowsAt) -> tuple[float, tup
     Args:
         of_a: rows of the first map, whose scale is known.
         of_b: rows of the second one as it is.
-        rows_at: scale -> rows of the second one (`Learned.at_scales`).
+        rows_at: scale -> rows of the second one (`LearnedEmbedder.at_scales`).
     """
     if not compute_room_odds(of_a, of_b, likeliest=True):
         return 1.0, ()

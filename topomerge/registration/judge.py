@@ -58,8 +58,8 @@ class Judge:
         return {**_features(counts, max(gaps)), "sliced": float(sliced), "ceilings": unlike, "ceiling_area": area}
 
     def tally(self, pose: Sim3, step: int = 1) -> Array:
-        """Return (2, 11) of `align.tally`, m2 in a's frame: of the columns of b, and of those of a; of every n-th one, times
-        n."""
+        """Return (2, 11) of `kernels.registration.tally`, m2 in a's frame: of the columns of b, and of those of a; of every n-th
+        one, times n."""
         out = np.zeros((2, 11))
         back = pose.inverse()
         for v, w in pair_storeys(self.a, self.b, pose.translation[2], pose.scale):
@@ -177,7 +177,7 @@ class Side:
         return self._parts[step]
 
     def tally(self, on: Side, pose: Sim3, step: int) -> Array:
-        """Return (11,) of `align.tally`, m2."""
+        """Return (11,) of `kernels.registration.tally`, m2."""
         at = np.array([*pose.translation[:2], pose.yaw, np.log(pose.scale)])
         v = on.fields
         seen = (on.kind, v.to_wall, v.to_any, v.face, on.open, on.bits, v.plan.origin, v.plan.edge)

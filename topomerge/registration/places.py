@@ -38,7 +38,7 @@ class Crops:
     Args:
         parts: (k, 2, SIDE, SIDE) uint8, bits named `PARTS`; of the first map and of the second one.
         ceiling: (k, 2, SIDE, SIDE) uint8, height of the ceiling above the floor in steps (`CEILINGS`), 0 where none was seen;
-            those of the second map raised to those of the first one (`levelled`).
+            those of the second map raised to those of the first one (`level_ceilings`).
         looked: (k, 2, LOOKED) float32 of 0 and 1: what the maps looked at.
         middle: (k, 3) m, of the squares, in the first map's frame, on its floor.
         area: (k,) m2 of the tile that both maps saw.

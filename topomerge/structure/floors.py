@@ -89,7 +89,7 @@ def is_flight(edge: Any) -> bool:
 
 
 def find_inside_point(floor: shapely.MultiPolygon, requested: Array) -> Array:
-    """Return (2,) `wanted`, where that lies inside the floor, else a point that does, m."""
+    """Return (2,) `requested`, where that lies inside the floor, else a point that does, m."""
     point = shapely.Point(*requested[:2])
     if floor.is_empty or floor.contains(point):
         return np.asarray(requested[:2], np.float64)

@@ -441,7 +441,7 @@ class NetworkJob(ABC):
         write_network(self.network, folder)
 
     def export_best(self, folder: Path) -> None:
-        """Write the file of weights and its card, in the place of what `write_best` wrote."""
+        """Write the file of weights and its card, in the place of what `write_checkpoint` wrote."""
         if not (folder / NETWORK_FILE).exists():
             return
         read_network(self.network, folder)

@@ -149,7 +149,7 @@ def fit_rooms(evidence: Sequence[MatchEvidence], l2: float) -> Array:
 
 
 def predict_left_out(evidence: Sequence[MatchEvidence], settings: MatchOdds) -> tuple[Array, Array]:
-    """Return the `probabilities` of each building by models that were fitted without it."""
+    """Return the probabilities (`predict_probabilities`) of each building by models that were fitted without it."""
     names = sorted({e.building for e in evidence})
     fold = np.random.default_rng(0).permutation(len(names)) % settings.folds
     parts = []

@@ -295,7 +295,7 @@ def mark_watched(buildings: Sequence[str], every: int) -> Array:
 
 
 def read_scan_building(path: Path) -> str:
-    """Return the physical building of a cached scan (`pairs.scan_items`); each procedural one has a seed of its own.
+    """Return the physical building of a cached scan (`plan_examples.build_scans`); each procedural one has a seed of its own.
 
     Raises:
         InputError: the file is damaged.

@@ -156,7 +156,7 @@ def build_rooms(recipe: PlanRecipe, sharing: BuildSettings, log_line: LogFn = la
 
 
 def draw_room_item(seed: int, plans: Plans, flat: bool = False, surroundings: bool = False) -> RoomItem:
-    """Draw the item of a seed: that of `scan_items`."""
+    """Draw the item of a seed: that of `draw_item`."""
     return RoomItem(**asdict(draw_item(seed, plans, flat)), surroundings=surroundings)
 
 

@@ -226,7 +226,7 @@ class Augment:
         points: of each room that are taken; 0: all.
         noise: m, standard deviation of points.
         shift: pixels, standard deviation of the middles of rooms on their storeys.
-        walks: share of maps of which only what another walk would have seen is left (`other_sensors.simulate_partial_walk`).
+        walks: share of maps of which only what another walk would have seen is left (`batches.simulate_partial_walk`).
         slices: share of those that look like slices; rough: of those whose walls have gaps or are thicker.
         tilt: degrees, standard deviation of how far the direction of walls is taken wrong; of some maps four times as much.
         zoom: of a storey's size, likewise, as a logarithm; bend: pixels, of how far places 8 m apart drift.

@@ -82,7 +82,7 @@ class MergeBelief(TaskSettings):
             made anew, and the risks are measured).
         halves: runs of `place_evidence` on one half of the buildings each (half=1, half=2); a pair is judged by the network that
             did not see its building. Empty: by the one that ships.
-        lookalikes: none, judged (left-out models are tried on them) or fitted (they train, too; `belief_lookalikes`).
+        lookalikes: none, judged (left-out models are tried on them) or fitted (they train, too; `build_lookalike_rows`).
         alike, alike_heldout: the look-alikes to fit to and to judge on; alike_weight: of one of them.
     """
 

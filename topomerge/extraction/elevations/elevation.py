@@ -72,7 +72,7 @@ def unroll(faces: Array, navigable: VoxelGrid, cells: VoxelGrid, crossed: VoxelG
 
     Args:
         navigable: the navigable volume; of one with the property `standing`, the cells where a body fits.
-        cells: with the means of their points (`cell_means`), in the map's frame; 5 cm or as fine as there are.
+        cells: with the means of their points (`compute_cell_means`), in the map's frame; 5 cm or as fine as there are.
         crossed: cells that rays crossed and in which nothing stands; None: unknown.
     """
     sizes = 2 * np.ceil(faces["length"] / ALONG / 2).astype(np.int64)
@@ -96,7 +96,7 @@ def measure_crossed_places(crossed: VoxelGrid | None, faces: Array, sizes: Array
     """Return (n, 32, 3) float32 share of the heights of each of `FREE_HEIGHTS` at which rays went through an element.
 
     Args:
-        crossed: as of `wall_elevations`.
+        crossed: as of `unroll`.
         faces: (F,) FACE_DTYPE; sizes: (F,) places of their strips, even.
     """
     out = np.zeros((int(sizes.sum()), DEPTHS, len(FREE_HEIGHTS)), np.float32)

@@ -53,7 +53,7 @@ class SparseVoxelOctree:
         return octree.find_in_box(self.grid.cells, self._nodes, low, high)
 
     def find_in_radius(self, centre: Array, r: float) -> Array:
-        """Return (m,) int64 rows of the cells whose centroids lie within r m of a centre (see `radius_many`)."""
+        """Return (m,) int64 rows of the cells whose centroids lie within r m of a centre (see `find_in_radius_many`)."""
         centre = np.asarray(centre)
         if centre.shape != (3,):
             raise ValueError(f"a centre must be (3,), not {centre.shape}")

@@ -55,8 +55,8 @@ class Sighting:
         share: of the votes of the new map's rooms; over all maps that were compared they sum to 1.
         rooms: (room of the new map, room of this one, cosine of their rows), most alike first: rooms that are each other's most
             alike one in the other map.
-        fit: log odds that the best rigid pose of both maps is right, seen by itself (`coarse.coarse_log_odds`); None where none
-            was looked for.
+        fit: log odds that the best rigid pose of both maps is right, seen by itself (`partners.compute_coarse_log_odds`); None
+            where none was looked for.
         landmarks: rare strings that both hold, and what radio counts as, in such strings.
     """
 

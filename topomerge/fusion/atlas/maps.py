@@ -49,7 +49,7 @@ class Memory:
     """Maps by their keys, and answers to questions about them.
 
     Args:
-        coarse: by the keys of two maps, ascending, how likely they lie on each other (`coarse.coarse_log_odds`).
+        coarse: by the keys of two maps, ascending, how likely they lie on each other (`partners.compute_coarse_log_odds`).
     """
 
     def __init__(self, coarse: MutableMapping[tuple[str, str], float] | None = None) -> None:

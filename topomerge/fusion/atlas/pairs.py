@@ -221,7 +221,7 @@ class Checks:
         self._places: dict[tuple[int, int], list[tuple[Sim3, Array]]] = {}
 
     def locate_place(self, i: int, j: int, pose: Sim3) -> Array:
-        """Return the `place` of maps i and j (i < j) under T_ij."""
+        """Return the place (`locate_place`) of maps i and j (i < j) under T_ij."""
 
         def compute() -> Array:
             return locate_place(self.maps.get_prepared(i).storeys, self.maps.get_prepared(j).storeys, pose)

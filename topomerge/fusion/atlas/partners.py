@@ -50,7 +50,7 @@ def compute_vectors(rows: Rows, turns: int = 0) -> Array:
 
 
 def compute_queries(rows: Rows) -> Array:
-    """Return (T, R, ·) `vectors` of a map at each turn, T of 4 of turned rows and else 1."""
+    """Return (T, R, ·) vectors (`compute_vectors`) of a map at each turn, T of 4 of turned rows and else 1."""
     return np.stack([compute_vectors(rows, k) for k in range(QUARTERS if isinstance(rows, TurnedRows) else 1)])
 
 
@@ -95,7 +95,7 @@ def count_votes(rooms: Array, cosine: Array, turns: int, owner: Array, maps: int
     """Return (maps,) of the votes of a map's rooms; each has one, shared among its neighbours by how alike they are.
 
     Args:
-        rooms: (turns * R, n) neighbours of `queries`, one turn after the other.
+        rooms: (turns * R, n) neighbours of `compute_queries`, one turn after the other.
         cosine: of them.
         owner: (N,) map of each row of the table; -1: of none that counts.
         maps: their number. A map gets the votes at the turn that gives it the most.
@@ -192,7 +192,7 @@ def _get_memory() -> Memory:
 
 
 def score_coarsely(task: CoarseTask) -> tuple[float, ...]:
-    """Compute the log odds that each map but the first lies on the first one (`coarse.coarse_log_odds`)."""
+    """Compute the log odds that each map but the first lies on the first one (`compute_coarse_log_odds`)."""
     memory = _get_memory()
     memory.coarse = {}  # what an earlier task found may be of another scale
     maps = Maps(task.files, None, memory, task.keys)

@@ -22,7 +22,7 @@ class AtlasResult:
         maps: what was put in.
         names: of the maps, for messages.
         components: maps that lie in one frame, by their place in `maps`, each ascending; those with more than one map first. The
-            frame is that of the first map, or of the one that the first map replaced (`in_frames`).
+            frame is that of the first map, or of the one that the first map replaced (`transform_components`).
         transforms: k -> its pose in the frame of its component; of all maps, the first ones' is the identity as a rule.
         links: hypotheses that hold the components together.
         rejected: hypotheses that were believed by themselves and thrown out, as others contradict them.

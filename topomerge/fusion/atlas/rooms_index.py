@@ -149,7 +149,7 @@ class RoomRows:
         return [self._parse_rows(arrays, entry, float) for entry in entries]
 
     def compute_vectors(self, maps: Sequence[int]) -> Array:
-        """Return (N, D) `neighbours.vectors` of all rooms of some maps, one map after the other.
+        """Return (N, D) vectors (`partners.compute_vectors`) of all rooms of some maps, one map after the other.
 
         Raises:
             InputError: the file is damaged, or does not fit a map.
@@ -247,7 +247,7 @@ class RoomsIndex:
         self.keys, self.counts = [*self.keys, *keys], [*self.counts, *counts]
 
     def find_nearest(self, asked: Array, count: int = ROOM_NEIGHBOURS) -> tuple[Array, Array]:
-        """Find the rows of `neighbours.nearest` by the index: most of them, and cosines to about .01."""
+        """Find the rows of `partners.find_nearest` by the index: most of them, and cosines to about .01."""
         hits = self._graph.search(
             self._quantise(np.concatenate([asked, asked[:1]])), count
         )  # one alone has another kind of answer

@@ -370,7 +370,7 @@ class Journal(dict[Pair, tuple[PoseHypothesis, ...]]):
         settings: of the atlas.
 
     Attributes:
-        coarse: the coarse ones, log odds of pairs; written down, too (`coarse.coarse_log_odds`).
+        coarse: the coarse ones, log odds of pairs; written down, too (`partners.compute_coarse_log_odds`).
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:

@@ -109,7 +109,7 @@ class Bend:
         return self.transform.inverse().apply(self.deformations[0].undo(placed))
 
     def unbend_points(self, points: Array) -> Array:
-        """Return the inverse of `relative`."""
+        """Return the inverse of `bend_points`."""
         placed = self.deformations[0].apply(self.transform.apply(points))
         return self.deformations[1].undo(self.transform.inverse().apply(placed))
 
