@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import topomerge
-from tests.fusion.atlas.atlas_scenes import NAMES, office_map, stranger
+from tests.fusion.plans_of import MOVE, part
+from tests.scenes import Scene, two_rooms
 from topomerge.cli.main import main as cli
 from topomerge.fusion.atlas.folder import read_atlas
 from topomerge.fusion.atlas.solve import Journal, solve
@@ -20,11 +21,15 @@ Run = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Maps of an office's west and east and of another building, and an atlas of them."""
+    """Maps of a flat, of most of it in another frame, and of another building, and an atlas of them."""
     place = tmp_path_factory.mktemp("atlas")
-    for k in (0, 2):
-        topomerge.save_map(office_map(k), place / f"{NAMES[k]}.tmap")
-    topomerge.save_map(stranger(), place / "stranger.tmap")
+    scene = Scene().shell(0, 0, 13, 9).wall((5, 0), (5, 9), doors=(2.0,)).wall((5, 5), (13, 5), doors=(4.0,))
+    for x, y in ((0.1, 7.0), (5.2, 0.1), (5.2, 8.2)):  # cupboards: an empty rectangle looks the same upside down
+        scene.box(x, y, 0, x + 1.6, y + 0.7, 2)
+    flat = scene.points()
+    clouds = {"west": flat, "east": MOVE.apply(part(flat, high=(11, 99))), "stranger": two_rooms().points()}
+    for name, points in clouds.items():
+        topomerge.save_map(topomerge.extract(points.astype(np.float32), name=name), place / f"{name}.tmap")
     words = [str(place / f"{name}.tmap") for name in ("west", "east", "stranger")]
     assert cli(["atlas", "add", str(place / "house"), *words, "-q"]) == 0
     return place

@@ -87,27 +87,22 @@ def test_any_number_of_processes_gives_the_same_maps(clouds: list[str], began: l
         for name in ("room", "navigable_room", "rooms", "edges", "storeys", "areas", "windows"):
             assert getattr(one.map, name).tobytes() == getattr(other.map, name).tobytes(), name
         assert np.array_equal(one.map.grid.cells, other.map.grid.cells)
+        assert one.parts is None and other.parts is None  # what registration needs is drawn for who asks
         assert other.read_seconds > 0 and (other.extract_seconds > 0) == (one.extract_seconds > 0)
     assert not list_children()
 
 
 def test_processes_start_before_the_maps_are_asked_for(clouds: list[str], began: list[str], method: str) -> None:
-    """They import and read while a command checks what it was given."""
-    with inputs.InputMaps(clouds[:2], choose(2)) as maps:
+    """They import and read while a command checks what it was given, and draw what registration needs of a map."""
+    with inputs.InputMaps(clouds[:2], choose(2), prepares=True) as maps:
         assert len(list_children()) == 1 and not began
         loaded = list(maps)
         assert not list_children()  # they do not wait for the end of the command
     assert [one.map.source for one in loaded] == clouds[:2] and len(began) == 1
-    assert all(one.parts is None for one in loaded)  # they are drawn for who asks
+    assert all(one.parts is not None and one.parts["surface"] is not None for one in loaded)
     with inputs.InputMaps(clouds[:2], choose(2)):
         pass  # a command that refuses what it was given
     assert not list_children()
-
-
-def test_what_registration_needs_is_drawn_where_a_map_is_extracted(clouds: list[str], began: list[str], method: str) -> None:
-    with inputs.InputMaps(clouds[:2], choose(2), prepares=True) as maps:
-        loaded = list(maps)
-    assert len(began) == 1 and all(one.parts is not None and one.parts["surface"] is not None for one in loaded)
 
 
 def test_forked_processes_do_not_outlive_the_first(clouds: list[str]) -> None:
