@@ -103,3 +103,16 @@ def test_grid_refuses(arguments, message):
 def test_from_cells_refuses(cells):
     with pytest.raises(ValueError, match="cells"):
         VoxelGrid.from_cells(np.array(cells))
+
+
+def test_codes_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    counted: list[int] = []
+    encode = voxels.encode
+    monkeypatch.setattr(voxels, "encode", lambda cells: counted.append(len(cells)) or encode(cells))
+    grid = VoxelGrid.from_cells(np.array([[1, 2, 3], [0, 0, 1], [1, 2, 3]]))
+    some = grid.assign_properties(count=np.array([1, 2])).select_cells(np.array([True, False]))
+    assert counted == [3] and some.cells.tolist() == [[0, 0, 1]] and some.properties["count"].tolist() == [1]
+    loaded = VoxelGrid.from_codes(grid.codes, grid.origin, grid.edge, grid.shape)
+    assert counted == [3] and loaded.cells.tolist() == grid.cells.tolist()
+    with pytest.raises(ValueError, match="in Morton order"):
+        grid.select_cells(np.array([1, 0]))

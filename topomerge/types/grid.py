@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -95,13 +95,32 @@ class VoxelGrid:
         from topomerge.kernels import voxels  # here: numba takes a fifth of a second, and files are opened before
 
         cells = np.ascontiguousarray(cells, np.int32)
-        first = voxels.find_unique_rows(voxels.encode(cells))
+        codes = voxels.encode(cells)
+        first = voxels.find_unique_rows(codes)
         unique_cells = np.ascontiguousarray(cells[first])
         if shape is None:
             shape = tuple(int(s) + 1 for s in high) if len(unique_cells) else (1, 1, 1)  # type: ignore[assignment]
         assert shape is not None
         origin = np.zeros(3) if origin is None else np.asarray(origin, np.float64)
-        return VoxelGrid(unique_cells, origin, edge, shape, {k: v[first] for k, v in (properties or {}).items()})
+        chosen = {k: v[first] for k, v in (properties or {}).items()}
+        return VoxelGrid._build(codes[first], unique_cells, origin, edge, shape, chosen)
+
+    @staticmethod
+    def from_codes(
+        codes: Array, origin: Array, edge: float, shape: tuple[int, int, int], properties: Mapping[str, Array] | None = None
+    ) -> VoxelGrid:
+        """Return a grid of ascending Morton codes, (n,) uint64."""
+        from topomerge.kernels import voxels
+
+        return VoxelGrid._build(codes, voxels.decode(codes), origin, edge, shape, properties or {})
+
+    @staticmethod
+    def _build(codes: Array, *values: Any) -> VoxelGrid:
+        """A grid of the fields' values, whose codes are known: they are not computed again."""
+        grid = object.__new__(VoxelGrid)
+        grid.__dict__["codes"] = codes
+        grid.__init__(*values)  # type: ignore[misc]
+        return grid
 
     def __len__(self) -> int:
         return len(self.cells)
@@ -162,7 +181,8 @@ class VoxelGrid:
     def select_cells(self, mask: Array) -> VoxelGrid:
         """Return the same volume with only the masked cells (bool mask or ascending row numbers)."""
         cells = np.ascontiguousarray(self.cells[mask])
-        return replace(self, cells=cells, properties={k: v[mask] for k, v in self.properties.items()})
+        chosen = {k: v[mask] for k, v in self.properties.items()}
+        return VoxelGrid._build(self.codes[mask], cells, self.origin, self.edge, self.shape, chosen)
 
     def replace_cells(self, cells: Array, properties: Mapping[str, Array] | None = None) -> VoxelGrid:
         """Other cells (any order) of the same volume."""
@@ -175,7 +195,8 @@ class VoxelGrid:
 
     def assign_properties(self, **properties: Array) -> VoxelGrid:
         """Return the same cells with more properties."""
-        grid = replace(self, properties={**self.properties, **properties})
+        named = {**self.properties, **properties}
+        grid = VoxelGrid._build(self.codes, self.cells, self.origin, self.edge, self.shape, named)
         for index in ("_bricks", "_columns"):  # of the cells, which stay: don't make it twice
             if index in self.__dict__:
                 grid.__dict__[index] = self.__dict__[index]
