@@ -114,8 +114,18 @@ NEVER_FOR_ONE_MAP = (
     "scipy.optimize",
     "scipy.stats",
     "rich",
+    "http.server",
+    "numba.np.polynomial",  # of the compiler, which is set up only to compile
 )
-ONLY_TO_EXTRACT = ("scipy.spatial", "scipy.ndimage", "scipy.sparse", "shapely", "onnxruntime", "topomerge.extraction")
+ONLY_TO_EXTRACT = (
+    "scipy.linalg",
+    "scipy.spatial",
+    "scipy.ndimage",
+    "scipy.sparse",
+    "shapely",
+    "onnxruntime",
+    "topomerge.extraction",
+)
 
 
 @pytest.mark.longer

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.grids import COMPILED, cell_lists, grids, random_grid
 from topomerge.kernels import voxels
-from topomerge.types import VoxelGrid
+from topomerge.types import VoxelGrid, are_within, compute_extent
 
 
 @COMPILED
@@ -116,3 +116,13 @@ def test_codes_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert counted == [3] and loaded.cells.tolist() == grid.cells.tolist()
     with pytest.raises(ValueError, match="in Morton order"):
         grid.select_cells(np.array([1, 0]))
+
+
+@given(cell_lists(min_size=1))
+def test_extent_and_cells_within_it(cells):
+    cells = np.array(cells)
+    low, high = compute_extent(cells)
+    assert np.array_equal(low, cells.min(axis=0)) and np.array_equal(high, cells.max(axis=0)) and low.dtype == cells.dtype
+    for first, last in ((0, high), (low + 1, high + 1), (2, 5)):
+        assert np.array_equal(are_within(cells, first, last), ((cells >= first) & (cells < last)).all(axis=1))
+    assert are_within(np.zeros((2, 0, 3)), 0, 1).shape == (2, 0)

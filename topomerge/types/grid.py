@@ -37,9 +37,19 @@ def wrap_to_turn(angle: Any, turn: float) -> Any:
     return np.where(rest < turn, rest, 0.0)
 
 
-def _compute_extent(cells: Array) -> tuple[Array, Array]:
-    columns = cells.T  # a reduction along the rows is four times slower
+def compute_extent(cells: Array) -> tuple[Array, Array]:
+    """Return the least and the largest of (n, d) cells or points along each axis; along rows it would take ten times as long."""
+    columns = cells.T
     return np.array([c.min() for c in columns]), np.array([c.max() for c in columns])
+
+
+def are_within(cells: Array, low: Any, high: Any) -> Array:
+    """Return (...,) bool: is low <= cell < high along each axis, of (..., d) whole numbers? One axis after the other, which takes
+    a fifth as long as `all` of each row."""
+    inside = np.ones(cells.shape[:-1], bool)
+    for axis, bounds in enumerate(zip(*(np.broadcast_to(side, cells.shape[-1]).tolist() for side in (low, high)), strict=True)):
+        inside &= (cells[..., axis] >= bounds[0]) & (cells[..., axis] < bounds[1])
+    return inside
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +81,7 @@ class VoxelGrid:
         fits = all(0 < s <= AXIS_LIMIT for s in self.shape)
         require(fits, "grid shape {} is outside 1..{}", self.shape, AXIS_LIMIT)
         if len(self.cells):
-            low, high = _compute_extent(self.cells)
+            low, high = compute_extent(self.cells)
             require(bool((low >= 0).all() and (high < self.shape).all()), "cells {}..{} outside {}", low, high, self.shape)
             require(bool((self.codes[1:] > self.codes[:-1]).all()), "cells must be unique and in Morton order")
         for name, values in self.properties.items():
@@ -89,7 +99,7 @@ class VoxelGrid:
         cells = np.asarray(cells).reshape(-1, 3)
         if len(cells):  # before the codes: they hold 21 bits an axis, and a cell beyond would take the place of another
             require(np.issubdtype(cells.dtype, np.integer), "cells must be integers, not {}", cells.dtype)
-            low, high = _compute_extent(cells)
+            low, high = compute_extent(cells)
             inside = bool((low >= 0).all() and (high < AXIS_LIMIT).all())
             require(inside, "cells {}..{} not in 0..{}", low, high, AXIS_LIMIT)
         from topomerge.kernels import voxels  # here: numba takes a fifth of a second, and files are opened before
