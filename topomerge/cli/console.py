@@ -346,8 +346,8 @@ class _LateFinder:
 
 
 def postpone_imports() -> None:
-    """Let this process run `SELDOM_USED` when something of them is used, and leave documentation unread, which SciPy parses when
-    it is imported, for a tenth of a second."""
+    """Let this process run `SELDOM_USED` when something of them is used, and find no documentation, as with `python -OO`: SciPy
+    parses its own when it is imported, for a tenth of a second."""
     import inspect
 
     sys.meta_path.insert(0, _LateFinder)
