@@ -14,7 +14,7 @@ from topomerge.errors import InputError
 from topomerge.extraction.cleaning import add_means, coarsen_until_dense, compute_cell_means, label_groups
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.slices import raise_slice
-from topomerge.extraction.voxels import LatticeCells, voxelise
+from topomerge.extraction.voxels import LatticeCells, _compute_offsets, voxelise
 from topomerge.kernels import count_threads, set_thread_count, stencil
 from topomerge.kernels import occupied_cells as kernel
 from topomerge.types import PointCloud, VoxelGrid
@@ -285,3 +285,10 @@ def test_groups_are_those_of_a_dense_raster(density: float):
     group = label_groups(cells * 7 + RNG.integers(0, 7, cells.shape) - 30 * 7, 7)
     assert group.max() + 1 == count
     assert len(set(zip(group.tolist(), labels[dense].tolist(), strict=True))) == count
+
+
+def test_offsets_are_means_of_whole_numbers_rounded_half_up() -> None:
+    counts = np.array([1, 2, 3, 7, 2_000_000_000, 10**12])
+    for part in (0, 1, 128, 254, 255):
+        sums = np.column_stack([counts * part, np.minimum(counts * part + counts // 2, counts * 255), counts * part // 2])
+        assert np.array_equal(_compute_offsets(sums, counts), (sums + counts[:, None] // 2) // counts[:, None])

@@ -58,6 +58,25 @@ def test_a_merge_needs_no_others(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
 
 
+def test_compiled_loops_are_loaded_without_the_compiler() -> None:
+    """Each symbol that their code names is found, and the rest of numba stays away."""
+    code = """
+import sys, numpy as np
+from numba.core.sigutils import normalize_signature
+from topomerge.kernels import ahead, octree, voxels
+for loop, signatures in ahead.load_loops().items():
+    for signature in signatures:
+        loop.compile(normalize_signature(f"({signature},)")[0])
+    assert sum(loop.stats.cache_hits.values()) == len(signatures), loop
+assert voxels.decode(voxels.encode(np.array([[1, 2, 3]]))).tolist() == [[1, 2, 3]]
+print("numba.np.polynomial.polynomial_core" in sys.modules, "scipy.linalg" in sys.modules)
+import numba
+assert numba.njit(lambda x: np.sqrt(x).sum())(np.ones(3)) == 3  # the compiler, where it is needed after all
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=100)
+    assert (done.returncode, done.stdout) == (0, "False False\n"), done.stderr
+
+
 @pytest.mark.slow
 def test_two_processes_compile_each_loop_once(tmp_path: Path) -> None:
     code = "import topomerge.kernels"

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.grids import COMPILED, cell_lists, grids, random_grid
 from topomerge.kernels import voxels
-from topomerge.types import VoxelGrid
+from topomerge.types import VoxelGrid, are_within, compute_extent
 
 
 @COMPILED
@@ -103,3 +103,26 @@ def test_grid_refuses(arguments, message):
 def test_from_cells_refuses(cells):
     with pytest.raises(ValueError, match="cells"):
         VoxelGrid.from_cells(np.array(cells))
+
+
+def test_codes_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    counted: list[int] = []
+    encode = voxels.encode
+    monkeypatch.setattr(voxels, "encode", lambda cells: counted.append(len(cells)) or encode(cells))
+    grid = VoxelGrid.from_cells(np.array([[1, 2, 3], [0, 0, 1], [1, 2, 3]]))
+    some = grid.assign_properties(count=np.array([1, 2])).select_cells(np.array([True, False]))
+    assert counted == [3] and some.cells.tolist() == [[0, 0, 1]] and some.properties["count"].tolist() == [1]
+    loaded = VoxelGrid.from_codes(grid.codes, grid.origin, grid.edge, grid.shape)
+    assert counted == [3] and loaded.cells.tolist() == grid.cells.tolist()
+    with pytest.raises(ValueError, match="in Morton order"):
+        grid.select_cells(np.array([1, 0]))
+
+
+@given(cell_lists(min_size=1))
+def test_extent_and_cells_within_it(cells):
+    cells = np.array(cells)
+    low, high = compute_extent(cells)
+    assert np.array_equal(low, cells.min(axis=0)) and np.array_equal(high, cells.max(axis=0)) and low.dtype == cells.dtype
+    for first, last in ((0, high), (low + 1, high + 1), (2, 5)):
+        assert np.array_equal(are_within(cells, first, last), ((cells >= first) & (cells < last)).all(axis=1))
+    assert are_within(np.zeros((2, 0, 3)), 0, 1).shape == (2, 0)

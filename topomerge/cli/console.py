@@ -328,7 +328,8 @@ def write_all(outputs: Sequence[tuple[str | Path, Callable[[Path], None]]]) -> N
                 _resolve_path(path).unlink(missing_ok=True)
 
 
-NEVER_USED = ("numpy.f2py", "numpy.testing")  # but imported by SciPy, with all that they import: a tenth of its import
+# Imported by SciPy and numba, with all that they import; what uses one of them waits for it then.
+SELDOM_USED = ("numpy.f2py", "numpy.testing", "numpy.ma", "scipy.spatial.transform", "yaml")
 
 
 class _LateFinder:
@@ -336,7 +337,7 @@ class _LateFinder:
 
     @staticmethod
     def find_spec(name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
-        if name not in NEVER_USED:
+        if name not in SELDOM_USED:
             return None
         from importlib.util import LazyLoader
 
@@ -347,8 +348,12 @@ class _LateFinder:
 
 
 def postpone_imports() -> None:
-    """Let this process run `NEVER_USED` when something of them is used."""
+    """Let this process run `SELDOM_USED` when something of them is used, and find no documentation, as with `python -OO`: SciPy
+    parses its own when it is imported, for a tenth of a second."""
+    import inspect
+
     sys.meta_path.insert(0, _LateFinder)
+    inspect.getdoc = lambda thing: None
 
 
 COMPILER = f"{os.sep}llvmlite{os.sep}"

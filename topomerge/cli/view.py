@@ -40,7 +40,7 @@ def run_view(args: argparse.Namespace) -> int:
         else:
             print_text(str(page))
         return 0
-    from topomerge.viz.report import serve
+    from topomerge.viz.report_server import serve
 
     with tempfile.TemporaryDirectory(prefix="topomerge-") as scratch:
         serve(_prepare_page(args, scratch), args.serve, _show if args.open else _print_address)

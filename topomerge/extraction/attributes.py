@@ -17,7 +17,7 @@ from topomerge.extraction.plans.storey_plan import Floor
 from topomerge.extraction.room_odds import add_room_probabilities
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.topology import LEVEL_KINDS
-from topomerge.types import EDGE_DTYPE, Array, TopometricMap, select_rooms
+from topomerge.types import EDGE_DTYPE, Array, TopometricMap, compute_extent, select_rooms
 
 # A doorway joins the two rooms that lie across it, once (beyond the thesis).
 #
@@ -244,8 +244,9 @@ def remove_strokes(map: TopometricMap) -> TopometricMap:
     stays = np.isin(np.arange(count), map.edges["rooms"])
     for room in np.flatnonzero(~stays).tolist():
         at = map.navigable.cells[map.navigable_room == room][:, :2].astype(np.int64)
-        low = at.min(axis=0) - 1
-        floor = np.zeros(at.max(axis=0) - low + 2, np.uint8)
+        low, high = compute_extent(at)
+        low -= 1
+        floor = np.zeros(high - low + 2, np.uint8)
         floor[tuple((at - low).T)] = 1
         stays[room] = edt.edt(floor, parallel=1).max() * map.navigable.edge >= STROKE_HALF_WIDTH
     stays |= ~np.isin(storey, storey[stays])

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from topomerge.errors import InputError
 from topomerge.extraction.convolution import build_moore, convolve
 from topomerge.kernels.occupied_cells import OFFSET_STEPS
-from topomerge.types import Array, VoxelGrid
+from topomerge.types import Array, VoxelGrid, compute_extent
 
 # Where the points of a cell lie on average: surfaces are known better by it than by the cell alone.
 #
@@ -132,7 +132,8 @@ def select_largest_place(cells: Array, counts: Array, edge: float) -> tuple[Arra
 
 def compute_box_volume(cells: Array) -> float:
     """Return cells of a box of whole bricks: what the lookup table has to cover."""
-    shape = np.ptp(cells, axis=0) + 1
+    low, high = compute_extent(cells)
+    shape = high - low + 1
     return float(np.prod(((shape + 7) // 8 * 8).astype(np.float64)))
 
 
@@ -180,7 +181,8 @@ def _is_not_stray(cells: Array, edge: float) -> Array:
 
 def _columns(cells: Array) -> float:
     """Count the columns of the rectangle around cells, with the margin that a plan has."""
-    size = np.ptp(cells[:, :2], axis=0) + 1 + 2 * PLACE_MARGIN
+    low, high = compute_extent(cells[:, :2])
+    size = high - low + 1 + 2 * PLACE_MARGIN
     return float(size[0]) * float(size[1])
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from topomerge.extraction.convolution import LENGTH_SLACK, Kernel, build_circle, build_von_neumann, count_at, is_any_at
 from topomerge.kernels import rasters as kernel
-from topomerge.types import Array, VoxelGrid
+from topomerge.types import Array, VoxelGrid, are_within, compute_extent
 
 # Connected components (seeds 2.3.3).
 
@@ -59,8 +59,9 @@ def compute_horizontal_distance_field(grid: VoxelGrid) -> Array:
         if not len(rows):
             continue
         cells = grid.cells[rows, :2]
-        low = cells.min(axis=0) - 1
-        plan = np.zeros(cells.max(axis=0) - low + 2, bool)
+        low, high = compute_extent(cells)
+        low -= 1
+        plan = np.zeros(high - low + 2, bool)
         at = tuple((cells - low).T)
         plan[at] = True
         # squared distances are whole numbers: rounding them keeps the root exact
@@ -127,7 +128,7 @@ def bridge_gaps(grid: VoxelGrid, standing: VoxelGrid, stick: Kernel, reach: floa
         columns = _find_closing_columns(near, radius)
         added.append(np.column_stack([columns, np.full(len(columns), z)]).astype(np.int32))
     new = np.concatenate(added)
-    new = new[((new >= 0) & (new < grid.shape)).all(axis=1)]
+    new = new[are_within(new, 0, grid.shape)]
     new = new[~is_any_at(grid, new, stick)]
     return grid.replace_cells(np.concatenate([standing.cells, new]))
 
@@ -147,13 +148,14 @@ def _find_closing_columns(columns: Array, radius: float) -> Array:
     for corner in tile[firsts]:
         # closing looks twice as far as its radius
         low, high = corner * CLOSING_TILE - margin, (corner + 1) * CLOSING_TILE + margin
-        window = columns[((columns >= low) & (columns < high)).all(axis=1)]
-        start = np.maximum(window.min(axis=0) - margin, low)
-        plan = np.zeros(np.minimum(window.max(axis=0) + margin + 1, high) - start, bool)
+        window = columns[are_within(columns, low, high)]
+        first, last = compute_extent(window)
+        start = np.maximum(first - margin, low)
+        plan = np.zeros(np.minimum(last + margin + 1, high) - start, bool)
         plan[tuple((window - start).T)] = True
         closed = ~_near(~_near(plan, radius), radius) & ~plan
         cells = np.argwhere(closed) + start
-        added.append(cells[(cells // CLOSING_TILE == corner).all(axis=1)])
+        added.append(cells[are_within(cells, corner * CLOSING_TILE, (corner + 1) * CLOSING_TILE)])
     return np.concatenate(added)
 
 

@@ -24,7 +24,7 @@ from topomerge.extraction.completeness import WALL_SIGHT
 from topomerge.extraction.storeys import measure_floor_to_ceiling
 from topomerge.kernels.rays import is_seen_from
 from topomerge.numpy_nn import sigmoid
-from topomerge.types import ROOM_ODDS, Array, TopometricMap, select_lowest_of_column
+from topomerge.types import ROOM_ODDS, Array, TopometricMap, are_within, compute_extent, select_lowest_of_column
 
 # What tells a room that somebody was in from one that was only looked into: a row of numbers a room, and one of its poses.
 #
@@ -178,11 +178,12 @@ def _iter_storey_floors(map: TopometricMap) -> Iterator[_StoreyFloor]:
         if not mine.any():
             continue
         at = lowest.cells[mine][:, :2].astype(np.int64) // factor
-        low = at.min(axis=0) - 1
-        shape, at = at.max(axis=0) - low + 2, tuple((at - low).T)
+        low, high = compute_extent(at)
+        low -= 1
+        shape, at = high - low + 2, tuple((at - low).T)
         tall = (z > level + WALL_SIGHT[0]) & (z < level + WALL_SIGHT[1])
         filled = map.grid.cells[tall][:, :2].astype(np.int64) // factor - low
-        filled = filled[((filled >= 0) & (filled < shape)).all(axis=1)]
+        filled = filled[are_within(filled, 0, shape)]
         label, flags, height = np.full(shape, -1), np.zeros((3, *shape), bool), np.zeros(shape)
         label[at], height[at] = room[mine], floor_z[mine] - level
         flags[0][at], flags[1][at] = above[mine], standing[mine]

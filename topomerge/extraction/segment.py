@@ -37,7 +37,7 @@ from topomerge.extraction.scan import Scan
 from topomerge.extraction.slices import is_raised
 from topomerge.extraction.storeys import NOWHERE, find_storeys, measure_floor_to_ceiling
 from topomerge.numpy_nn import sigmoid
-from topomerge.types import Array, VoxelGrid
+from topomerge.types import Array, VoxelGrid, are_within
 
 Scorer = Callable[[Array, Sequence[Passage]], Array]  # (n, 17) features and passages -> (n,) probability of a door
 PLAN_CELL = 0.1  # m: finer grids are looked at with about this
@@ -180,7 +180,7 @@ def find_segments(storeys: Sequence[SegmentedStorey], places: Array) -> Array:
     for storey in storeys:
         plan = storey.plan
         at = np.floor((places[:, :2] - plan.origin) / plan.edge).astype(np.int64)
-        inside = np.flatnonzero(((at >= 0) & (at < plan.wall.shape)).all(axis=1))
+        inside = np.flatnonzero(are_within(at, 0, plan.wall.shape))
         column = tuple(at[inside].T)
         above = places[inside, 2] - plan.floor[column]
         own = (np.abs(above) < SAME_LEVEL) & (np.abs(above) < nearest[inside])

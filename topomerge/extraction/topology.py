@@ -16,7 +16,16 @@ from topomerge.extraction.plans.storey_plan import Floor
 from topomerge.extraction.storeys import estimate_ceiling_height, measure_floor_to_ceiling
 from topomerge.extraction.zones import compute_merge_levels
 from topomerge.kernels.rasters import count_steps
-from topomerge.types import AREA_DTYPE, EDGE_DTYPE, ROOM_DTYPE, Array, TopometricMap, VoxelGrid, select_lowest_of_column
+from topomerge.types import (
+    AREA_DTYPE,
+    EDGE_DTYPE,
+    ROOM_DTYPE,
+    Array,
+    TopometricMap,
+    VoxelGrid,
+    compute_extent,
+    select_lowest_of_column,
+)
 
 # Where two rooms meet: doors, openings and stairs (seeds 2.7).
 
@@ -187,8 +196,9 @@ def _find_narrowest_place(navigable: VoxelGrid, room: Array, pair: Array, contac
     Borders between clusters of views lie somewhere near a door, not in it; the floor itself is narrowest in the door.
     """
     reach = int(np.ceil(DOOR_SEARCH / navigable.edge))
-    low = contact[:, :2].min(axis=0) - reach
-    size = contact[:, :2].max(axis=0) + reach + 1 - low
+    low, high = compute_extent(contact[:, :2])
+    low -= reach
+    size = high + reach + 1 - low
     owner = _rasterise_rooms(navigable, room, low, size, contact)
     free = np.pad(owner >= 0, 1)
     clearance = np.sqrt(edt.edtsq(free.view(np.uint8), parallel=1))[1:-1, 1:-1]
@@ -241,8 +251,8 @@ def _rasterise_rooms(navigable: VoxelGrid, room: Array, low: Array, size: Array,
     reach = int(LEVEL_HEIGHT / navigable.edge)
     middle = round(float(contact[:, 2].mean()))
     levels = np.arange(middle - reach, middle + reach + 1)
-    columns = np.argwhere(np.ones(size, bool)) + low
-    cells = np.column_stack([np.tile(columns, (len(levels), 1)), np.repeat(levels, len(columns))])
+    cells = np.empty((len(levels), *size, 3), np.int64)
+    cells[..., 2], cells[..., 0], cells[..., 1] = np.ix_(levels, low[0] + np.arange(size[0]), low[1] + np.arange(size[1]))
     row = navigable.find_rows(cells)
     label = np.where(row >= 0, room[np.maximum(row, 0)], -1)
     return label.reshape(len(levels), *size).max(axis=0)
@@ -376,14 +386,14 @@ def measure_room(
     """
     cells = navigable.cells[floor]
     area, height = _measure_area(cells[:, :2], navigable.edge, body_width), estimate_ceiling_height(above)
-    box = grid.cells[occupied] if len(occupied) else cells
+    low, high = compute_extent(grid.cells[occupied] if len(occupied) else cells)
     return {
         "centroid": navigable.compute_centroids(cells).mean(axis=0),
         "area": area,
         "height": height,
         "volume": area * height,
-        "lo": grid.origin + box.min(axis=0) * grid.edge,
-        "hi": grid.origin + (box.max(axis=0) + 1) * grid.edge,
+        "lo": grid.origin + low * grid.edge,
+        "hi": grid.origin + (high + 1) * grid.edge,
         "cells": len(occupied),
     }
 
@@ -392,8 +402,9 @@ def _measure_area(columns: Array, edge: float, body_width: float) -> float:
     """Measure the floor, m2: the navigable columns, the strip along the walls in which the body does not fit, and half a cell
     more along the boundary, because a wall's face lies on average in the middle of its cell."""
     reach = int(np.ceil(body_width / edge - 1e-6)) // 2
-    low = columns.min(axis=0) - reach - 1
-    plan = np.zeros(columns.max(axis=0) - low + reach + 2, bool)
+    low, high = compute_extent(columns)
+    low -= reach + 1
+    plan = np.zeros(high - low + reach + 2, bool)
     plan[tuple((columns - low).T)] = True
     if reach:
         plan = ndimage.binary_dilation(plan, np.ones((2 * reach + 1, 2 * reach + 1)))

@@ -13,7 +13,7 @@ from topomerge.errors import InputError
 from topomerge.extraction.cleaning import compute_box_volume, select_largest_place, select_without_strays
 from topomerge.kernels import count_threads, voxels
 from topomerge.kernels import occupied_cells as kernel
-from topomerge.types import Array, PointCloud, VoxelGrid
+from topomerge.types import Array, PointCloud, VoxelGrid, are_within, compute_extent
 
 # Lattice cells of a cloud that comes in chunks: 40 bytes a cell, and at most two and a half times that while runs are united.
 
@@ -72,7 +72,7 @@ class LatticeCells:
         numbers = cells - self._origin
         near = bool(numbers.min(initial=0) >= 0 and numbers.max(initial=0) < voxels.AXIS_LIMIT)
         if not near:
-            inside = ((numbers >= 0) & (numbers < voxels.AXIS_LIMIT)).all(axis=1)
+            inside = are_within(numbers, 0, voxels.AXIS_LIMIT)
             self._far.append((cells[~inside], counts[~inside], sums[~inside]))
             if sum(len(part[0]) for part in self._far[1:]) * FAR_RATIO > len(self._far[0][0]):
                 self._far = [_unite_cells(self._far)]
@@ -113,10 +113,9 @@ class LatticeCells:
         for first in range(0, len(codes), BLOCK):
             block = slice(first, first + BLOCK)
             numbers = voxels.decode(codes[block]) - base
-            inside = ((numbers >= 0) & (numbers < size)).all(axis=1)
-            count = counts[block][inside, None]
+            inside = are_within(numbers, 0, size)
             cells.append(numbers[inside].astype(np.int32))
-            offsets.append(((sums[block][inside] + count // 2) // np.maximum(count, 1)).astype(np.uint8))
+            offsets.append(_compute_offsets(sums[block][inside], counts[block][inside]))
         shape = (int(size[0]), int(size[1]), int(size[2]))
         return VoxelGrid.from_cells(np.concatenate(cells), grid.origin, self.edge, shape, {"offset": np.concatenate(offsets)})
 
@@ -135,6 +134,12 @@ def _choose_origin(points: Array, shift: Array, edge: float) -> Array | None:
             middle = np.floor((np.median(some.astype(np.float64), axis=0) + shift) / edge).astype(np.int64)
             return (middle >> 4 << 4) - voxels.AXIS_LIMIT // 2
     return None
+
+
+def _compute_offsets(sums: Array, counts: Array) -> Array:
+    """Return (n, 3) uint8 means of sums (n, 3) over counts (n,), rounded half up: by floats, which are exact for whole numbers of
+    this size, as processors divide these several times faster."""
+    return ((sums + counts[:, None] // 2) / counts[:, None]).astype(np.uint8)
 
 
 def _unite_cells(parts: list[_Cells]) -> _Cells:
@@ -197,8 +202,8 @@ def voxelise(
         check = "check --unit, --scale or --resolution, or crop the file"
         raise InputError(f"the points span {extent} m: too large for {edge:g} m voxels; {check}")
     size = (int(shape[0]), int(shape[1]), int(shape[2]))
-    offset = (sums + counts[:, None] // 2) // counts[:, None]
-    return VoxelGrid.from_cells(cells - base, base * edge, edge, size, {"count": counts, "offset": offset.astype(np.uint8)})
+    properties = {"count": counts, "offset": _compute_offsets(sums, counts)}
+    return VoxelGrid.from_cells(cells - base, base * edge, edge, size, properties)
 
 
 def _add_chunks(chunks: Iterable[PointCloud], lattices: Sequence[LatticeCells]) -> None:
@@ -219,8 +224,8 @@ def _add_chunks(chunks: Iterable[PointCloud], lattices: Sequence[LatticeCells]) 
 
 
 def _compute_box(cells: Array) -> tuple[Array, Array]:
-    low = cells.min(axis=0)
-    return low, cells.max(axis=0) - low + 1
+    low, high = compute_extent(cells)
+    return low, high - low + 1
 
 
 def warn(warnings: list[str] | None, message: str) -> None:

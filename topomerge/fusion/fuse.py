@@ -47,7 +47,19 @@ from topomerge.kernels.occupied_cells import OFFSET_STEPS
 from topomerge.matching.consistency import find_matches
 from topomerge.matching.room_plans import build_room_plans
 from topomerge.registration.storeys import is_extruded
-from topomerge.types import JOINED, LEVELLED, Array, Deformation, Placement, Sim3, TopometricMap, VoxelGrid, is_level
+from topomerge.types import (
+    JOINED,
+    LEVELLED,
+    Array,
+    Deformation,
+    Placement,
+    Sim3,
+    TopometricMap,
+    VoxelGrid,
+    are_within,
+    compute_extent,
+    is_level,
+)
 
 ALIKE_EDGES = 0.8  # ratio of edge lengths: cells of another map that are not smaller than that keep those of the first
 PROVENANCE_BITS = 32  # maps that one bit set tells apart
@@ -236,8 +248,8 @@ class _JoinedCells:
         occupied = occupied[(occupied[:, 2] >= low - 3) & (occupied[:, 2] <= high + 3)]
         if not len(occupied):
             return np.zeros(len(cells), bool)
-        corner = np.minimum(occupied.min(axis=0), cells.min(axis=0))[:2]
-        shape = np.maximum(occupied.max(axis=0), cells.max(axis=0))[:2] - corner + 1
+        corner, high = compute_extent(np.concatenate([occupied[:, :2], cells[:, :2]]))
+        shape = high - corner + 1
         mask = np.zeros(shape, bool)
         mask[tuple((occupied[:, :2] - corner).T)] = True
         mask = ndimage.binary_dilation(mask, iterations=max(round(ASSUMED_MARGIN / self.edge), 1))
@@ -255,7 +267,7 @@ def _build_joined(
         parts: the same maps as they lie in the joined one.
     """
     cells = decode_cells(joined.codes)
-    base = 2 * (cells.min(axis=0) // 2)  # even: free cells are twice as long
+    base = 2 * (compute_extent(cells)[0] // 2)  # even: free cells are twice as long
     tables: dict[str, Array] = {"provenance": joined.provenance, "room": joined.room}
     grid = VoxelGrid.from_cells(cells - base, joined.origin + base * joined.edge, joined.edge, properties=tables)
     provenance, label = grid.properties["provenance"], grid.properties["room"]
@@ -287,7 +299,7 @@ def _build_free_space(joined: _JoinedCells, grid: VoxelGrid, base: Array) -> Vox
     if not len(joined.free_codes):
         return None
     free_cells = decode_cells(joined.free_codes) - base // 2
-    free_cells = free_cells[((free_cells >= 0) & (free_cells < -(-np.array(grid.shape) // 2))).all(axis=1)]
+    free_cells = free_cells[are_within(free_cells, 0, -(-np.array(grid.shape) // 2))]
     x, y, z = (-(-s // 2) for s in grid.shape)
     free = VoxelGrid.from_cells(free_cells, grid.origin, 2 * grid.edge, (x, y, z))
     return free.select_cells(~grid.coarsen(2).contains(free.cells))

@@ -26,7 +26,7 @@ from topomerge.extraction.scan import Scan
 from topomerge.extraction.segment import LEAST_ROOM
 from topomerge.extraction.storeys import find_storeys, measure_floor_to_ceiling
 from topomerge.progress import Stopwatch
-from topomerge.types import Array, TopometricMap, VoxelGrid
+from topomerge.types import Array, TopometricMap, VoxelGrid, are_within
 
 SAME_SHARE = 0.5  # of the floor of the smaller of two rooms, in the larger one: they are one
 DOUBT_SHARE, DOUBT_AREA = 0.1, 1.0  # of it, and m2: of less, walls lie a little off; of more, nobody knows whose it is
@@ -62,7 +62,7 @@ def select_part_floor(part: TopometricMap, cells: Array, rows: Array, grid: Voxe
         cells, rows: (k, 3) cells of the joined grid that its navigable cells fill, and (k,) which do.
     """
     assert part.navigable_area is not None
-    inside = (part.navigable_room[rows] >= 0) & ((cells >= 0) & (cells < grid.shape)).all(axis=1)
+    inside = (part.navigable_room[rows] >= 0) & are_within(cells, 0, grid.shape)
     rows, standing = rows[inside], part.navigable.properties.get("standing")
     complete = standing is not None
     stands = np.ones(len(rows), bool) if standing is None else np.asarray(standing, bool)[rows]

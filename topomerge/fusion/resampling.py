@@ -14,7 +14,7 @@ from topomerge.extraction.cleaning import compute_cell_means
 from topomerge.kernels import registration as kernel
 from topomerge.kernels import run_in_slices, voxels
 from topomerge.kernels.voxels import build, find_filled_cells, find_unique_rows
-from topomerge.types import Array, Placement, Sim3, VoxelGrid
+from topomerge.types import Array, Placement, Sim3, VoxelGrid, are_within, compute_extent
 from topomerge.types.placement import BETWEEN_STOREYS, Deformation
 
 RESAMPLED_AT_ONCE = 200_000  # cells
@@ -104,8 +104,9 @@ def _find_columns(cells: Array) -> tuple[Array, Array]:
     """Return (c,) row of a cell (n, 3) of each column, and (n,) the column of each cell; each cell by itself where they are too
     thinly spread for a raster."""
     at = cells[:, :2].astype(np.int64)
-    at -= at.min(axis=0)
-    size = int(at[:, 0].max() + 1), int(at[:, 1].max() + 1)
+    low, high = compute_extent(at)
+    at -= low
+    size = int(high[0] - low[0] + 1), int(high[1] - low[1] + 1)
     rows = np.arange(len(cells))
     if size[0] * size[1] > THINLY_SPREAD * len(cells):
         return rows, rows
@@ -152,8 +153,9 @@ def transform_means(
         return np.full((len(cells), 3), 0.5), np.zeros(len(cells))
     within = (placement.transform_points(compute_cell_means(grid))[rows] - origin) / edge - cells
     inside = np.clip(within, 0, 1)
+    same = inside == within
     points = np.asarray(grid.properties.get("count", np.ones(len(grid))), np.float64)[rows]
-    return inside, points * np.where((inside == within).all(axis=1), 1.0, FILLED_WEIGHT)
+    return inside, points * np.where(same[:, 0] & same[:, 1] & same[:, 2], 1.0, FILLED_WEIGHT)
 
 
 def encode_cells(cells: Array) -> Array:
@@ -188,8 +190,9 @@ def find_wall_copies(first: Seen, second: Seen, edge: float) -> Array:
     if not near:
         return np.full(len(second[0]), -1, np.int64)
     offsets = np.array(sorted(near, key=lambda o: (o[0] ** 2 + o[1] ** 2, o)), np.int64)
-    low = 2 * ((np.minimum(first[0].min(axis=0), second[0].min(axis=0)) - AROUND) // 2)
-    high = np.maximum(first[0].max(axis=0), second[0].max(axis=0)) + AROUND + 1 - low
+    lows, highs = zip(compute_extent(first[0]), compute_extent(second[0]), strict=True)
+    low = 2 * ((np.minimum(*lows) - AROUND) // 2)
+    high = np.maximum(*highs) + AROUND + 1 - low
     tables = [_build_table(cells - low, high) for cells in (first[0], second[0])]
     tables += [_build_table(cells - low // 2, high // 2 + 1) for cells in (first[1], second[1])]
     cells = np.ascontiguousarray(second[0] - low)
@@ -203,6 +206,6 @@ def find_wall_copies(first: Seen, second: Seen, edge: float) -> Array:
 
 def _build_table(cells: Array, size: Array) -> tuple[Array, Array]:
     """Build the look-up (`kernels.voxels.build`) of those cells that lie in a volume of so many cells."""
-    inside = ((cells >= 0) & (cells < size)).all(axis=1)
+    inside = are_within(cells, 0, size)
     x, y, z = size.tolist()
     return build(np.ascontiguousarray(cells[inside]), (x, y, z))

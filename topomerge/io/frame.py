@@ -33,7 +33,8 @@ def get_axis_rotation(up: str) -> Array:
 def transform_points(points: Array, rotation: Array, factor: float) -> Array:
     """Return (n, 3) float64 points in metres, z up."""
     with np.errstate(over="ignore", invalid="ignore"):
-        scaled = np.asarray(points, np.float64) * factor
+        scaled = np.asarray(points, np.float64)
+        scaled = scaled if factor == 1 else scaled * factor
         if np.array_equal(rotation, np.eye(3)):
             return scaled
         # A product with the matrix would spread one axis's nan and inf to all; the turn only swaps axes and signs.

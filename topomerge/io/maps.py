@@ -240,9 +240,7 @@ def _unpack(arrays: dict[str, Array], name: str) -> VoxelGrid:
     if offset is not None and (offset.dtype != np.uint8 or offset.shape != (len(codes), 3)):
         raise ValueError(f"the points of the cells of {name} have no proper offsets")
     x, y, z = shape.tolist()
-    from topomerge.kernels import voxels  # here: a file that is no map is told without numba
-
-    return VoxelGrid(voxels.decode(codes), frame[:3].copy(), float(frame[3]), (x, y, z), properties)
+    return VoxelGrid.from_codes(codes, frame[:3].copy(), float(frame[3]), (x, y, z), properties)
 
 
 def _require_usable_frame(name: str, origin: Array, edge: float) -> None:

@@ -178,8 +178,10 @@ class Gatherer:
         if self.shift is None and len(part.points):
             self.shift = frame.choose_shift(part.points)
         self.sample.add(part.points)
-        shift = np.zeros(3) if self.shift is None else self.shift
-        return replace(part, points=(part.points - shift).astype(np.float32))
+        near = np.empty(part.points.shape, np.float32)
+        for axis, shift in enumerate((0.0, 0.0, 0.0) if self.shift is None else self.shift.tolist()):
+            near[:, axis] = part.points[:, axis] - shift
+        return replace(part, points=near)
 
     def _emit_cloud(self, part: _Part) -> Iterator[PointCloud]:
         assert self.shift is not None

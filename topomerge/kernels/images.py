@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -160,16 +162,15 @@ def _find_touched_tiles(frames: Floats, along: Floats, across: float, low: Float
     """Return the (n, 2) square and strip of all that touch each other, ascending: squares of places in a strip that are closer to
     each other than a square is wide."""
     d = np.linspace(0, across, int(np.ceil(4 * across / tile)) + 2)
-    aside = tile / 4 * np.array([(u, v) for u in (-1, 0, 1) for v in (-1, 0, 1)])
+    aside = tile / 4 * np.array([-1, 0, 1])
     steps = np.ceil(4 * along / tile).astype(np.int64) + 2
     t = np.concatenate([np.linspace(0, long, step) for long, step in zip(along, steps, strict=True)])
     line = np.repeat(np.arange(len(frames)), steps)
     frame = frames[line]
     places = (frame[:, None, :2] + t[:, None, None] * frame[:, None, 2:4]) + d[:, None] * frame[:, None, 4:6]
+    x, y = ([np.floor(((places[..., k] + offset) - low[k]) / tile).astype(np.int64) for offset in aside] for k in (0, 1))
     found = []
-    for offset in aside:
-        near = np.floor(((places + offset) - low) / tile).astype(np.int64)
-        inside = ((near >= 0) & (near < columns)).all(axis=2)
-        square = near[..., 0] * columns[1] + near[..., 1]
-        found.append(np.unique((square * len(frames) + line[:, None])[inside]))
+    for u, v in product(x, y):
+        inside = (u >= 0) & (u < columns[0]) & (v >= 0) & (v < columns[1])
+        found.append(np.unique(((u * columns[1] + v) * len(frames) + line[:, None])[inside]))
     return np.column_stack(np.divmod(np.unique(np.concatenate(found)), len(frames)))

@@ -12,7 +12,7 @@ from topomerge.extraction.plans.storey_plan import HEIGHT_BANDS
 from topomerge.kernels import registration
 from topomerge.kernels.bend import sum_shifted_values
 from topomerge.matching.poses import FREE_MARGIN, PlanFields, pair_storeys
-from topomerge.types import Array, Sim3
+from topomerge.types import Array, Sim3, are_within
 
 SAME_WALL = 0.15  # m: walls that near are one
 JUDGED_COLUMNS = 40_000  # of a storey; of larger ones so many
@@ -235,7 +235,7 @@ def _compare_walls(source: PlanFields, target: PlanFields, move: Sim3) -> tuple[
     points = source.walls
     at = move.apply(np.column_stack([points, np.zeros(len(points))]))[:, :2]
     cells = np.floor((at - target.plan.origin) / target.plan.edge).astype(np.int64)
-    inside = np.asarray(((cells >= 0) & (cells < target.plan.wall.shape)).all(axis=1))
+    inside = are_within(cells, 0, target.plan.wall.shape)
     i, j = np.where(inside[:, None], cells, 0).T
     near = inside & (target.to_wall[i, j] <= SAME_WALL)
     seen = inside & (near | (target.kind[i, j] != 0))

@@ -17,7 +17,7 @@ import numpy as np
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.matching.poses import PlanFields, pair_storeys
 from topomerge.networks.network import Network, Run, Signature, Tensor, load_network, load_shipped_network
-from topomerge.types import Array, Sim3
+from topomerge.types import Array, Sim3, are_within
 
 CROP_PIXEL = 0.1  # m
 SIDE = 64  # pixels of a square
@@ -107,7 +107,7 @@ def _draw_layers(fields: PlanFields, places: Array, scale: float) -> tuple[Array
     """Draw the bytes of parts and of ceilings of a plan at places (..., 2), m in its frame; its heights grow by `scale`."""
     p = fields.plan
     cells = np.floor((places - p.origin) / p.edge).astype(np.int64)
-    inside = np.asarray(((cells >= 0) & (cells < p.wall.shape)).all(axis=-1))
+    inside = are_within(cells, 0, p.wall.shape)
     i, j = np.moveaxis(np.where(inside[..., None], cells, 0), -1, 0)
     layers = [p.wall, p.free, p.clutter, *(p.is_occupied(*h) for h in HEIGHTS), fields.hung == 2, np.isfinite(p.ceiling)]
     packed = np.bitwise_or.reduce([layer.astype(np.uint8) << k for k, layer in enumerate(layers)])

@@ -24,7 +24,7 @@ from topomerge.extraction.plans.storey_plan import (
     is_observed_band,
 )
 from topomerge.kernels.rasters import compute_column_bits, find_line_columns
-from topomerge.types import Array, TopometricMap, VoxelGrid
+from topomerge.types import Array, TopometricMap, VoxelGrid, compute_extent
 
 STOREY_GAP = 1.9  # m of empty height between a floor and its ceiling
 STOREY_LEAST_AREA = 3.0  # m2
@@ -168,10 +168,10 @@ def build_plans(map: TopometricMap | VoxelGrid, free: VoxelGrid | None = None, c
     cell = max(cell, grid.edge)
     points = grid.compute_centroids()  # as the verdict was fitted: to half a cell
     corner = grid.origin[:2]  # columns are those of the cells: on another lattice some get two rows of cells, and some none
-    low = np.floor((points[:, :2].min(axis=0) - corner) / cell + 1e-6).astype(np.int64)
+    low = np.floor((compute_extent(points[:, :2])[0] - corner) / cell + 1e-6).astype(np.int64)
     columns = np.floor((points[:, :2] - corner) / cell + 1e-6).astype(np.int64) - low
     corner = corner + low * cell
-    shape = tuple((columns.max(axis=0) + 1).tolist())
+    shape = tuple((compute_extent(columns)[1] + 1).tolist())
     ix, iy = np.ascontiguousarray(columns.T)
     empty = None if free is None or not len(free) else _find_crossed_columns(free, corner, cell)
     layers, storeys_seen = find_slices(grid), []

@@ -4,7 +4,17 @@ Conventions: z is up, lengths are metres, angles radians. Poses are float64, poi
 points of map b into the frame of map a. A room label of -1 means "no room".
 """
 
-from topomerge.types.grid import Array, LogFn, PointCloud, Sim3, TrueRoom, VoxelGrid, select_lowest_of_column
+from topomerge.types.grid import (
+    Array,
+    LogFn,
+    PointCloud,
+    Sim3,
+    TrueRoom,
+    VoxelGrid,
+    are_within,
+    compute_extent,
+    select_lowest_of_column,
+)
 from topomerge.types.landmarks import (
     LANDMARK_DTYPE,
     LANDMARK_KINDS,
@@ -73,9 +83,11 @@ __all__ = [
     "TrueRoom",
     "VoxelGrid",
     "add_outline_odds",
+    "are_within",
     "build_landmarks",
     "classify_door_state",
     "clean_landmarks",
+    "compute_extent",
     "convert_pose_to_files",
     "convert_pose_to_maps",
     "filter_confident",

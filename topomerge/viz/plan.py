@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.io.rooms_ply import NO_ROOM, assign_room_colours
-from topomerge.types import Array, TopometricMap
+from topomerge.types import Array, TopometricMap, compute_extent
 
 CUT = (1.0, 1.9)  # m above the floor: what fills this band is drawn as wall, as architects cut a plan
 WALL_SHARE = 0.5  # share of the band that must be occupied
@@ -209,7 +209,7 @@ def build_scene_data(
     named = np.arange(len(map.rooms)) if only is None else np.asarray(only, np.int64)
     seen = np.zeros(len(map.grid), np.int64) if seen is None else seen.astype(np.int64)
     labels = np.stack([np.maximum(map.find_cell_storeys(), 0), map.room + 1, seen], axis=1).astype(np.int64)
-    low = map.grid.cells.min(axis=0) if len(map.grid) else np.zeros(3, np.int32)
+    low = compute_extent(map.grid.cells)[0] if len(map.grid) else np.zeros(3, np.int32)
     cells = map.grid.cells.astype(np.int64) - low
     factor, number, shape, kinds, kind = _merge_cells(cells, labels, most)
     order = np.lexsort((number, kind))
@@ -263,7 +263,7 @@ def _merge_cells(cells: Array, labels: Array, most: int) -> tuple[int, Array, li
     kinds = np.stack([code // (base[1] * base[2]), code // base[2] % base[1] - 1, code % base[2]], axis=1)
     while True:
         coarse = cells // factor
-        shape = (coarse.max(axis=0) + 1).tolist() if len(cells) else [1, 1, 1]
+        shape = (compute_extent(coarse)[1] + 1).tolist() if len(cells) else [1, 1, 1]
         number = (coarse[:, 0] * shape[1] + coarse[:, 1]) * shape[2] + coarse[:, 2]
         if len(number) <= most and factor == 1:
             return factor, number, shape, kinds, kind

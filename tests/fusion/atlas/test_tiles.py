@@ -23,7 +23,7 @@ from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.store import add, find_nearest_rooms, remove, select_tile, split_into_tiles
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3, TopometricMap
-from topomerge.viz.report import serve
+from topomerge.viz.report_server import serve
 
 
 @pytest.fixture(scope="module")

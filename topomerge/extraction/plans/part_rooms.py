@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from topomerge.extraction.plans.passages import Pair, Passage
 from topomerge.extraction.plans.storey_plan import StoreyPlan
-from topomerge.types import Array
+from topomerge.types import Array, are_within
 
 # 1.5 and 6 in its place were no better on twenty pairs (rooms' IoU .887 and .883 for .891: docs/adr/0020).
 LOG_ODDS = 3.0  # of a door, by a map that is sure of two rooms; of none, by one that is sure of one room
@@ -110,7 +110,7 @@ def _score_separation(room: Array, certainty: Array, sides: tuple[Array, Array])
 def _find_column_rooms(plan: StoreyPlan, part: PartRooms) -> Array:
     """Return (nx, ny) room of a part in each column of a storey, -1 none."""
     at = np.floor((part.places[:, :2] - plan.origin) / plan.edge).astype(np.int64)
-    here = np.flatnonzero(((at >= 0) & (at < plan.wall.shape)).all(axis=1))
+    here = np.flatnonzero(are_within(at, 0, plan.wall.shape))
     here = here[np.abs(part.places[here, 2] - plan.floor[tuple(at[here].T)]) < SAME_STOREY]
     out = np.full(plan.wall.shape, -1, np.int64)
     here = here[np.argsort(-part.places[here, 2], kind="stable")]  # the lowest is written last

@@ -24,7 +24,7 @@ from topomerge.extraction.plans.storey_plan import (
 from topomerge.extraction.slices import SIGHT_DIRECTIONS, count_walled_directions, find_enclosed_columns
 from topomerge.extraction.storeys import CARRIED, HIGHEST_CEILING, NOWHERE, STOREY_LEAST_HEIGHT
 from topomerge.kernels.rasters import PROFILE_BELOW, PROFILE_LEVELS, fill_profiles, find_first_occupied, is_hollow_below
-from topomerge.types import Array, VoxelGrid, select_lowest_of_column
+from topomerge.types import Array, VoxelGrid, are_within, compute_extent, select_lowest_of_column
 
 ROOM_WALLS = WallRule(least_bands=3)  # fewer bands show the upper side of a ceiling, beside higher ones
 THIN = 0.4  # share of the usual wall's levels: what has fewer is no wall
@@ -73,7 +73,8 @@ def build_storey_plan(
     # Whole strides of the network and whole ceiling tiles: where columns lie decides single rooms (docs/adr/0004).
     margin, steps = int(np.ceil(PLAN_MARGIN / e)), int(np.lcm(COARSEST_STRIDE, _compute_tile_size(e)))
     far_off = -(-(round(COVERED_REACH / e) + margin) // steps) * steps
-    first, last = mine[:, :2].min(axis=0) - margin, mine[:, :2].max(axis=0) + margin
+    lowest, highest = compute_extent(mine[:, :2])
+    first, last = lowest - margin, highest + margin
     low, high = first - far_off, last + far_off
     size = high + 1 - low
     base, seen, far = _interpolate_heights(mine, low, size)
@@ -134,7 +135,7 @@ def _find_box_around(inside: Array, first: Array, last: Array, margin: int) -> t
 
 
 def _is_within(at: Array, size: Array) -> Array:
-    return np.asarray(((at >= 0) & (at < size)).all(axis=1))
+    return are_within(at, 0, size)
 
 
 def _interpolate_heights(cells: Array, low: Array, size: Array, nominal: int = 0) -> tuple[Array, Array, Array]:
@@ -309,7 +310,7 @@ def remove_upper_sides(grid: VoxelGrid, plan: StoreyPlan, region: Array, places:
     suspect = covered < OPEN_SHARE
     low, base = locate_columns(plan, grid)
     at = np.floor((places[np.isfinite(places).all(axis=1)] - grid.origin) / grid.edge).astype(np.int64) - (*low, 0)
-    at = at[((at[:, :2] >= 0) & (at[:, :2] < region.shape)).all(axis=1)]
+    at = at[are_within(at[:, :2], 0, region.shape)]
     above, of = (at[:, 2] - base[tuple(at[:, :2].T)]) * grid.edge, region[tuple(at[:, :2].T)]
     suspect[of[(above > CARRIED[0]) & (above < CARRIED[1]) & (of >= 0)]] = False
     if not suspect.any():

@@ -16,7 +16,7 @@ from scipy import ndimage
 from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES, DOORWAY_CLASS, INSIDE_CLASS, StoreyPlan
 from topomerge.kernels import run_side_by_side
 from topomerge.networks.network import Network, Run, Signature, Tensor, load_network, load_shipped_network
-from topomerge.types import Array
+from topomerge.types import Array, are_within
 
 PLAN_NETWORK_FILE = "plan_network.onnx"
 GRID_NETWORK_FILE = "grid_network.onnx"  # smaller: larger ones learn how grids are simulated
@@ -139,7 +139,7 @@ def add_drawn_doors(plan: StoreyPlan, probability: Array, doors: Array) -> Array
         doors: (k, 4) places on the floor, m, and how probably the drawing shows a door there.
     """
     at = np.floor((doors[:, :2] - plan.origin) / plan.edge).astype(np.int64)
-    here = np.flatnonzero(((at >= 0) & (at < plan.wall.shape)).all(axis=1))
+    here = np.flatnonzero(are_within(at, 0, plan.wall.shape))
     here = here[np.abs(doors[here, 2] - plan.floor[tuple(at[here].T)]) < SAME_STOREY]
     column = np.ravel_multi_index(tuple(at[here].T), plan.wall.shape)
     count = np.bincount(column, minlength=plan.wall.size)

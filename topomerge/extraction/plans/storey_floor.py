@@ -12,7 +12,7 @@ from topomerge.extraction.plans.passages import Pair
 from topomerge.extraction.plans.plan import locate_columns
 from topomerge.extraction.plans.storey_plan import Floor, Merge, StoreyPlan
 from topomerge.extraction.segment import PartitionedStorey
-from topomerge.types import Array, VoxelGrid, select_lowest_of_column
+from topomerge.types import Array, VoxelGrid, are_within, select_lowest_of_column
 
 WALL_REACH = 0.5  # m: so far into walls and what stands before them the cells of a room go
 OVER_CEILING = 0.4  # m
@@ -88,7 +88,7 @@ def find_cells_of_storey(grid: VoxelGrid, plan: StoreyPlan, room: Array, factor:
     """
     low, base = locate_columns(plan, grid)
     at = (grid.cells // factor if factor > 1 else grid.cells)[:, :2].astype(np.int64) - low
-    rows = np.flatnonzero(((at >= 0) & (at < room.shape)).all(axis=1))
+    rows = np.flatnonzero(are_within(at, 0, room.shape))
     at = at[rows]
     ceiling, above = (np.broadcast_to(height, room.shape)[tuple(at.T)] for height in (plan.ceiling, plan.top))
     z = (grid.cells[rows, 2] // factor - base[tuple(at.T)]) * plan.edge
@@ -108,7 +108,7 @@ def _select_floor_cells(
     low, base = locate_columns(part.plan, navigable)
     cells = navigable.cells[in_storey]
     at = (cells // factor)[:, :2].astype(np.int64) - low
-    in_plan = ((at >= 0) & (at < room.shape)).all(axis=1)
+    in_plan = are_within(at, 0, room.shape)
     at, cells = at[in_plan], cells[in_plan]
     columns = np.argwhere(room >= 0)
     walked = np.zeros(room.shape, bool)
@@ -134,7 +134,7 @@ def join_floor(
     Returns:
         The cells with the property `standing`, the storeys that have a room, and storey, room and area of each cell.
     """
-    in_grid = ((cells >= 0) & (cells < grid.shape)).all(axis=1)
+    in_grid = are_within(cells, 0, grid.shape)
     floor = grid.replace_cells(cells[in_grid], {name: values[in_grid] for name, values in tables.items()})
     of_cell = {name: values.astype(np.int32) for name, values in floor.properties.items()}
     of_rooms = of_cell["room"] >= 0

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from topomerge.kernels import octree, rays, voxels
-from topomerge.types import Array, VoxelGrid
+from topomerge.types import Array, VoxelGrid, compute_extent
 
 # Sparse voxel octree: range, radius and level-of-detail queries on a voxel grid (seeds 2.2.1).
 
@@ -173,11 +173,13 @@ def _cast_tile(octree: SparseVoxelOctree, views: Array, radius: float) -> tuple[
     at, reach = (views - grid.origin) / grid.edge, radius / grid.edge
     margin = int(np.ceil(reach)) + 1
     view_cells = np.floor(at).astype(np.int64)
-    low, high = view_cells.min(axis=0) - margin, view_cells.max(axis=0) + margin + 1
+    first, last = compute_extent(view_cells)
+    low, high = first - margin, last + margin + 1
     window = grid.cells[octree.find_in_box(low, high)]
     if len(window):  # it need not be higher or wider than what is in it
-        low = np.maximum(low, np.minimum(window.min(axis=0), view_cells.min(axis=0)))
-        high = np.minimum(high, np.maximum(window.max(axis=0), view_cells.max(axis=0)) + 1)
+        lowest, highest = compute_extent(window)
+        low = np.maximum(low, np.minimum(lowest, first))
+        high = np.minimum(high, np.maximum(highest, last) + 1)
     field = rays.compute_distance_field(window, low, (int(high[0] - low[0]), int(high[1] - low[1]), int(high[2] - low[2])))
     counts, words, masks = [], [], []
     for begin in range(0, len(at), VIEWS_AT_ONCE):

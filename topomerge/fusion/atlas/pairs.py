@@ -17,7 +17,7 @@ from topomerge.matching.poses import FREE_MARGIN, PlanFields, PoseHypothesis, pa
 from topomerge.registration.judge import Judge
 from topomerge.registration.pipeline import refine_by_surfaces, register
 from topomerge.registration.verify import score_plausibility
-from topomerge.types import Array, Sim3, TopometricMap
+from topomerge.types import Array, Sim3, TopometricMap, are_within
 
 PLACE_REACH = 3.0  # m: what contradicts within this of one spot is one place, about as wide as a room
 LEAST_CONFLICT = 0.3  # m2 of walls on free floor of one place, below which it may be noise
@@ -86,7 +86,7 @@ def find_conflict_columns(a: Sequence[PlanFields], b: Sequence[PlanFields], pose
             walls = source.walls
             moved = move.apply(np.column_stack([walls, np.zeros(len(walls))]))[:, :2]
             cells = np.floor((moved - target.plan.origin) / target.plan.edge).astype(np.int64)
-            inside = np.asarray(((cells >= 0) & (cells < target.plan.wall.shape)).all(axis=1))
+            inside = are_within(cells, 0, target.plan.wall.shape)
             x, y = np.where(inside[:, None], cells, 0).T
             clash = inside & (target.kind[x, y] == align.FREE_STATE) & (target.to_any[x, y] >= FREE_MARGIN)
             at = (moved if n == 0 else walls)[clash]
@@ -336,7 +336,7 @@ def sample_common_points(a: Sequence[PlanFields], b: Sequence[PlanFields], pose:
         rows = rows[:: max(len(rows) // SAMPLED_COLUMNS, 1)]
         at = np.column_stack([w.plan.origin + (rows + 0.5) * w.plan.edge, np.full(len(rows), w.plan.floor_guess)])
         placed = np.floor((pose.apply(at)[:, :2] - v.plan.origin) / v.plan.edge).astype(np.int64)
-        inside = ((placed >= 0) & (placed < v.plan.wall.shape)).all(axis=1)
+        inside = are_within(placed, 0, v.plan.wall.shape)
         samples.append(at[inside][v.plan.explored[tuple(placed[inside].T)]])
     return np.concatenate(samples)
 

@@ -30,7 +30,7 @@ from topomerge.matching.poses import PlanFields, PoseHypothesis, wrap_yaw
 from topomerge.registration.judge import Judge
 from topomerge.registration.search import find_yaw_candidates
 from topomerge.registration.storeys import build_plans
-from topomerge.types import Array, Sim3, TopometricMap, find_room_names
+from topomerge.types import Array, Sim3, TopometricMap, are_within, find_room_names
 
 INDEX_FOLDER, INDEX_VERSION, KIND = "locate", 1, "file of an index of places"
 ADVICE = "delete the folder `locate` of the atlas, it is made again"
@@ -202,7 +202,7 @@ def draw_coarse_image(fields: PlanFields) -> CoarseImage:
 def draw_points(points: Array, size: tuple[int, int], full: float) -> Array:
     """Draw points (n, 2), m, as shares (nx, ny) of so many a cell."""
     cell = np.floor(points / COARSE_CELL).astype(np.int64)
-    cell = cell[((cell >= 0) & (cell < size)).all(axis=1)]
+    cell = cell[are_within(cell, 0, size)]
     count = np.bincount(cell[:, 0] * size[1] + cell[:, 1], minlength=size[0] * size[1]).reshape(size)
     return np.minimum(count / full, 1.0).astype(np.float32)
 
@@ -222,7 +222,7 @@ def _draw_rooms(map: TopometricMap, plans: Sequence[StoreyPlan]) -> Iterable[Arr
         rooms = np.full(plan.wall.shape, -1, np.int16)
         mine = (owner == k) & (map.navigable_room >= 0)
         cell = np.floor((floor[mine, :2] - plan.origin) / plan.edge).astype(np.int64)
-        inside = ((cell >= 0) & (cell < rooms.shape)).all(axis=1)
+        inside = are_within(cell, 0, rooms.shape)
         rooms[tuple(cell[inside].T)] = map.navigable_room[mine][inside]
         if inside.any():
             away, (i, j) = ndimage.distance_transform_edt(rooms < 0, return_indices=True)
@@ -394,7 +394,7 @@ def _measure_share(points: Array, mask: Array, fields: PlanFields, pose: Sim3) -
     """Measure the share of points (n, 2) of a scan that lie on columns of a mask."""
     at = turn_points(points, pose.yaw) + pose.translation[:2]
     cells = np.floor((at - fields.plan.origin) / fields.plan.edge).astype(np.int64)
-    cells = cells[((cells >= 0) & (cells < mask.shape)).all(axis=1)]
+    cells = cells[are_within(cells, 0, mask.shape)]
     return float(mask[cells[:, 0], cells[:, 1]].sum()) / max(len(points), 1)
 
 

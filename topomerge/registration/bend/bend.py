@@ -20,7 +20,7 @@ from topomerge.registration.bend.graph import SettledMoves
 from topomerge.registration.bend.measure import LINE_SIGMAS, Window
 from topomerge.registration.bend.pieces import Drift, select_drifts
 from topomerge.registration.prepared import Prepared
-from topomerge.types import Array, Sim3
+from topomerge.types import Array, Sim3, are_within
 from topomerge.types.placement import Deformation, ShiftField
 
 FIRST_WINDOW = Window(1.2, 0.3, float(np.radians(3.0)))  # in which the rigid pose is mended
@@ -63,7 +63,7 @@ def bend_plan(plan: StoreyPlan, forward: Callable[[Array], Array], back: Callabl
     columns = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1).reshape(-1, 2)
     middles = origin + (columns + 0.5) * plan.edge
     source = np.floor((back(middles) - plan.origin) / plan.edge).astype(np.int64)
-    inside = np.asarray(((source >= 0) & (source < (nx, ny))).all(axis=1))
+    inside = are_within(source, 0, (nx, ny))
     i, j = np.where(inside[:, None], source, 0).T
 
     def drawn(raster: Array, outside: float | bool | int) -> Array:

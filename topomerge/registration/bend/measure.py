@@ -10,7 +10,7 @@ from topomerge.kernels import run_in_slices
 from topomerge.kernels.bend import build_line_equations, compute_wall_gain, estimate_line_normals, score_moves
 from topomerge.matching.poses import DISTANCE_CAP, PlanFields, compute_distance
 from topomerge.registration.bend.pieces import Pieces
-from topomerge.types import Array, Sim3
+from topomerge.types import Array, Sim3, are_within
 
 SECTORS = 4  # of the directions that walls face; what faces none, or away from all, is compared with all walls
 # Without sides, pieces snap to the other face of a wall, 0.15 m off (docs/adr/0014).
@@ -198,7 +198,7 @@ def build_wall_lines(fields: PlanFields, middles: Array) -> WallLines:
     columns = np.ascontiguousarray(np.argwhere(plan.wall))
     row[plan.wall] = np.arange(len(columns))
     cells = np.floor((middles[:, :2] - plan.origin) / plan.edge + 1e-6).astype(np.int64)
-    inside = ((cells >= 0) & (cells < row.shape)).all(axis=1)
+    inside = are_within(cells, 0, row.shape)
     cells, middles = cells[inside], middles[inside]
     at = row[tuple(cells.T)]
     height = middles[:, 2] - plan.floor[tuple(cells.T)]

@@ -14,7 +14,7 @@ from topomerge.archive import read_weights_json
 from topomerge.errors import InputError
 from topomerge.matching.poses import PlanFields
 from topomerge.registration.storeys import find_slices, is_extruded
-from topomerge.types import Array, TopometricMap, VoxelGrid
+from topomerge.types import Array, TopometricMap, VoxelGrid, are_within
 
 # Blocks, not rooms alone: corridors and halls bend within themselves, and maps without rooms must bend, too (docs/adr/0014).
 PIECE_SIZE = 5.0  # m, of a piece along a main direction; rooms up to `WHOLE_SIZE` are not cut
@@ -142,7 +142,7 @@ def _find_wall_rooms(fields: PlanFields, map: TopometricMap) -> Array:
     level = plan.floor_guess
     here = np.abs(places[:, 2] - level) < 1.5
     columns = np.floor((places[here, :2] - plan.origin) / plan.edge).astype(np.int64)
-    within = ((columns >= 0) & (columns < labels.shape)).all(axis=1)
+    within = are_within(columns, 0, labels.shape)
     labels[tuple(columns[within].T)] = rooms[here][within]
     if not (labels >= 0).any():
         return np.full(int(plan.wall.sum()), -1, np.int32)
