@@ -353,7 +353,7 @@ def postpone_imports() -> None:
     import inspect
 
     sys.meta_path.insert(0, _LateFinder)
-    inspect.getdoc = lambda thing: None
+    inspect.getdoc = lambda object: None
 
 
 COMPILER = f"{os.sep}llvmlite{os.sep}"
