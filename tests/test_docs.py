@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -140,6 +141,7 @@ def test_the_exit_statuses_are_told_alike() -> None:
         assert f"| {status} |" in page
 
 
+@cache
 def named_in(path: Path) -> set[str]:
     """Functions and classes of a file, and `Class.method`."""
     found = set()

@@ -69,6 +69,7 @@ def all_around() -> np.ndarray:
     return poses_all_around()
 
 
+@pytest.mark.longer
 def test_the_room_comes_out(tmp_path: Path) -> None:
     """Its floor, its height, and its inside as free space, by the rays of the images."""
     map = extract(read_points(write_replica(tmp_path / "room", all_around())))

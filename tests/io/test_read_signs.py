@@ -76,6 +76,7 @@ def test_signs_and_tags_of_a_folder(tmp_path: Path) -> None:
     assert read_points(tmp_path / "walk", text=False).landmarks is None
 
 
+@pytest.mark.longer
 def test_parts_of_signs_are_not_signs(tmp_path: Path) -> None:
     """Pictures that cut a sign off show a part of it."""
     pytest.importorskip("rapidocr_onnxruntime", exc_type=ImportError)

@@ -12,8 +12,10 @@ import torch
 from topomerge.models.convolutional import DrawingProbabilities, DrawingUNet
 from topomerge.models.export import export_network, load_exported_weights
 
+from topomerge.archive import find_weights_file
 from topomerge.errors import InputError
-from topomerge.networks.drawing import DRAWING_SIGNATURE, load_drawing_network
+from topomerge.networks.drawing import DRAWING_FILE, DRAWING_SIGNATURE, load_drawing_network
+from topomerge.networks.network import WEIGHTS_PACKAGE
 from topomerge.training.drawing_segmentation import compute_dice_loss
 from topomerge.training.loop import Exported
 from topomerge.training.scan_settings import DrawingSegmentation
@@ -41,6 +43,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.longer
 def test_weights_of_a_file_are_those_that_were_exported(exported: Path) -> None:
     first, second = build(1), build(2)
     picture = torch.rand(2, 3, 96, 64)
@@ -77,6 +80,7 @@ class Job:
         return Exported(self.network, DRAWING_SIGNATURE, [])
 
 
+@pytest.mark.longer
 def test_a_training_starts_from_a_file_and_tells_which(exported: Path) -> None:
     first, job = build(1), Job(build(2), {"set": "drawings"})
     settings = DrawingSegmentation(init_from=str(exported))
@@ -87,9 +91,9 @@ def test_a_training_starts_from_a_file_and_tells_which(exported: Path) -> None:
         start_from_exported(object(), settings)
 
 
-def test_a_run_is_a_start_and_what_is_none_is_told_before_data_is_made(exported: Path, tmp_path: Path) -> None:
+def test_a_run_is_a_start_and_what_is_none_is_told_before_data_is_made(tmp_path: Path) -> None:
     (tmp_path / "run" / "best").mkdir(parents=True)
-    shutil.copy(exported, tmp_path / "run" / "best" / "drawing_network.onnx")
+    shutil.copy(find_weights_file(WEIGHTS_PACKAGE, DRAWING_FILE), tmp_path / "run" / "best" / "drawing_network.onnx")
     assert find_start("drawing_segmentation", str(tmp_path / "run")) == tmp_path / "run" / "best" / "drawing_network.onnx"
     settings = DrawingSegmentation(init_from=str(tmp_path), runs=str(tmp_path))
     with pytest.raises(InputError, match=r"^init_from=.*: holds no drawing_network.onnx; name a run of task=drawing_segm"):

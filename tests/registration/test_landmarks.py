@@ -73,6 +73,7 @@ def test_signs_choose_among_places_that_walls_do_not_tell_apart(agree):
     assert off > 3.0 or second.probability < 0.2
 
 
+@pytest.mark.longer
 def test_the_order_of_the_maps_does_not_matter():
     a, b = with_signs(HALL, NUMBERS), told(HALL, [*NUMBERS[:5], "9.999"])
     one, other = register(a, b), register(b, a)

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import topomerge as tm
 from tests.fusion.plans_of import MOVE, office, part
+from tests.scenes import two_rooms
 from topomerge import archive
 from topomerge.cli.main import main as cli
 from topomerge.errors import InputError
@@ -97,7 +98,7 @@ def test_transforms_apply_to_the_files(files, merged) -> None:
 
 
 def test_a_level_map_has_no_levelling(maps) -> None:
-    level = tm.extract(office().points())
+    level = tm.extract(two_rooms().points())
     assert np.array_equal(level.levelling, np.eye(4)) and LEVELLED not in level.parameters
     pose = Sim3(0.3, (1.0, 2.0, 0.0))
     assert convert_pose_to_files(pose, np.eye(4), np.eye(4)).tolist() == pose.matrix.tolist()

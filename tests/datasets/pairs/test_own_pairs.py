@@ -362,6 +362,7 @@ def rooms_of(entry: Mapping[str, Any]) -> tuple[TrueRoom, ...]:
     return tuple(TrueRoom(room["name"], outline, room["floor"], room["ceiling"], room["storey"]) for room, outline in rows)
 
 
+@pytest.mark.longer
 def test_rooms_that_match_are_those_of_the_simulator(houses: Path, cache: Path) -> None:
     from topomerge.datasets.pairs.parts import find_true_matches, match_true_rooms
 
@@ -402,6 +403,7 @@ def test_train_and_evaluate(houses: Path, cache: Path, tmp_path: Path) -> None:
     assert not (cache / "evaluation").exists() or not list((cache / "evaluation").rglob("*.tmap"))  # extracted once
 
 
+@pytest.mark.longer
 def test_retrieval_takes_them(houses: Path, cache: Path) -> None:
     settings = RetrievalSettings(data=Data("folder"), path=str(houses), cache=str(cache), descriptor="engineered")
     assert "Queries: 1 maps of 1 physical buildings" in measure_retrieval(settings, quiet)[0]["text"]
@@ -443,12 +445,12 @@ def test_the_matcher_of_rooms_takes_them(houses: Path, cache: Path, monkeypatch:
     assert scores["pairs"] == 2 and scores["rooms"] > 0
 
 
-def test_a_path_needs_its_data_and_data_its_path(houses: Path) -> None:
+def test_a_path_needs_its_data_and_data_its_path(tmp_path: Path) -> None:
     for task in ("embedding", "room_matcher"):
         with pytest.raises(InputError, match="data=folder needs path="):
             compose_settings([f"task={task}", "data=folder"])
         with pytest.raises(InputError, match="is of data=folder, not of data=train_small"):
-            compose_settings([f"task={task}", "data=train_small", f"path={houses}"])
+            compose_settings([f"task={task}", "data=train_small", f"path={tmp_path}"])
     with pytest.raises(InputError, match="data=folder: is for tasks that learn from pairs of maps, not for match_odds"):
         compose_settings(["task=match_odds", "data=folder"])
     settings = Evaluation(descriptors={"engineered": {"name": "engineered"}}, only=["engineered"])
