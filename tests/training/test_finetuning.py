@@ -136,6 +136,7 @@ def test_replay_mixes_another_set_in(settings: Training, tmp_path: Path, monkeyp
         fit(replace(mixed, name="third", replay_data="missing"), quiet)
 
 
+@pytest.mark.longer
 def test_an_export_tells_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     for name in ("onnxscript", "onnx_ir", "torch.onnx"):
