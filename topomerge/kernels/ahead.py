@@ -22,8 +22,22 @@ from typing import Any
 
 import llvmlite.binding
 import numba
-from numba.core.caching import FunctionCache
-from numba.core.runtime import rtsys
+
+try:  # parts of numba that it does not promise to keep: without them loops load as it loads them
+    from numba.core.caching import FunctionCache
+    from numba.core.runtime import rtsys
+
+    class _Cache(FunctionCache):  # type: ignore[misc]
+        """Numba's cache of a loop, which sets up the compiler, for .3 s, before it loads what is compiled. This one does not: the
+        compiler sets itself up where it is needed after all."""
+
+        def load_overload(self, sig: Any, target_context: Any) -> Any:
+            rtsys.initialize(target_context)  # of what is set up, all that loaded code calls
+            with self._guard_against_spurious_io_errors():
+                return self._load_overload(sig, target_context)
+
+except ImportError:
+    _Cache = None  # type: ignore[assignment, misc]
 
 MODULES = ("bend", "graphs", "images", "occupied_cells", "rasters", "rays", "registration", "stencil", "voxels")
 SWITCH = "TOPOMERGE_COMPILE_AHEAD"  # environment variable: 0 compiles nothing ahead
@@ -42,22 +56,12 @@ def compile_ahead(*signatures: str, **options: Any) -> Callable[[Callable[..., A
 
     def decorate(function: Callable[..., Any]) -> Any:
         loop = numba.njit(cache=True, nogil=True, **options)(function)
-        if not numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+        if _Cache is not None and not numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
             loop._cache = _Cache(function)
         AHEAD[loop] = signatures
         return loop
 
     return decorate
-
-
-class _Cache(FunctionCache):  # type: ignore[misc]
-    """Numba's cache of a loop, which sets up the compiler, for .3 s, before it loads what is compiled. This one does not: the
-    compiler sets itself up where it is needed after all."""
-
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        rtsys.initialize(target_context)  # of what is set up, all that loaded code calls
-        with self._guard_against_spurious_io_errors():
-            return self._load_overload(sig, target_context)
 
 
 def compile_missing(cache: Path, processes: int) -> None:
