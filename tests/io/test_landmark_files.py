@@ -66,8 +66,8 @@ def test_a_map_without_landmarks_holds_no_tables_of_them_and_older_files_are_rea
         load_map(rewritten(older, tmp_path / "oldest.tmap", format=np.array(1, "<i4")))
 
 
-def test_many_landmarks_are_written_and_read(tmp_path: Path) -> None:
-    count = 50_000
+@pytest.mark.parametrize("count", [50_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+def test_many_landmarks_are_written_and_read(count: int, tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     values = [f"aa:{k:06x}" for k in range(count)]
     many = build_landmarks("radio", values, "bag", random.uniform(0, 9, (count, 3)), number=random.uniform(-90, -40, count))

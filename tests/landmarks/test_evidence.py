@@ -235,9 +235,9 @@ def test_kinds_that_one_map_lacks_say_nothing():
     assert LandmarkEvidence().apply(UNIFORM) == pytest.approx(UNIFORM)
 
 
-def test_many_landmarks_are_bounded_work():
+@pytest.mark.parametrize("count", [100_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+def test_many_landmarks_are_bounded_work(count):
     rng = np.random.default_rng(0)
-    count = 100_000
     table = np.zeros(count, build_landmarks("text", ["x"], "t").table.dtype)
     many = build_landmarks("text", [f"{k}" for k in range(1000)], "hostile")
     table["value"], table["position"] = rng.integers(1000, size=count), rng.uniform(0, 20, (count, 3))

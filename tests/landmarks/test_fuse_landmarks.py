@@ -157,10 +157,11 @@ def test_all_rooms_101_are_no_quarrel_and_many_contradictions_are_counted() -> N
 
 
 @pytest.mark.longer
+@pytest.mark.parametrize("many", [50_000, pytest.param(250_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("hostile", ["spread", "one place", "one string"])
-def test_many_landmarks_need_no_pairs(hostile: str) -> None:
+def test_many_landmarks_need_no_pairs(hostile: str, many: int) -> None:
     """Each pair of equal ones would be 10^9 of them."""
-    random, many = np.random.default_rng(0), 50_000
+    random = np.random.default_rng(0)
     table = build_landmarks("text", ["x"], "a").table.repeat(many)
     position = random.uniform(0, 500, (many, 3)) if hostile == "spread" else np.zeros((many, 3))
     if hostile == "one string":

@@ -78,9 +78,10 @@ def test_heights_that_are_not_known_are_those_of_the_floors():
 
 
 @pytest.mark.longer
-def test_many_signs_propose_within_bounds():
+@pytest.mark.parametrize("count", [100_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+def test_many_signs_propose_within_bounds(count):
     """Hostile: of both maps the surest and rarest are looked at; poses are few and finite, and so are strings of an index."""
-    rng, count = np.random.default_rng(0), 100_000
+    rng = np.random.default_rng(0)
     many = build_landmarks("text", [f"{k}.{k % 97}" for k in range(2000)], "hostile")
     table = np.repeat(many.table[:1], count)
     table["value"], table["position"] = rng.integers(2000, size=count), rng.uniform(0, 20, (count, 3))
