@@ -248,8 +248,8 @@ class _JoinedCells:
         occupied = occupied[(occupied[:, 2] >= low - 3) & (occupied[:, 2] <= high + 3)]
         if not len(occupied):
             return np.zeros(len(cells), bool)
-        corner, high = compute_extent(np.concatenate([occupied[:, :2], cells[:, :2]]))
-        shape = high - corner + 1
+        corner, last = compute_extent(np.concatenate([occupied[:, :2], cells[:, :2]]))
+        shape = last - corner + 1
         mask = np.zeros(shape, bool)
         mask[tuple((occupied[:, :2] - corner).T)] = True
         mask = ndimage.binary_dilation(mask, iterations=max(round(ASSUMED_MARGIN / self.edge), 1))
