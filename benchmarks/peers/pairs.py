@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from topomerge.datasets.pairs.evaluation_pair import load_set
-from topomerge.datasets.pairs.example import _make_first_pair
+from topomerge.datasets.pairs.example import make_first_pair
 from topomerge.datasets.pairs.grid_pairs import GridItem, GridPair, draw_grid_items, load_grids
 from topomerge.datasets.pairs.items import Library, select_plans
 
@@ -156,7 +156,7 @@ def simulate_raw_pair(pair: GridPair, item: GridItem, plans: Library) -> PeerPai
     Raises:
         ValueError: the generator gives another pair by now.
     """
-    simulated = _make_first_pair(item.item, list(select_plans(item.item, plans)))
+    simulated, _ = make_first_pair(item.item, list(select_plans(item.item, plans)))
     pose, truth = simulated.truth, pair.truth
     if pose is None or truth is None or np.abs(pose.matrix - truth.matrix).max() > 1e-6:
         raise ValueError(f"{pair.name}: the generator gives another pair by now")

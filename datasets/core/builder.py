@@ -28,6 +28,7 @@ from topomerge.types import Array, LogFn
 ItemType = TypeVar("ItemType")
 
 PATIENCE = 20.0  # s to wait for the scheduler of a cluster
+FAULT = re.compile(r"\w+(Error|Exception): ")  # a reason that is no refusal of an input
 OLD = 3600.0  # s; half-written files of a build that was killed are deleted when they are older
 Task = tuple[Any, Any, str]  # an item, which has a name; what it is made from; the folder of its file
 
@@ -106,6 +107,9 @@ def build_set(
         work: makes the file of a task (`make_item`).
         log_line: is told the progress, a line each `every` seconds.
         unit: what the items are called there.
+
+    Raises:
+        InputError: all that was missing failed for other reasons than its inputs.
     """
     folders = {item.name: Path(folder) for item, _, folder in tasks}
     for folder in set(folders.values()):
@@ -116,6 +120,8 @@ def build_set(
     missing = {task[0].name: task for task in tasks if task[0].name not in rows and task[0].name not in refusals}
     log_line(f"{len(rows)} of {len(folders)} {unit} are in the cache, {len(refusals)} are known to be refused")
     results = run_tasks(list(missing.values()), sharing, BuildProgress(len(missing), log_line, every, unit), work)
+    if results and all(FAULT.match(row.reason) for row in results):
+        raise InputError(f"{manifest.name}: none of {len(results)} {unit} could be made: {results[0].reason}")
     rows |= {row.name: read_about(folders[row.name] / f"{row.name}.npz") for row in results if not row.reason}
     with replace_on_success(manifest) as temporary:
         lines = [json.dumps(rows[name], sort_keys=True, ensure_ascii=False) for name in sorted(rows)]

@@ -75,7 +75,7 @@ def make_arrays(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array]
     """
     if item.more:
         return build_several_maps(item, plans)
-    pair, signs = _make_first_pair(item, plans)
+    pair, signs = make_first_pair(item, plans)
     return build_pair_arrays(pair, extract_maps((pair.a, pair.b), item, signs), describe_item(item))
 
 
@@ -120,7 +120,7 @@ def _build_map_arrays(
 
 def make_evaluation_arrays(item: Item, plans: Sequence[Sequence[Plan]], folder: Path) -> dict[str, Array]:
     """Make the arrays of `make_arrays` and those for evaluation (`evaluation_pair`); the maps are written into the folder."""
-    pair, signs = _make_first_pair(item, plans)
+    pair, signs = make_first_pair(item, plans)
     maps = extract_maps((pair.a, pair.b), item, signs)
     arrays = build_pair_arrays(pair, maps, {**describe_item(item), **compute_pair_statistics(pair, maps)})
     arrays |= build_evaluation_arrays(pair, maps, (arrays["a.true_room"], arrays["b.true_room"]))
@@ -176,7 +176,7 @@ def build_pair_arrays(pair: Pair, maps: Sequence[TopometricMap], item_entries: M
     return arrays
 
 
-def _make_first_pair(item: Item, plans: Sequence[Sequence[Plan]]) -> tuple[Pair, list[Landmarks]]:
+def make_first_pair(item: Item, plans: Sequence[Sequence[Plan]]) -> tuple[Pair, list[Landmarks]]:
     """Return the pair of the first candidate that has one, and the signs that both maps read; none without."""
 
     def make(k: int, rng: np.random.Generator) -> tuple[Pair, list[Landmarks]]:

@@ -24,7 +24,7 @@ from topomerge.datasets.core.builder import (
     select_items,
 )
 from topomerge.datasets.pairs.evaluation_pair import convert_to_sim3
-from topomerge.datasets.pairs.example import _make_first_pair
+from topomerge.datasets.pairs.example import make_first_pair
 from topomerge.datasets.pairs.items import Item, Library, Recipe, check, draw_items, load_library, select_plans
 from topomerge.datasets.pairs.pairs import Pair
 
@@ -195,7 +195,8 @@ def make_grids(item: GridItem, plans: list[tuple[object, ...]], folder: str) -> 
 
     def make() -> dict[str, Array]:
         about = {"difficulty": dict(item.item.difficulty), "source": item.item.source, "set": item.set, "item": item.number}
-        return build_pair_arrays(_make_first_pair(item.item, plans), {**about, "file": f"{item.name}.npz"})  # type: ignore[arg-type]
+        pair, _ = make_first_pair(item.item, plans)  # type: ignore[arg-type]
+        return build_pair_arrays(pair, {**about, "file": f"{item.name}.npz"})
 
     return make_item(item.name, folder, make, LONGEST_GRID_PAIR)
 

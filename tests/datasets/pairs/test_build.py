@@ -137,12 +137,19 @@ def test_one_bad_item_ends_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     assert [p.name for p in (tmp_path / "pairs").iterdir()] == [f"{bad}.refused"], "a KeyError is no reason for good"
     asked: list[str] = []
     monkeypatch.setattr(example, "make_arrays", lambda item, plans: asked.append(item.name))
-    assert build(Build(SMALL, str(tmp_path))).refused["# has no such rooms"] == 1 and bad not in asked and len(asked) == 2
+    with pytest.raises(InputError, match=r"small.jsonl: none of 2 pairs could be made: \w+Error: "):  # not one bad item, but all
+        build(Build(SMALL, str(tmp_path)))
+    assert bad not in asked and len(asked) == 2, "what was refused for its inputs is not asked again"
 
 
 def test_parts_make_the_whole(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     made: list[list[str]] = []
-    monkeypatch.setattr(example, "make_arrays", lambda item, plans: made[-1].append(item.name))
+
+    def make(item: Item, plans: list[Plan]) -> dict[str, np.ndarray]:
+        made[-1].append(item.name)
+        return {"about": np.frombuffer(b"{}", np.uint8)}
+
+    monkeypatch.setattr(example, "make_arrays", make)
     for k in (1, 2):
         made.append([])
         build(Build(SMALL, str(tmp_path / str(k)), part=[k, 2]))

@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from topomerge.datasets.core.builder import select_items
-from topomerge.datasets.pairs.grid_pairs import GRID_EDGE, GridRecipe, build_grid_arrays, draw_grid_items, unpack_pair
+from topomerge.datasets.pairs.grid_pairs import (
+    GRID_EDGE,
+    GridRecipe,
+    build_grid_arrays,
+    draw_grid_items,
+    load_grids,
+    make_grids,
+    unpack_pair,
+)
 
 from topomerge.errors import InputError
 from topomerge.types import VoxelGrid
@@ -36,3 +45,12 @@ def test_a_larger_selection_holds_a_smaller_one() -> None:
 def test_a_part_of_a_set_holds_items_of_the_whole_set() -> None:
     whole, part = (draw_grid_items(GridRecipe(sets=[6, 3], limit=limit))[0] for limit in (0, 4))
     assert len(part) == 4 and {item.name for item in part} < {item.name for item in whole}
+
+
+def test_a_pair_is_made_and_comes_back(tmp_path: Path) -> None:
+    item, *_ = draw_grid_items(GridRecipe(sets=[1], rooms=[3, 4]))[0]
+    assert make_grids(item, [], str(tmp_path)).reason == ""
+    pair = load_grids(tmp_path / f"{item.name}.npz")
+    assert (
+        len(pair.a) > 1000 < len(pair.b) and pair.about["set"] == item.set and pair.about["kind"] in ("overlap", "other-building")
+    )
