@@ -16,7 +16,7 @@ from typing import Any
 import psutil
 
 from tests.scenes_map import building
-from tests.studio.browser import MapPage, open_browser, run_studio
+from tests.studio.browser import MapPage, open_context, run_studio, start_browser
 from topomerge.io.maps import save_map
 from topomerge.progress import Stopwatch
 
@@ -47,7 +47,7 @@ def measure(rooms: int) -> dict[str, float]:
     pairs = min(PAIRS, max((rooms - 1) // 2, 1))
     with tempfile.TemporaryDirectory() as folder:
         save_map(building(pairs, max(round(rooms / (2 * pairs + 1)), 1)), Path(folder) / "large.tmap")
-        with run_studio(Path(folder)) as (address, server), open_browser() as context:
+        with run_studio(Path(folder)) as (address, server), start_browser() as chromium, open_context(chromium) as context:
             page = context.new_page()
             page.goto(address)
             page.wait_for_selector("li[data-path]")

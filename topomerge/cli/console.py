@@ -328,8 +328,9 @@ def write_all(outputs: Sequence[tuple[str | Path, Callable[[Path], None]]]) -> N
                 _resolve_path(path).unlink(missing_ok=True)
 
 
-# Imported by SciPy and numba, with all that they import; what uses one of them waits for it then.
-SELDOM_USED = ("numpy.f2py", "numpy.testing", "numpy.ma", "scipy.spatial.transform", "yaml")
+# But imported by SciPy, with all that they import. None that is used may stand here: two threads that use a late module for the
+# first time at once see half of it.
+NEVER_USED = ("numpy.f2py", "numpy.testing")
 
 
 class _LateFinder:
@@ -337,7 +338,7 @@ class _LateFinder:
 
     @staticmethod
     def find_spec(name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
-        if name not in SELDOM_USED:
+        if name not in NEVER_USED:
             return None
         from importlib.util import LazyLoader
 
@@ -348,7 +349,7 @@ class _LateFinder:
 
 
 def postpone_imports() -> None:
-    """Let this process run `SELDOM_USED` when something of them is used, and find no documentation, as with `python -OO`: SciPy
+    """Let this process run `NEVER_USED` when something of them is used, and find no documentation, as with `python -OO`: SciPy
     parses its own when it is imported, for a tenth of a second."""
     import inspect
 
