@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,6 +23,7 @@ from topomerge.datasets.core.builder import (
     make_item,
     select_items,
 )
+from topomerge.datasets.core.building import Plan
 from topomerge.datasets.pairs.evaluation_pair import convert_to_sim3
 from topomerge.datasets.pairs.example import make_first_pair
 from topomerge.datasets.pairs.items import Item, Library, Recipe, check, draw_items, load_library, select_plans
@@ -190,12 +191,12 @@ def build_grids(
     return [path for item in items if (path := folder / f"{item.name}.npz").exists()], report
 
 
-def make_grids(item: GridItem, plans: list[tuple[object, ...]], folder: str) -> BuildRow:
+def make_grids(item: GridItem, plans: Sequence[Sequence[Plan]], folder: str) -> BuildRow:
     """Make an item's file."""
 
     def make() -> dict[str, Array]:
         about = {"difficulty": dict(item.item.difficulty), "source": item.item.source, "set": item.set, "item": item.number}
-        pair, _ = make_first_pair(item.item, plans)  # type: ignore[arg-type]
+        pair, _ = make_first_pair(item.item, plans)
         return build_pair_arrays(pair, {**about, "file": f"{item.name}.npz"})
 
     return make_item(item.name, folder, make, LONGEST_GRID_PAIR)
