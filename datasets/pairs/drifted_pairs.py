@@ -51,7 +51,7 @@ from topomerge import archive
 from topomerge.errors import InputError
 from topomerge.types import Array, LogFn, PointCloud, Sim3
 
-LONGEST_BENT_PAIR = 900.0  # s
+LONGEST_BENT_PAIR = 900.0  # s of a processor
 LEAST_SPACING = 0.06  # m between points: cells are of 0.1 m
 BENT_FORMAT = 1  # raise it when the same item gives other bytes
 DRIFT_FACTORS = (0.0, 1.0, 2.0, 4.0)

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 FEWEST_ROOMS = 2  # rooms that must come out of each map
 Made = TypeVar("Made")
-LONGEST_PAIR = 600.0  # s a pair: a hundred times what is usual, so that no slow machine makes another set
+LONGEST_PAIR = 600.0  # s of a processor: a hundred times what is usual, so that no slow machine makes another set
 
 
 @dataclass(frozen=True)

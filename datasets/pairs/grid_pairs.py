@@ -42,7 +42,7 @@ NOTHING_IN_COMMON = 99.0  # m: nothing is shown by both
 POINTS_SHOWN = 200  # points of a room that a map shows
 CEILING_BELOW = 0.15  # m: what is that far below a floor is the storey below's ceiling
 RAY_STEP = 0.08  # m along a ray
-LONGEST_GRID_PAIR = 120.0  # s
+LONGEST_GRID_PAIR = 120.0  # s of a processor
 WEIGHTS = {
     "sources": {"procedural": 0.65, "r2v": 0.1, "campus": 0.25},
     "kinds": {

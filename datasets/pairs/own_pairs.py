@@ -50,7 +50,7 @@ from topomerge.registry import DATASETS
 from topomerge.types import Array, LogFn, TopometricMap
 
 OWN_SOURCE, OWN_FOLDER = "own", "own"  # source of the pairs; folder of the cache
-LONGEST_CAPTURE, LONGEST_OWN_PAIR = 7200.0, 600.0  # s
+LONGEST_CAPTURE, LONGEST_OWN_PAIR = 7200.0, 600.0  # s of a processor
 TWIN_COLUMNS = (0, 3, 4)  # area, length, width of a room in its graph's `x`
 NAMING = (".yaml", ".yml", ".gltf")  # files that name others
 CAPTURE_FORMAT = 1  # of the files of captures: raise it when `make_capture` writes others

@@ -170,7 +170,7 @@ def scan_with_drift(building: Building, name: str, visited: Array, rng: np.rando
     return replace(cloud, rooms=()), shift
 
 
-LONGEST_SCAN = 600.0  # s
+LONGEST_SCAN = 600.0  # s of a processor
 VOXEL_SIZES = (0.1, 0.1, 0.1, 0.08, 0.15)  # m
 PLANS_READ = 1000  # of a source
 PLAN_RASTERS = ("wall", "inside", "profile", "ceiling")

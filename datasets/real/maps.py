@@ -29,7 +29,7 @@ from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.types import LogFn
 
-LONGEST_PAIR = 600.0  # s a pair
+LONGEST_PAIR = 600.0  # s of a processor a pair
 POINTS_A_ROOM = 512  # a room
 
 
