@@ -116,6 +116,38 @@ def trip_dsg(folder: Path) -> tuple[Tally, float, str]:
     return tally, error, "spark_dsg"
 
 
+def trip_usdz(count: int) -> Trip:
+    def trip(folder: Path) -> tuple[Tally, float, str]:
+        from tests.io.test_native_usdz import scan, vertices
+        from tests.io.test_usdz import roomplan
+
+        a, b = roomplan(folder / "room.usdz"), scan(folder / "scan.usdz")
+        tally, out = join("usdz", folder, *[Source(a, TILTED), Source(b, YAW)][:count])
+        expected = [TILTED.move_points(vertices(a)), YAW.move_points(vertices(b))][:count]
+        return tally, float(np.abs(vertices(out) - np.concatenate(expected)).max()), "usd-core, our reader"
+
+    return trip
+
+
+def trip_robot_maps(folder: Path) -> tuple[Tally, float, str]:
+    """The error is that of entities; pixels are off by half a pixel."""
+    import json
+
+    from tests.io.test_native_robot_maps import home, turn
+
+    motion = turn(180, 0.013, 0.004)
+    a, b = home(folder / "a.json", ("Bath", "Hall")), home(folder / "b.json", ("Kitchen", ""))
+    tally, out = join("robot_map", folder, Source(a), Source(b, motion))
+    before, after = (json.loads(path.read_text())["entities"] for path in (b, out))
+    old, new = (
+        np.array([xy for entity in listed for xy in zip(entity["points"][::2], entity["points"][1::2], strict=True)])
+        / (100, -100)
+        for listed in (before, after[-len(before) :])
+    )
+    expected = motion.move_points(np.column_stack([old, np.zeros(len(old))]))[:, :2]
+    return tally, float(np.abs(new - expected).max()), "our reader"
+
+
 def trip_e57(folder: Path) -> tuple[Tally, float, str]:
     import pye57
 
@@ -201,6 +233,9 @@ TRIPS: dict[str, Trip] = {
     "g2o, SE3, two graphs": trip_g2o(GRAPH, TILTED),
     "g2o, SE2, two graphs": trip_g2o(PLANE, YAW),
     "Spark-DSG, two graphs of three rooms, two of them shared": trip_dsg,
+    "USDZ, RoomPlan's, one file": trip_usdz(1),
+    "USDZ, RoomPlan's and a scanner's of another unit and axis": trip_usdz(2),
+    "Valetudo, two maps of the same two rooms; its points are whole cm": trip_robot_maps,
     "E57, three stations": trip_e57,
     "LAS": trip_cloud("a.las", "laspy"),
     "LAZ": trip_cloud("a.laz", "laspy"),
