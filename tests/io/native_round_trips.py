@@ -86,16 +86,38 @@ def trip_karto(sessions: int) -> Trip:
     return trip
 
 
+def read_by_gtsam(path: Path, numbers: list[int], flat: bool) -> Array | None:
+    """(n, 4, 4) poses of the vertices of these numbers, as GTSAM reads them; None where it is not installed."""
+    try:
+        import gtsam
+    except ImportError:
+        return None
+    values = gtsam.readG2o(str(path), not flat)[1]
+    poses = np.tile(np.eye(4), (len(numbers), 1, 1))
+    for row, number in enumerate(numbers):
+        if flat:
+            matrix = values.atPose2(number).matrix()
+            poses[row, :2, :2], poses[row, :2, 3] = matrix[:2, :2], matrix[:2, 2]
+        else:
+            poses[row] = values.atPose3(number).matrix()
+    return poses
+
+
 def trip_g2o(text: str, motion: Motion) -> Trip:
     def trip(folder: Path) -> tuple[Tally, float, str]:
         (folder / "a.g2o").write_text(text)
         tally, out = join("g2o", folder, Source(folder / "a.g2o"), Source(folder / "a.g2o", motion))
         before, after = read_pose_graph(folder / "a.g2o").vertices, read_pose_graph(out).vertices
         posed = [k for k in before if before[k].posed]
-        found = np.array([after[k + max(before) + 1].pose for k in posed])
+        flat = before[posed[0]].tag == "VERTEX_SE2"
+        moved = [k + max(before) + 1 for k in posed]
+        found = np.array([after[k].pose for k in moved])
+        opened = read_by_gtsam(out, moved, flat)
+        if opened is not None:
+            np.testing.assert_allclose(opened, found, rtol=0, atol=1e-12)
         expected = motion.matrix @ np.array([before[k].pose for k in posed])
-        flat = [0, 1] if before[posed[0]].tag == "VERTEX_SE2" else [0, 1, 2]
-        return tally, float(np.abs((found - expected)[:, flat]).max()), "our reader"
+        error = np.abs((found - expected)[:, [0, 1] if flat else [0, 1, 2]]).max()
+        return tally, float(error), "our reader" if opened is None else "GTSAM, our reader"
 
     return trip
 
