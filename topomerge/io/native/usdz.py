@@ -293,4 +293,5 @@ def _write_package(folder: Path, files: Sequence[tuple[Path, str]], target: Path
 
     with Sdf.ZipFileWriter.CreateNew(str(target)) as writer:
         for path, name in files:
-            writer.AddFile(str(path), name)
+            if not writer.AddFile(str(path), name):
+                raise InputError(f"{target}: {name[:60]!r} can't be written into it; check the space on the disk")
