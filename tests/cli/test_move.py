@@ -13,6 +13,7 @@ from tests.cli import test_merge_points
 from tests.cli.test_merge_points import BENDS, Run, run
 from tests.io import test_karto
 from tests.io.test_native import PLANE, quaternions, random_poses, write_lines
+from tests.io.test_native_robot_maps import home
 from tests.io.test_native_rtabmap import poses_of, write_session
 from tests.samples import box_points, write_ply
 from tests.scenes_map import building
@@ -66,6 +67,26 @@ def test_a_merge_writes_one_pose_graph_of_slam_toolbox(run: Run, tmp_path: Path)
     moved = NEAR.apply(one.poses[:, :3, 3])
     np.testing.assert_allclose(both.poses[: len(one.poses)], one.poses, atol=1e-9)
     np.testing.assert_allclose(both.poses[len(one.poses) :, :2, 3], moved[:, :2], atol=1e-9)
+
+
+def test_two_scans_of_iphones_become_one_file(run: Run, tmp_path: Path) -> None:
+    pytest.importorskip("pxr")
+    from tests.io.test_native_usdz import vertices
+    from tests.io.test_usdz import roomplan
+
+    for name in "ab":
+        roomplan(tmp_path / f"{name}.usdz")
+    status, out, _ = run("a.usdz", "b.usdz", "-o", "merged", "--native", "--rigid")
+    assert status == 0 and "a.usdz + b.usdz: 20 meshes, 4 objects" in out
+    one, both = vertices(tmp_path / "a.usdz"), vertices(tmp_path / "merged/joined.usdz")
+    np.testing.assert_allclose(both, np.concatenate([one, NEAR.apply(one)]), rtol=0, atol=1e-6)
+
+
+def test_two_maps_of_a_vacuum_robot_become_one(run: Run, tmp_path: Path) -> None:
+    for name in "ab":
+        home(tmp_path / f"{name}.json")
+    status, out, _ = run("a.json", "b.json", "-o", "merged", "--native", "--rigid")
+    assert status == 0 and "rooms" in out and "Bath" in (tmp_path / "merged/joined.json").read_text()
 
 
 def test_mixed_formats_each_in_its_own(run: Run, tmp_path: Path) -> None:

@@ -65,8 +65,10 @@ def read_las(path: Path) -> int:
 
 def read_native(path: Path) -> int:
     """Write a file of another program again, moved, and joined with itself where its format holds several."""
-    from topomerge.io.native import Motion, Source, find_format, save_joined
+    from topomerge.io.native import Motion, Source, find_format, save_joined, usdz
     from topomerge.types import Sim3
+
+    usdz.compute_in_subprocess = lambda _module, _kind, _path, task, *_: usdz.compute_in_process(task)
 
     form = find_format(path)
     if form is None:
@@ -201,7 +203,7 @@ READERS: dict[str, Callable[[Path], int]] = {  # by name or suffix; all others a
     "embedder.onnx": read_embedder,
     "pairs.yaml": read_own_pairs,
     **dict.fromkeys(("native.db", "native.json", "native.e57", "native.ply", "native.pcd", "native.pbstream"), read_native),
-    **dict.fromkeys(("native.g2o", "native.tum", "native.csv"), read_native),
+    **dict.fromkeys(("native.g2o", "native.tum", "native.csv", "native.usdz", "native.rr", "native.home.json"), read_native),
     ".las": read_las,
     ".laz": read_las,
     ".usdz": read_usdz,
@@ -341,6 +343,7 @@ def write_native(folder: Path, found: dict[str, Path]) -> dict[str, Path]:
     """Files that are written again, each under a name of its own, and those of the formats that only their readers know."""
     from tests.io import test_native as native
     from tests.io.test_native_graphs import flat_graph
+    from tests.io.test_native_robot_maps import home
     from tests.io.test_native_rtabmap import write_session
     from tests.io.test_read_valetudo import rr_file, rr_pixels
 
@@ -357,6 +360,8 @@ def write_native(folder: Path, found: dict[str, Path]) -> dict[str, Path]:
     rows = np.column_stack([1.4e18 + np.arange(8.0), poses[:, :3, 3], turns[:, [3, 0, 1, 2]], np.zeros((8, 3))])
     native.write_lines(made["native.csv"], rows, "%.9f", ",", "#timestamp\n")
     made["home.rr"] = rr_file(folder / "home.rr", rr_pixels(), packed=False)
+    made["native.rr"] = rr_file(folder / "native.rr", rr_pixels(), packed=False)
+    made["native.home.json"] = home(folder / "native.home.json")
     if find_spec("google.protobuf"):
         from tests.io import cartographer_states as carto
 
@@ -366,6 +371,7 @@ def write_native(folder: Path, found: dict[str, Path]) -> dict[str, Path]:
         from tests.io.test_usdz import roomplan
 
         made["room.usdz"] = roomplan(folder / "room.usdz")
+        made["native.usdz"] = roomplan(folder / "native.usdz")
     return {name: path for name, path in made.items() if path.is_file()}
 
 

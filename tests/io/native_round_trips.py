@@ -86,16 +86,38 @@ def trip_karto(sessions: int) -> Trip:
     return trip
 
 
+def read_by_gtsam(path: Path, numbers: list[int], flat: bool) -> Array | None:
+    """(n, 4, 4) poses of the vertices of these numbers, as GTSAM reads them; None where it is not installed."""
+    try:
+        import gtsam
+    except ImportError:
+        return None
+    values = gtsam.readG2o(str(path), not flat)[1]
+    poses = np.tile(np.eye(4), (len(numbers), 1, 1))
+    for row, number in enumerate(numbers):
+        if flat:
+            matrix = values.atPose2(number).matrix()
+            poses[row, :2, :2], poses[row, :2, 3] = matrix[:2, :2], matrix[:2, 2]
+        else:
+            poses[row] = values.atPose3(number).matrix()
+    return poses
+
+
 def trip_g2o(text: str, motion: Motion) -> Trip:
     def trip(folder: Path) -> tuple[Tally, float, str]:
         (folder / "a.g2o").write_text(text)
         tally, out = join("g2o", folder, Source(folder / "a.g2o"), Source(folder / "a.g2o", motion))
         before, after = read_pose_graph(folder / "a.g2o").vertices, read_pose_graph(out).vertices
         posed = [k for k in before if before[k].posed]
-        found = np.array([after[k + max(before) + 1].pose for k in posed])
+        flat = before[posed[0]].tag == "VERTEX_SE2"
+        moved = [k + max(before) + 1 for k in posed]
+        found = np.array([after[k].pose for k in moved])
+        opened = read_by_gtsam(out, moved, flat)
+        if opened is not None:
+            np.testing.assert_allclose(opened, found, rtol=0, atol=1e-12)
         expected = motion.matrix @ np.array([before[k].pose for k in posed])
-        flat = [0, 1] if before[posed[0]].tag == "VERTEX_SE2" else [0, 1, 2]
-        return tally, float(np.abs((found - expected)[:, flat]).max()), "our reader"
+        error = np.abs((found - expected)[:, [0, 1] if flat else [0, 1, 2]]).max()
+        return tally, float(error), "our reader" if opened is None else "GTSAM, our reader"
 
     return trip
 
@@ -114,6 +136,38 @@ def trip_dsg(folder: Path) -> tuple[Tally, float, str]:
     expected = np.array([node["attributes"]["position"] for node in before["nodes"]])
     error = max(float(np.abs(found - place).max(axis=1).min()) for place in expected)
     return tally, error, "spark_dsg"
+
+
+def trip_usdz(count: int) -> Trip:
+    def trip(folder: Path) -> tuple[Tally, float, str]:
+        from tests.io.test_native_usdz import scan, vertices
+        from tests.io.test_usdz import roomplan
+
+        a, b = roomplan(folder / "room.usdz"), scan(folder / "scan.usdz")
+        tally, out = join("usdz", folder, *[Source(a, TILTED), Source(b, YAW)][:count])
+        expected = [TILTED.move_points(vertices(a)), YAW.move_points(vertices(b))][:count]
+        return tally, float(np.abs(vertices(out) - np.concatenate(expected)).max()), "usd-core, our reader"
+
+    return trip
+
+
+def trip_robot_maps(folder: Path) -> tuple[Tally, float, str]:
+    """The error is that of entities; pixels are off by half a pixel."""
+    import json
+
+    from tests.io.test_native_robot_maps import home, turn
+
+    motion = turn(180, 0.013, 0.004)
+    a, b = home(folder / "a.json", ("Bath", "Hall")), home(folder / "b.json", ("Kitchen", ""))
+    tally, out = join("robot_map", folder, Source(a), Source(b, motion))
+    before, after = (json.loads(path.read_text())["entities"] for path in (b, out))
+    old, new = (
+        np.array([xy for entity in listed for xy in zip(entity["points"][::2], entity["points"][1::2], strict=True)])
+        / (100, -100)
+        for listed in (before, after[-len(before) :])
+    )
+    expected = motion.move_points(np.column_stack([old, np.zeros(len(old))]))[:, :2]
+    return tally, float(np.abs(new - expected).max()), "our reader"
 
 
 def trip_e57(folder: Path) -> tuple[Tally, float, str]:
@@ -201,6 +255,9 @@ TRIPS: dict[str, Trip] = {
     "g2o, SE3, two graphs": trip_g2o(GRAPH, TILTED),
     "g2o, SE2, two graphs": trip_g2o(PLANE, YAW),
     "Spark-DSG, two graphs of three rooms, two of them shared": trip_dsg,
+    "USDZ, RoomPlan's, one file": trip_usdz(1),
+    "USDZ, RoomPlan's and a scanner's of another unit and axis": trip_usdz(2),
+    "Valetudo, two maps of the same two rooms; its points are whole cm": trip_robot_maps,
     "E57, three stations": trip_e57,
     "LAS": trip_cloud("a.las", "laspy"),
     "LAZ": trip_cloud("a.laz", "laspy"),

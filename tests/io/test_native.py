@@ -347,7 +347,7 @@ def test_outputs_have_names_of_their_own(tmp_path: Path) -> None:
 
 def test_the_table_of_round_trips(tmp_path: Path) -> None:
     """Nothing is lost, poses are right to a millionth (in floats and in LAS to what these hold), and the page is written."""
-    for name in ("pye57", "laspy", "spark_dsg", "plyfile", "google.protobuf"):
+    for name in ("pye57", "laspy", "spark_dsg", "plyfile", "google.protobuf", "pxr"):
         pytest.importorskip(name)
     from tests.io.native_round_trips import TRIPS, main
 
@@ -359,8 +359,8 @@ def test_the_table_of_round_trips(tmp_path: Path) -> None:
     ]
     assert [line[0] for line in lines] == list(TRIPS)
     for name, counts, error, _ in lines:
-        limit = 6e-5 if name in ("LAS", "LAZ") else 5e-6 if "floats" in name else 1e-6
+        limit = 6e-5 if name in ("LAS", "LAZ") else 8e-3 if "whole cm" in name else 5e-6 if "floats" in name else 1e-6
         assert float(error) <= limit, (name, error)
         for part in counts.split(", "):
             before, after = part.rpartition(" → ")[::2]
-            assert before.split()[-1] == after or "Spark-DSG" in name, part
+            assert before.split()[-1] == after or "Spark-DSG" in name or "Valetudo" in name, part

@@ -269,7 +269,7 @@ MERGE = Command(
             action="store_true",
             default=False,
             help="also write the inputs again in their own formats with the new poses, joined where the format can hold several: "
-            "RTAB-Map, g2o, Cartographer, slam_toolbox, Spark-DSG, E57, LAS, PLY, PCD, trajectories",
+            "RTAB-Map, g2o, Cartographer, slam_toolbox, Spark-DSG, USDZ, Valetudo, E57, LAS, PLY, PCD, trajectories",
         ),
         build_option(
             "--force", action="store_true", help="write the best merge even if it is not trusted (the exit status stays 2)"

@@ -92,7 +92,7 @@ def _find_file(name: str, how: str = "as NUMBER=FILE") -> Path:
 def plan_merge(result: MergeResult, args: argparse.Namespace, folder: Path) -> tuple[Plan, Doubt | None]:
     """Plan what `merge --native` writes; an input that can't be written again is left out with a warning."""
     from topomerge.fusion.frames import LEAST_DOUBT, TURN_DOUBT, build_file_motion, convert_motion
-    from topomerge.io.native import Doubt, Source, find_format, plan_outputs
+    from topomerge.io.native import Doubt, Source, find_format, plan_outputs, refuse_scale
     from topomerge.io.piece import read_options
 
     sources = []
@@ -100,11 +100,14 @@ def plan_merge(result: MergeResult, args: argparse.Namespace, folder: Path) -> t
         name = args.inputs[k]
         try:
             path = _find_file(name, f"by `topomerge move {folder} {k}=FILE -o moved`")
-            if find_format(path) is None:
+            form = find_format(path)
+            if form is None:
                 raise InputError(f"{name}: has no form in which it could be written again; take its points by --points")
             motion = build_file_motion(placement, result.maps[k].levelling, result.maps[0].levelling)
             options = read_options(path, collect_reading_options(name, args))
-            sources.append(Source(path, convert_motion(motion, options)))
+            source = Source(path, convert_motion(motion, options))
+            refuse_scale(source, form)
+            sources.append(source)
         except InputError as error:
             text = str(error)
             warn([text if text.startswith(name) else f"{name}: {text}"])
@@ -142,5 +145,6 @@ MOVE = Command(
     ),
     paths=("merged", "files", "output"),
     description="Write files of other programs again, in their own format, with the poses of a merge: databases of RTAB-Map, "
-    "pose graphs, states of Cartographer and scene graphs joined, scans and trajectories moved. No source is changed.",
+    "pose graphs, states of Cartographer, scene graphs, USDZ and maps of vacuum robots joined, scans and trajectories moved. No "
+    "source is changed.",
 )

@@ -13,7 +13,7 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.frame import get_axis_rotation
-from topomerge.io.native import SAME_SIZE, Doubt, Motion
+from topomerge.io.native import NATIVE, Doubt, Motion, Source, refuse_scale
 from topomerge.io.native.pose_graph import PoseGraph, build_pose_graph, read_pose_graph
 from topomerge.io.piece import ReadOptions
 from topomerge.types import (
@@ -58,15 +58,7 @@ def build_file_motion(placement: Placement, levelling: Array, into: Array) -> Mo
     Args:
         placement: of the map in the joined one.
         levelling, into: (4, 4), take points of the file, and of the first file, into their maps.
-
-    Raises:
-        InputError: the map is scaled, which no file of poses can be.
     """
-    scale = placement.pose.scale
-    if abs(scale - 1) > SAME_SIZE:
-        raise InputError(
-            f"is {scale:.4g} times as large in the joined frame, and poses can't scale; read it with --scale {scale:.6g}"
-        )
     stays = placement.pose == Sim3() and np.array_equal(levelling, into)
     matrix = np.eye(4) if stays else convert_pose_to_files(placement.pose, levelling, into)
     if placement.bend is None:
@@ -145,7 +137,14 @@ def _parse_frames(listing: Mapping[str, Any]) -> list[FileFrame]:
 
 
 def build_map_graph(frames: Sequence[FileFrame]) -> PoseGraph:
-    """Build the pose graph of the maps of a merge: an edge for each link of an atlas, else from the first map to each other."""
+    """Build the pose graph of the maps of a merge: an edge for each link of an atlas, else from the first map to each other.
+
+    Raises:
+        InputError: a map is scaled, which no pose can be.
+    """
+    for frame in frames:
+        if frame.motion is not None:
+            refuse_scale(Source(Path(frame.source), frame.motion), NATIVE["g2o"])
     poses = {frame.number: frame.motion.matrix for frame in frames if frame.motion is not None}
     links = []
     for frame in frames:

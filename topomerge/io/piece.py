@@ -9,7 +9,8 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from numbers import Real
 from pathlib import Path
@@ -270,12 +271,36 @@ def read_in_subprocess(
     Raises:
         InputError: as the reader; or the child came to an end before it was done.
     """
-    task = json.dumps([module, str(path), asdict(options), seconds, room])
-    child = start_child(task)
+    with _open_child([module, str(path), asdict(options), seconds, room], kind, path, seconds) as stream:
+        while (piece := _receive_piece(path, kind, stream)) is not None:
+            yield piece
+
+
+def compute_in_subprocess(module: str, kind: str, path: Path, task: Mapping[str, Any], seconds: int, room: int) -> Any:
+    """Compute ``module.compute_in_process(task)`` in a process of its own; the task and the result are values of JSON.
+
+    Args:
+        module: of `topomerge.io`.
+        kind: what the file should be, for messages.
+        path: of the file, for messages.
+        task: what to do.
+        seconds: of the processor that it may take.
+        room: bytes that it may take beyond what it needs to start.
+
+    Raises:
+        InputError: as the function; or the child came to an end before it was done.
+    """
+    with _open_child([module, str(path), {"task": dict(task)}, seconds, room], kind, path, seconds) as stream:
+        return _receive_header(path, kind, stream)["value"]
+
+
+@contextmanager
+def _open_child(words: Sequence[Any], kind: str, path: Path, seconds: int | None) -> Iterator[IO[bytes]]:
+    """Yield what a child sends; it is ended afterwards. Where it ended too early, an InputError."""
+    child = start_child(json.dumps(words))
     assert child.stdout is not None
     try:
-        while (piece := _receive_piece(path, kind, child.stdout)) is not None:
-            yield piece
+        yield child.stdout
     except EOFError:
         late = child.wait() == -signal.SIGXCPU
         why = f"more than {seconds} s for a small part of it" if late else "the library that reads it broke down"
@@ -294,18 +319,24 @@ def start_child(task: str) -> subprocess.Popen[bytes]:
     )
 
 
-def _receive_piece(path: Path, kind: str, stream: IO[bytes]) -> Piece | None:
-    """Return the next piece, None after the last; an EOFError where the child is no more."""
+def _receive_header(path: Path, kind: str, stream: IO[bytes]) -> dict[str, Any]:
+    """Return what the child sends next; an EOFError where it is no more."""
     line = stream.readline()
     if not line.endswith(b"\n"):
         raise EOFError
-    header = json.loads(line)
-    if "end" in header:
-        return None
+    header: dict[str, Any] = json.loads(line)
     if "refused" in header:
         raise InputError(header["refused"])
     if "fault" in header:
         raise build_damage_error(path, kind, header["fault"])
+    return header
+
+
+def _receive_piece(path: Path, kind: str, stream: IO[bytes]) -> Piece | None:
+    """Return the next piece, None after the last."""
+    header = _receive_header(path, kind, stream)
+    if "end" in header:
+        return None
     arrays: dict[str, Any] = {name: _receive_array(stream, ARRAYS[name], shape) for name, shape in header["arrays"].items()}
     rooms = tuple(TrueRoom(**{**room, "polygon": np.array(room["polygon"], float).reshape(-1, 2)}) for room in header["rooms"])
     if "landmarks" in arrays:
@@ -327,7 +358,7 @@ def main() -> None:
     limit(room=room)
     with os.fdopen(os.dup(1), "wb") as out:
         os.dup2(2, 1)  # what a library prints is no piece
-        for header, arrays in _iter_messages(reader, Path(path), ReadOptions(**options), seconds):
+        for header, arrays in _iter_messages(reader, Path(path), options, seconds):
             out.write(json.dumps(header).encode() + b"\n")
             for array in arrays:
                 out.write(array.data)
@@ -335,11 +366,14 @@ def main() -> None:
 
 
 def _iter_messages(
-    reader: Any, path: Path, options: ReadOptions, seconds: int | None
+    reader: Any, path: Path, options: Mapping[str, Any], seconds: int | None
 ) -> Iterator[tuple[dict[str, Any], list[Array]]]:
     try:
         limit(seconds=seconds)
-        for piece in reader.read_in_process(path, options):
+        if "task" in options:
+            yield {"value": reader.compute_in_process(options["task"])}, []
+            return
+        for piece in reader.read_in_process(path, ReadOptions(**options)):
             marks = piece.landmarks
             arrays: dict[str, Any] = {name: getattr(piece, name) for name in ARRAYS}
             arrays["landmarks"] = None if marks is None else marks.table

@@ -91,12 +91,7 @@ def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
     Raises:
         InputError: a layer names others outside of the file, or there are no meshes, or too many.
     """
-    from pxr import Usd
-
-    refuse_outside(path)
-    stage = Usd.Stage.Open(str(path))
-    if stage is None:
-        raise build_damage_error(path, KIND, "it can't be opened")
+    stage = open_stage(path)
     parts = list(_iter_parts(path, stage))
     if not parts:
         raise InputError(f"{path}: holds no meshes; export it with its geometry")
@@ -114,6 +109,37 @@ def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
             if count > MOST_POINTS:
                 raise InputError(f"{path}: would become more than {MOST_POINTS:,} points; give a larger --spacing")
             yield Piece(points, done=0.1 + 0.9 * number / len(kept))
+
+
+def open_stage(path: Path) -> Any:
+    """Open a file of which nothing lies outside.
+
+    Raises:
+        InputError: a layer names others outside of the file, or it can't be opened.
+    """
+    from pxr import Usd
+
+    refuse_outside(path)
+    stage = Usd.Stage.Open(str(path))
+    if stage is None:
+        raise build_damage_error(path, KIND, "it can't be opened")
+    return stage
+
+
+def build_stage_frame(path: Path, stage: Any) -> Array:
+    """Build (4, 4), which takes places of a stage into metres with z up.
+
+    Raises:
+        InputError: its unit is none.
+    """
+    from pxr import UsdGeom
+
+    unit = float(UsdGeom.GetStageMetersPerUnit(stage))
+    if not UNITS[0] <= unit <= UNITS[1]:
+        raise build_damage_error(path, KIND, f"a unit of {unit:g} m")
+    turn = np.eye(4)
+    turn[:3, :3] = unit * get_axis_rotation("y" if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else "z")
+    return turn
 
 
 def refuse_outside(path: Path) -> None:
@@ -149,11 +175,7 @@ def _iter_parts(path: Path, stage: Any) -> Iterator[Part]:
     """Yield the meshes and boxes of a stage, placed in the world."""
     from pxr import Usd, UsdGeom
 
-    unit = float(UsdGeom.GetStageMetersPerUnit(stage))
-    if not UNITS[0] <= unit <= UNITS[1]:
-        raise build_damage_error(path, KIND, f"a unit of {unit:g} m")
-    turn = np.eye(4)
-    turn[:3, :3] = unit * get_axis_rotation("y" if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else "z")
+    turn = build_stage_frame(path, stage)
     cache, corners, count = UsdGeom.XformCache(), 0, 0
     for number, prim in enumerate(stage.Traverse(Usd.TraverseInstanceProxies())):
         if number > MOST_PRIMS or count > MOST_PARTS:

@@ -54,10 +54,10 @@ class RobotMap:
 
 def is_robot_map(about: object) -> bool:
     """Return whether a value is a map of Valetudo or of Valetudo RE."""
-    return isinstance(about, dict) and (about.get("__class") == "ValetudoMap" or _is_rand256_map(about))
+    return isinstance(about, dict) and (about.get("__class") == "ValetudoMap" or is_rand256_map(about))
 
 
-def _is_rand256_map(about: Mapping[str, Any]) -> bool:
+def is_rand256_map(about: Mapping[str, Any]) -> bool:
     """Return whether it is the JSON of Valetudo RE (rand256)."""
     image = about.get("image")
     return isinstance(image, dict) and isinstance(image.get("pixels"), dict) and isinstance(image.get("dimensions"), dict)
@@ -65,9 +65,7 @@ def _is_rand256_map(about: Mapping[str, Any]) -> bool:
 
 def iter_pieces(path: Path, about: Mapping[str, Any], options: ReadOptions) -> Iterator[Piece]:
     """Yield floor points, then walls layer by layer, in metres."""
-    yield from _extrude(
-        path, _parse_rand256_map(path, about) if _is_rand256_map(about) else parse_robot_map(path, about), options
-    )
+    yield from _extrude(path, parse_json_map(path, about), options)
 
 
 def _extrude(path: Path, drawn: RobotMap, options: ReadOptions) -> Iterator[Piece]:
@@ -86,6 +84,15 @@ def _extrude(path: Path, drawn: RobotMap, options: ReadOptions) -> Iterator[Piec
     x, y = (drawn.origin - drawn.resolution).tolist()
     plan = grid.Plan(path, drawn.resolution, (x, y, 0.0))
     yield from grid.extrude(path, np.flipud(walls), np.flipud(free), plan, options)
+
+
+def parse_json_map(path: Path, about: Mapping[str, Any]) -> RobotMap:
+    """Parse a map of Valetudo or of Valetudo RE (`is_robot_map`).
+
+    Raises:
+        InputError: the map can't be used.
+    """
+    return _parse_rand256_map(path, about) if is_rand256_map(about) else parse_robot_map(path, about)
 
 
 def parse_robot_map(path: Path, about: Mapping[str, Any]) -> RobotMap:
@@ -190,6 +197,15 @@ SEGMENT_SHIFT, LARGEST_SEGMENT = 21, 31  # Valetudo RE packs the number of a roo
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Read a map file of Roborock: floor points, then walls layer by layer, in metres."""
+    yield from _extrude(path, read_roborock_map(path), options)
+
+
+def read_roborock_map(path: Path) -> RobotMap:
+    """Read the walls, the floor and the robot's own rooms of a map file of Roborock.
+
+    Raises:
+        InputError: it is damaged, or shows nothing.
+    """
     data = path.read_bytes() if path.stat().st_size <= LARGEST_RR else b""
     if data.startswith(GZIP_MAGIC):
         unpacker = zlib.decompressobj(31)
@@ -201,7 +217,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
             raise build_damage_error(path, KIND, f"it is cut short, or unpacks to more than {LARGEST_RR >> 20} MB")
     if not data.startswith(RR_MAGIC):
         raise InputError(f"{path}: is no map of Roborock (it does not start with rr); check the file's suffix")
-    yield from _extrude(path, parse_roborock_map(path, data), options)
+    return parse_roborock_map(path, data)
 
 
 def parse_roborock_map(path: Path, data: bytes) -> RobotMap:

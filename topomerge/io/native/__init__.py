@@ -31,7 +31,7 @@ class Motion:
     """Where the frame of a file lies in the joined one.
 
     Args:
-        matrix: (4, 4) float64, a rotation and a translation.
+        matrix: (4, 4) float64, a rotation and a translation; for formats that can be scaled also a scale.
         warp: where a bent map puts points; None: `matrix` says it all.
     """
 
@@ -42,6 +42,11 @@ class Motion:
     def still(self) -> bool:
         """Does everything stay where it is?"""
         return self.warp is None and bool(np.array_equal(self.matrix, np.eye(4)))
+
+    @property
+    def scale(self) -> float:
+        """How many times as large does the file become?"""
+        return float(np.cbrt(np.linalg.det(self.matrix[:3, :3])))
 
     @property
     def level(self) -> bool:
@@ -103,7 +108,8 @@ class Tally:
 @dataclass(frozen=True)
 class Format:
     """A format: what such files are called, their suffixes, the module that writes them, whether several become one, the
-    suffix of a file that is written beside, and whether only those of one group are joined (`find_group` of the module)."""
+    suffix of a file that is written beside, whether only those of one group are joined (`find_group` of the module), whether what
+    is in them can be scaled, and the suffix of what is written, if it is not theirs."""
 
     name: str
     suffixes: tuple[str, ...]
@@ -111,6 +117,8 @@ class Format:
     joins: bool = False
     companion: str = ""
     grouped: bool = False
+    scales: bool = False
+    written: str = ""
 
 
 NATIVE = {
@@ -119,22 +127,24 @@ NATIVE = {
     "pbstream": Format("a state of Cartographer", (".pbstream",), "pbstream", joins=True),
     "karto": Format("a pose graph of slam_toolbox", (".posegraph",), "karto", joins=True, companion=".data", grouped=True),
     "dsg": Format("a scene graph", (".json",), "scene_graph", joins=True),
+    "usdz": Format("a USDZ file", (".usdz",), "usdz", joins=True, scales=True),
+    "robot_map": Format("a vacuum robot's map", (".json", ".rr", ".rrmap"), "robot_map", joins=True, written=".json"),
     "e57": Format("an E57 file", (".e57",), "stations"),
-    "las": Format("a LAS file", (".las", ".laz"), "clouds"),
-    "ply": Format("a PLY file", (".ply",), "clouds"),
+    "las": Format("a LAS file", (".las", ".laz"), "clouds", scales=True),
+    "ply": Format("a PLY file", (".ply",), "clouds", scales=True),
     "pcd": Format("a PCD file", (".pcd",), "clouds"),
     "trajectory": Format("a trajectory", (".txt", ".csv", ".tum", ".kitti"), "trajectories"),
 }
+CHECKED = ("trajectories", "scene_graph", "robot_map")  # modules whose `is_native` reads a file to tell whether it is theirs
 
 
 def find_format(path: Path) -> Format | None:
     """Find the format in which a file can be written again; None: in none, or it does not exist."""
     if not path.is_file():
         return None
-    form = next((form for form in NATIVE.values() if path.suffix.lower() in form.suffixes), None)
-    if form is None or form.module not in ("trajectories", "scene_graph"):
-        return form
-    return form if import_module(f"topomerge.io.native.{form.module}").is_native(path) else None
+    able = (form for form in NATIVE.values() if path.suffix.lower() in form.suffixes)
+    checked = (f for f in able if f.module not in CHECKED or import_module(f"topomerge.io.native.{f.module}").is_native(path))
+    return next(checked, None)
 
 
 def list_native_suffixes() -> str:
@@ -159,6 +169,7 @@ def plan_outputs(sources: Sequence[Source], folder: Path) -> list[tuple[Path, Fo
                 name = source.path.with_suffix(whole.suffixes[0]).name
                 raise InputError(f"{source.path}: give {name}, beside which it lies")
             raise InputError(f"{source.path}: {able}; leave it out, or take its points by `merge --points`")
+        refuse_scale(source, form)
         key = form.module if form.joins else str(number)
         if form.grouped:
             key += import_module(f"topomerge.io.native.{form.module}").find_group(source.path)
@@ -167,12 +178,27 @@ def plan_outputs(sources: Sequence[Source], folder: Path) -> list[tuple[Path, Fo
     plan = []
     for form, members in groups.values():
         suffix = "".join(members[0].path.suffixes[-2:]) if members[0].path.name.endswith(".dsg.json") else members[0].path.suffix
+        written = form.written or suffix
         stem = "joined" if len(members) > 1 else f"{members[0].path.name.removesuffix(suffix)}_moved"
-        tries = (f"{stem}{f'_{n}' if n > 1 else ''}{suffix}" for n in itertools.count(1))
+        tries = (f"{stem}{f'_{n}' if n > 1 else ''}{written}" for n in itertools.count(1))
         name = next(name for name in tries if name.lower() not in taken)
         taken.add(name.lower())
         plan.append((folder / name, form, members))
     return plan
+
+
+def refuse_scale(source: Source, form: Format) -> None:
+    """Refuse a file that has another size in the joined frame, where its format holds poses.
+
+    Raises:
+        InputError: it is so.
+    """
+    scale = source.motion.scale
+    if not form.scales and abs(scale - 1) > SAME_SIZE:
+        raise InputError(
+            f"{source.path}: is {scale:.4g} times as large in the joined frame, and poses can't scale; "
+            f"read it with --scale {scale:.6g}"
+        )
 
 
 def refuse_missing(path: Path) -> None:
