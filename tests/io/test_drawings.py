@@ -11,16 +11,10 @@ from topomerge.datasets.drawings.sheet import Hand, load_font
 
 from tests.cases import list_longer
 from topomerge.extraction.extract import extract
-from topomerge.io.drawing import (
-    PictureText,
-    choose_zoom,
-    estimate_scale,
-    find_name,
-    find_structure,
-    parse_lengths,
-)
+from topomerge.io.drawing import choose_zoom, estimate_scale, find_structure
 from topomerge.io.drawn_page import find_page
 from topomerge.io.points import read_points
+from topomerge.io.written_lengths import PictureText, find_name, parse_lengths
 from topomerge.networks.drawing import DRAWING_CLASSES, compute_drawing_probabilities
 
 PLAIN = Hand("filled", (0, 0, 0), 0.25, 0.1, 2, False, "arc", "lines", 0.0, 0.0, 1.0, "m2", False, 3, 0.3)
