@@ -39,7 +39,7 @@ SQUARE, LEAST_STRAIGHT = 7, 0.3  # degrees; of the outline of walls, at least: o
 INK_IN_WALLS, STRAIGHT_PLAN = 0.35, 0.6  # of a page that may be a grid: of 30 grids the straightest has .55, most .3 to .5
 TREAD, FEWEST_TREADS = (0.2, 0.37), 6  # m between two
 TREAD_WIDTH, TREAD_STRONG = (0.4, 4.5), 15.0  # m; levels a pixel: tiles are paler
-WALLED = 0.4  # of a room's outline is wall or door, at least
+WALLED = 0.65  # of a room's outline is wall or door, at least: pieces of 100 validation pages have .61 and less, rooms .7
 FEWEST_PIXELS = 30  # of a room that gives a scale
 AGREEING = 0.12  # of the logarithm of the scale: texts that differ more from the median are not of their room
 BLANK = 16  # levels of 255 between the darkest and the lightest pixel: less is paper
@@ -262,7 +262,7 @@ def estimate_scale(drawing: ParsedDrawing, texts: Sequence[PictureText]) -> Draw
             if abs(np.log(small / box[0] * box[1] / large)) <= ALIKE:  # else the text is not of this box
                 found.append((np.sqrt(small * large / (box[0] * box[1])), text.text))
     by_doors = _estimate_scale_by_doors(drawing)
-    chains = _check_chains(find_chains(texts), by_doors)
+    chains = _select_chains(find_chains(texts), by_doors)
     areas = len(found)
     found += [(value / drawing.zoom, "") for value in chains.resolutions]
     if not found:
@@ -282,12 +282,15 @@ def estimate_scale(drawing: ParsedDrawing, texts: Sequence[PictureText]) -> Draw
     return DrawingScale(float(np.exp(np.median(logs[kept]))) * drawing.zoom, float(spread), reasons)
 
 
-def _check_chains(chains: Chains, by_doors: DrawingScale | None) -> Chains:
-    """Return dimensions in rows, or none where they may be something else: doors would be of odd widths, or all are alike."""
+def _select_chains(found: Sequence[Chains], by_doors: DrawingScale | None) -> Chains:
+    """Select the dimensions in rows with the most links, or none where they may be something else: doors would be of odd widths,
+    or all are alike."""
     if by_doors is None:
-        return chains if chains.varied >= VARIED_ALONE else Chains()
-    off = [abs(np.log(value / by_doors.resolution)) for value in chains.resolutions]
-    return chains if off and np.median(off) <= ODD_DOORS * by_doors.spread else Chains()
+        possible = [c for c in found if c.varied >= VARIED_ALONE]
+    else:
+        near = {c: abs(np.log(np.median(c.resolutions) / by_doors.resolution)) for c in found}
+        possible = sorted((c for c in found if near[c] <= ODD_DOORS * by_doors.spread), key=lambda c: float(near[c]))
+    return max(possible, key=lambda c: len(c.resolutions), default=Chains())
 
 
 def _find_room(rooms: Array, text: PictureText, zoom: float) -> int:

@@ -102,33 +102,41 @@ class Chains:
     varied: float = 1.0
 
 
-def find_chains(texts: Sequence[PictureText]) -> Chains:
+def find_chains(texts: Sequence[PictureText]) -> list[Chains]:
     """Find dimensions in a row: the middles of neighbours are half of the one and half of the other apart.
 
     What stands in a row by chance agrees on no scale. Numbers of rooms do, but are all alike as lengths.
+
+    Returns:
+        The largest group that agrees, with whole numbers as centimetres, and as millimetres; none for what agrees on nothing.
     """
-    best = Chains()
+    found = []
     for whole in (UNITS["cm"], UNITS["mm"]):
-        found = [(t, v) for t in texts if (v := parse_dimension(t.text, whole)) is not None][:MOST_DIMENSIONS]
-        if len(found) < 2:
-            continue
-        places, values = np.array([t.place for t, _ in found]), np.array([v for _, v in found])
-        height = np.array([t.height for t, _ in found])
-        links = []
-        for along in (0, 1):
-            ahead = places[None, :, along] - places[:, None, along]
-            aside = np.abs(places[None, :, 1 - along] - places[:, None, 1 - along])
-            row = (aside <= IN_A_ROW * np.minimum(height[:, None], height)) & (ahead > 0)
-            ahead[~row] = np.inf
-            links += [(i, j) for i, j in enumerate(ahead.argmin(axis=1).tolist()) if row[i, j]]
+        lengths = [(t, v) for t in texts if (v := parse_dimension(t.text, whole)) is not None][:MOST_DIMENSIONS]
+        links = np.array(_link_neighbours([t for t, _ in lengths])).reshape(-1, 2)
         if len(links) < FEWEST_LINKS:
             continue
-        first, second = np.array(links).T
-        resolution = (values[first] + values[second]) / 2 / np.hypot(*(places[second] - places[first]).T)
+        places, values = np.array([t.place for t, _ in lengths]), np.array([v for _, v in lengths])
+        resolution = values[links].mean(axis=1) / np.hypot(*(places[links[:, 1]] - places[links[:, 0]]).T)
         agree = np.abs(np.log(resolution)[:, None] - np.log(resolution)) <= LINKS_AGREE
         kept = agree[int(agree.sum(axis=1).argmax())]
-        members = np.unique(np.array(links)[kept])
+        members = np.unique(links[kept])
         varied = float(values[members].max() / values[members].min())
-        if kept.sum() >= max(FEWEST_LINKS, len(best.resolutions) + 1) and varied >= VARIED:
-            best = Chains(tuple(resolution[kept].tolist()), tuple(found[k][0] for k in members), varied)
-    return best
+        if kept.sum() >= FEWEST_LINKS and varied >= VARIED:
+            found.append(Chains(tuple(resolution[kept].tolist()), tuple(lengths[k][0] for k in members), varied))
+    return found
+
+
+def _link_neighbours(texts: Sequence[PictureText]) -> list[tuple[int, int]]:
+    """Link each text with the next one to its right in its row, and with the next one below in its column."""
+    if len(texts) < 2:
+        return []
+    places, height = np.array([t.place for t in texts]), np.array([t.height for t in texts])
+    links = []
+    for along in (0, 1):
+        ahead = places[None, :, along] - places[:, None, along]
+        aside = np.abs(places[None, :, 1 - along] - places[:, None, 1 - along])
+        row = (aside <= IN_A_ROW * np.minimum(height[:, None], height)) & (ahead > 0)
+        nearest = np.where(row, ahead, np.inf).argmin(axis=1).tolist()
+        links += [(i, j) for i, j in enumerate(nearest) if row[i, j]]
+    return links
