@@ -7,7 +7,7 @@ from topomerge.datasets.drawings.hands import draw_plan, draw_tiles, draw_treads
 from topomerge.datasets.drawings.shapes import DrawingShapes, OpeningShape, RoomShape
 from topomerge.datasets.drawings.sheet import WALL_STYLES, Hand, Sheet
 
-from topomerge.io.drawing import parse_lengths
+from topomerge.io.written_lengths import parse_lengths
 from topomerge.networks.drawing import DOOR, FLOOR, PAGE, STAIRS, SYMBOL, TEXT, WALL, WINDOW
 
 SCALE = 60.0  # px/m

@@ -11,16 +11,10 @@ from topomerge.datasets.drawings.sheet import Hand, load_font
 
 from tests.cases import list_longer
 from topomerge.extraction.extract import extract
-from topomerge.io.drawing import (
-    PictureText,
-    choose_zoom,
-    estimate_scale,
-    find_name,
-    find_structure,
-    parse_lengths,
-)
+from topomerge.io.drawing import choose_zoom, estimate_scale, find_structure
 from topomerge.io.drawn_page import find_page
 from topomerge.io.points import read_points
+from topomerge.io.written_lengths import PictureText, find_name, parse_lengths
 from topomerge.networks.drawing import DRAWING_CLASSES, compute_drawing_probabilities
 
 PLAIN = Hand("filled", (0, 0, 0), 0.25, 0.1, 2, False, "arc", "lines", 0.0, 0.0, 1.0, "m2", False, 3, 0.3)
@@ -102,6 +96,14 @@ def test_a_courtyard_is_page():
         ("3500 mm x 2700 mm", None, (3.5, 2.7)),
         ("10'1\" x 11'11\"", None, (10 * 0.3048 + 0.0254, 11 * 0.3048 + 11 * 0.0254)),
         ("9' x 8'", None, (9 * 0.3048, 8 * 0.3048)),
+        ("12'-4\" x 9'-7\"", None, (12 * 0.3048 + 4 * 0.0254, 9 * 0.3048 + 7 * 0.0254)),
+        ("12ft 6in x 10ft", None, (12 * 0.3048 + 6 * 0.0254, 3.048)),
+        ("3.75m x 2.92m (12'4 x 9'7)", None, (12 * 0.3048 + 4 * 0.0254, 9 * 0.3048 + 7 * 0.0254)),
+        ("4.2m by 3.1m", None, (4.2, 3.1)),
+        ("3200 x 4100", None, (3.2, 4.1)),
+        ("10-1 x 11-1", None, None),
+        ("112 SF", 112 * 0.3048**2, None),
+        ("12.3 m 2", 12.3, None),
         ("KITCHEN", None, None),
         ("2.113", None, None),
         ("0.001 m²", None, None),
@@ -155,6 +157,56 @@ def test_a_text_of_another_room_is_outvoted_and_doors_are_the_last_resort():
     assert estimate_scale(parsed, [*texts, wrong]).resolution == pytest.approx(1 / 30, rel=0.04)
     by_doors = estimate_scale(parsed, [])
     assert not by_doors.written and by_doors.resolution == pytest.approx(1 / 30, rel=0.2) and by_doors.spread > 0.1
+
+
+def write_row(texts, step, start=(100.0, 40.0), upright=False, height=10.0):
+    """Dimensions in a row: texts whose middles lie where those of their lengths are, step pixels a metre."""
+    out, at = [], 0.0
+    for text, length in texts:
+        along = start[0] + (at + length / 2) * step
+        out.append(PictureText(text, (start[1], along) if upright else (along, start[1]), height, 0.9))
+        at += length
+    return out
+
+
+@pytest.mark.parametrize("upright", [False, True])
+@pytest.mark.parametrize(
+    "texts",
+    [
+        [("4.00", 4.0), ("3,50", 3.5), ("2.25 m", 2.25), ("1.10", 1.1)],
+        [("400", 4.0), ("350", 3.5), ("225", 2.25), ("88", 0.88)],
+        [("4000", 4.0), ("3500", 3.5), ("2250", 2.25), ("880", 0.88)],
+        [("13'-6\"", 13.5 * 0.3048), ("9' 6\"", 9.5 * 0.3048), ("7'", 7 * 0.3048), ("3'-2 1/2\"", 38 * 0.0254)],
+    ],
+)
+def test_dimensions_in_a_row_give_the_scale(texts, upright):
+    drawing = draw(Hand(**{**vars(PLAIN), "names": 0.0}))
+    parsed = find_structure(one_hot(drawing.classes), 1.0, None)
+    row = write_row(texts, 30.0, upright=upright)
+    wrong = PictureText("7.77", (row[1].place[0] + 43.0, row[1].place[1] + 97.0), 10.0, 1.0)
+    scale = estimate_scale(parsed, [*row, wrong])
+    assert scale.written and scale.resolution == pytest.approx(1 / 30, rel=0.005) and scale.spread < 0.03
+    assert scale.dimensions == tuple(row)
+
+
+def test_numbers_of_rooms_in_a_row_are_no_dimensions():
+    drawing = draw(Hand(**{**vars(PLAIN), "names": 0.0}))
+    parsed = find_structure(one_hot(drawing.classes), 1.0, None)
+    numbers = [PictureText(f"1.{k:02d}", (40.0 + 60 * k, 100.0), 10.0, 1.0) for k in range(1, 6)]
+    far = [PictureText(f"{k}.20", (40.0 + 30 * k * (k - 1), 100.0), 10.0, 1.0) for k in range(1, 6)]  # a third of a usual plan
+    for texts in (numbers, far):
+        assert not estimate_scale(parsed, texts).written
+
+
+def test_a_piece_of_the_page_beside_an_entrance_is_no_room():
+    drawing = draw()
+    classes = drawing.classes.copy()
+    rows, columns = np.nonzero(drawing.rooms >= 0)
+    beside = np.zeros(classes.shape, bool)
+    beside[rows.min() : rows.min() + 60, columns.min() - 40 : columns.min() - 8] = True
+    classes[beside & (classes == DRAWING_CLASSES.index("page"))] = DRAWING_CLASSES.index("floor")
+    parsed = find_structure(one_hot(classes), 1.0, 30.0)
+    assert count_rooms(parsed) == 3
 
 
 def paint(grey):

@@ -12,20 +12,13 @@ from tests.io.test_drawings import draw, draw_case
 from topomerge.errors import InputError
 from topomerge.evaluation.drawings import straighten_truth
 from topomerge.extraction.extract import extract
-from topomerge.io.drawing import (
-    ParsedDrawing,
-    PictureText,
-    TracedDrawing,
-    build_stairs_landmarks,
-    find_treads,
-    is_plan,
-    parse_drawing,
-)
+from topomerge.io.drawing import ParsedDrawing, TracedDrawing, build_stairs_landmarks, find_treads, is_plan, parse_drawing
 from topomerge.io.drawn_page import DrawnPage, compute_levels, find_homography, find_page, move_places
 from topomerge.io.drawn_storeys import correlate_masks, find_storeys, parse_storey
 from topomerge.io.grid import build_drawn_pieces, count_pages, read_picture
 from topomerge.io.piece import ReadOptions
 from topomerge.io.points import read_points
+from topomerge.io.written_lengths import PictureText
 
 SHEET = 842, 595  # px, of A4
 

@@ -16,8 +16,9 @@ import topomerge as tm
 from tests.io.cad_plans import OUTER, ROOMS, parse_dark_lines
 from topomerge.errors import InputError
 from topomerge.io import drawing, pdf, svg
-from topomerge.io.drawing import ParsedDrawing, PictureText, find_stated_scale
+from topomerge.io.drawing import ParsedDrawing
 from topomerge.io.piece import ReadOptions
+from topomerge.io.written_lengths import PictureText, find_stated_scale
 from topomerge.types import Landmarks
 
 POINTS_A_METRE = 72 / 0.0254 / 100  # of a drawing 1:100

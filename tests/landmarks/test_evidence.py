@@ -81,6 +81,9 @@ def test_another_number_at_the_place_contradicts_by_hand():
         ("Salida", "Sali", ["sign cut off: Sali may be Salida"]),
         ("Salida", "Sa", ["signs contradict: Salida against Sa"]),
         ("Salida", "Salud", ["signs contradict: Salida against Salud"]),
+        ("Notausgang", "Notausga7g", []),
+        ("Notausgang", "Haupteingang", ["signs contradict: Notausgang against Haupteingang"]),
+        ("2.113.004", "2.113.005", ["signs contradict: 2.113.004 against 2.113.005"]),
     ],
 )
 def test_a_text_that_lost_an_end_contradicts_nothing(one, other, sentences):

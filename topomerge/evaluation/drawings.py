@@ -25,9 +25,10 @@ from topomerge.datasets.drawings.sheet import Drawing, choose_hand
 from topomerge.evaluation.documents import group_rows, write_mean, write_share, write_table
 from topomerge.evaluation.tasks import Row, TaskSettings, find_optional_data, limit_cases, measure_missing
 from topomerge.extraction.extract import extract
-from topomerge.io.drawing import estimate_scale, find_name, parse_drawing, parse_lengths, read_texts
+from topomerge.io.drawing import estimate_scale, parse_drawing, read_texts
 from topomerge.io.drawn_page import find_page, move_places
 from topomerge.io.points import read_points
+from topomerge.io.written_lengths import find_name, parse_lengths
 from topomerge.metrics import match_places, score_rooms
 from topomerge.networks.drawing import DOOR, PAGE, WALL, WINDOW
 from topomerge.types import Array, LogFn, TopometricMap

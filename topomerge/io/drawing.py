@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +14,15 @@ from topomerge.errors import InputError
 from topomerge.io.drawn_page import DrawnPage, find_lines, move_places
 from topomerge.io.pictures import load_text_reader
 from topomerge.io.sightings import clean_text
+from topomerge.io.written_lengths import (
+    NUMBERED,
+    Chains,
+    PictureText,
+    find_chains,
+    find_name,
+    find_stated_scale,
+    parse_lengths,
+)
 from topomerge.kernels import run_side_by_side
 from topomerge.networks.drawing import DOOR, FLOOR, PAGE, WALL, WINDOW, compute_drawing_probabilities
 from topomerge.networks.network import Run
@@ -31,35 +39,15 @@ SQUARE, LEAST_STRAIGHT = 7, 0.3  # degrees; of the outline of walls, at least: o
 INK_IN_WALLS, STRAIGHT_PLAN = 0.35, 0.6  # of a page that may be a grid: of 30 grids the straightest has .55, most .3 to .5
 TREAD, FEWEST_TREADS = (0.2, 0.37), 6  # m between two
 TREAD_WIDTH, TREAD_STRONG = (0.4, 4.5), 15.0  # m; levels a pixel: tiles are paler
-WALLED = 0.4  # of a room's outline is wall or door, at least
-FOOT, INCH = 0.3048, 0.0254  # m
-PLAUSIBLE_AREA, PLAUSIBLE_SIDE = (0.8, 3000.0), (0.6, 100.0)  # m2, m
+WALLED = 0.65  # of a room's outline is wall or door, at least: pieces of 100 validation pages have .61 and less, rooms .7
 FEWEST_PIXELS = 30  # of a room that gives a scale
 AGREEING = 0.12  # of the logarithm of the scale: texts that differ more from the median are not of their room
 BLANK = 16  # levels of 255 between the darkest and the lightest pixel: less is paper
+NAME_SIGMA = 1.0  # m, of where a name stands in its room
 NAME_HEIGHT = 1.2  # m above the floor at which the name of a room is placed
+VARIED_ALONE, ODD_DOORS = 1.5, 3.0  # dimensions, the longest for the shortest, where no door is seen; spreads of their widths
 ALIKE = 0.3  # likewise, of how long rooms are for their width
 DOOR_WIDTH, DOOR_SPREAD = 0.82, 0.12  # m, usual clear width of drawn doors, and its spread as a logarithm
-
-NUMBER = r"(\d{1,5}(?:[.,]\d{1,3})?)"
-AREA = re.compile(NUMBER + r"\s*(m²|m2|m\^2|qm|sqm|sq\.?\s*m\.?|kvm|㎡|sq\.?\s*ft\.?|ft²|sqft)", re.IGNORECASE)
-SIDES = re.compile(NUMBER + r"\s*(mm|cm|m)?\s*[x×X*]\s*" + NUMBER + r"\s*(mm|cm|m)?(?![\d'\"′])")
-SIDE_IN_FEET = r"(\d{1,3})\s*['’′]\s*(?:(\d{1,2})\s*(?:[\"”″]|'')?)?"
-FEET = re.compile(SIDE_IN_FEET + r"\s*[x×X*]\s*" + SIDE_IN_FEET)
-NUMBERED = re.compile(r"[A-Za-z]{0,3}[-. ]?\d{1,3}(?:[.\-]\d{1,4}){0,2}[a-z]?(?<=..)")
-NAME_SIGMA = 1.0  # m, of where a name stands in its room
-STATED_SCALE = re.compile(r"(?<![\d:.,])1\s?:\s?([1-9]\d{1,3})(?![\d:.,])")
-WORD = re.compile(r"[^\W\d_]{2,}")
-
-
-@dataclass(frozen=True)
-class PictureText:
-    """A text on a picture: its middle (column, row) and its height, px, and how surely it was read."""
-
-    text: str
-    place: tuple[float, float]
-    height: float
-    confidence: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,12 +77,14 @@ class DrawingScale:
     Args:
         resolution: m; spread: its standard deviation as a logarithm.
         reasons: the texts or doors that say so; written: are they texts?
+        dimensions: those of the texts that stand in rows, and name no room.
     """
 
     resolution: float
     spread: float
     reasons: tuple[str, ...]
     written: bool = True
+    dimensions: tuple[PictureText, ...] = ()
 
 
 SMALL_PICTURE = 1000  # px of its longer side, below which letters are enlarged
@@ -242,39 +232,12 @@ def drop_small(mask: Array, least: float) -> Array:
     return np.asarray(size[label] >= max(least, 1))
 
 
-def parse_lengths(text: str) -> tuple[float | None, tuple[float, float] | None]:
-    """Parse an area, m2, and sides, m, that a text states: "13.4 m²", "4.2 x 5.8 m", "10'1\\" x 11'1\\"", "145 sq ft"."""
-    sides = None
-    if found := FEET.search(text):
-        feet = [float(v or 0) for v in found.groups()]
-        sides = feet[0] * FOOT + feet[1] * INCH, feet[2] * FOOT + feet[3] * INCH
-    elif found := SIDES.search(text):
-        values = [float(found[k].replace(",", ".")) for k in (1, 3)]
-        unit = found[4] or found[2] or ("cm" if min(values) > 60 else "m")
-        factor = {"m": 1.0, "cm": 0.01, "mm": 0.001}[unit.lower()]
-        sides = values[0] * factor, values[1] * factor
-    area = None
-    if found := AREA.search(text):
-        area = float(found[1].replace(",", ".")) * (FOOT**2 if "f" in found[2].lower() else 1.0)
-    if area is not None and not PLAUSIBLE_AREA[0] <= area <= PLAUSIBLE_AREA[1]:
-        area = None
-    if sides is not None and not all(PLAUSIBLE_SIDE[0] <= side <= PLAUSIBLE_SIDE[1] for side in sides):
-        sides = None
-    return area, sides
-
-
-def find_name(text: str) -> str:
-    """Find the name or number of a room in a text: what is left without areas and sides; "" where that is no name."""
-    left = FEET.sub(" ", SIDES.sub(" ", AREA.sub(" ", text)))
-    left = " ".join(left.split()).strip(" -:;,/|()")
-    return left if WORD.search(left) or NUMBERED.fullmatch(left) else ""
-
-
 def estimate_scale(drawing: ParsedDrawing, texts: Sequence[PictureText]) -> DrawingScale | None:
     """Estimate the size of a pixel by the areas and sides that are written in rooms; else by the width of doors.
 
-    Each text that lies in a room says how long a pixel is: by the room's area, or by its box. The largest group of texts that
-    agree decides, of alike ones that which doors are nearer to.
+    Each text that lies in a room says how long a pixel is: by the room's area, or by its box; so do dimensions that stand in a
+    row. The largest group of texts that agree decides, of alike ones that which doors are nearer to. Where dimensions are of this
+    group, they alone say how large it is: walls take nothing off them.
 
     Returns:
         None where neither texts nor doors say anything.
@@ -299,6 +262,9 @@ def estimate_scale(drawing: ParsedDrawing, texts: Sequence[PictureText]) -> Draw
             if abs(np.log(small / box[0] * box[1] / large)) <= ALIKE:  # else the text is not of this box
                 found.append((np.sqrt(small * large / (box[0] * box[1])), text.text))
     by_doors = _estimate_scale_by_doors(drawing)
+    chains = _select_chains(find_chains(texts), by_doors)
+    areas = len(found)
+    found += [(value / drawing.zoom, "") for value in chains.resolutions]
     if not found:
         return by_doors
     logs = np.log([value for value, _ in found])
@@ -307,9 +273,24 @@ def estimate_scale(drawing: ParsedDrawing, texts: Sequence[PictureText]) -> Draw
     if by_doors is not None:  # where as many speak for one as for another
         votes -= 0.5 * np.minimum(np.abs(logs - np.log(by_doors.resolution / drawing.zoom)), 1.0)
     kept = agree[int(votes.argmax())]
+    if kept[areas:].any():
+        spread = 0.03 / np.sqrt(kept[areas:].sum())
+        reasons = tuple(dict.fromkeys(t.text for t in chains.texts))
+        return DrawingScale(float(np.median(chains.resolutions)), float(spread), reasons, dimensions=chains.texts)
     spread = 0.05 / np.sqrt(kept.sum()) if kept.sum() > 1 else 0.1
     reasons = tuple(dict.fromkeys(text for (_, text), good in zip(found, kept, strict=True) if good))
     return DrawingScale(float(np.exp(np.median(logs[kept]))) * drawing.zoom, float(spread), reasons)
+
+
+def _select_chains(found: Sequence[Chains], by_doors: DrawingScale | None) -> Chains:
+    """Select the dimensions in rows with the most links, or none where they may be something else: doors would be of odd widths,
+    or all are alike."""
+    if by_doors is None:
+        possible = [c for c in found if c.varied >= VARIED_ALONE]
+    else:
+        near = {c: abs(np.log(np.median(c.resolutions) / by_doors.resolution)) for c in found}
+        possible = sorted((c for c in found if near[c] <= ODD_DOORS * by_doors.spread), key=lambda c: float(near[c]))
+    return max(possible, key=lambda c: len(c.resolutions), default=Chains())
 
 
 def _find_room(rooms: Array, text: PictureText, zoom: float) -> int:
@@ -382,6 +363,7 @@ def trace_drawing(
     warnings = [f"{path.name}: was read as a drawn plan, without its page, texts and furniture"]
     if page.mended:
         warnings.append(f"{path.name}: its page was {', '.join(page.mended)} first; places are those on that page")
+    dimensions: tuple[PictureText, ...] = ()
     if resolution is None:
         scale = estimate_scale(drawing, texts or ())
         if known is not None and not (scale and scale.written and abs(np.log(scale.resolution / known)) > AGREEING):
@@ -389,7 +371,7 @@ def trace_drawing(
         if scale is None:
             more = "" if texts is not None else " (pip install topomerge[text] reads what is written on it)"
             raise InputError(f"{path}: an image does not say how large a pixel is; give --resolution in metres a pixel{more}")
-        known = scale.resolution
+        known, dimensions = scale.resolution, scale.dimensions
         why = ", ".join(repr(reason) if scale.written else reason for reason in scale.reasons[:3])
         warnings.append(f"{path.name}: {known:.4g} m a pixel, give or take {scale.spread:.0%}, by {why}; --resolution sets it")
         if not np.isclose(choose_zoom(picture.shape[:2], known), drawing.zoom, rtol=0.1):
@@ -398,7 +380,8 @@ def trace_drawing(
     zoom = drawing.zoom
     treads = resize_picture(np.repeat(find_treads(picture, known)[..., None] * np.uint8(255), 3, axis=2), zoom)[..., 0] > 127
     drawing = replace(drawing, stairs=treads & ndimage.binary_fill_holes(drawing.free | drawing.occupied))
-    placed = [PictureText(t.text, (t.place[0] * zoom, t.place[1] * zoom), t.height * zoom, t.confidence) for t in texts or ()]
+    rest = [t for t in texts or () if t not in dimensions]
+    placed = [PictureText(t.text, (t.place[0] * zoom, t.place[1] * zoom), t.height * zoom, t.confidence) for t in rest]
     return TracedDrawing(drawing, known / zoom, tuple(placed), tuple(warnings))
 
 
@@ -408,12 +391,6 @@ def explain_missing_walls(path: Path, picture: Array) -> str:
         return "nothing is drawn on it"
     advice = "" if path.suffix.lower() in (".pdf", ".svg") else "; if it is a robot's grid, give --no-drawing"
     return f"no walls around a room were found in it{advice}"
-
-
-def find_stated_scale(texts: Sequence[PictureText]) -> float | None:
-    """Find the one scale of a page that its texts state ("1:100" is 100); None where they state none, or several."""
-    found = {float(match) for text in texts for match in STATED_SCALE.findall(text.text)}
-    return found.pop() if len(found) == 1 else None
 
 
 def build_name_landmarks(

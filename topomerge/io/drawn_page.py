@@ -25,6 +25,7 @@ CLEAN_SHARE = 0.3  # of the pixels of a picture that a program drew are of one l
 SMALL_SIDE = 400  # px of the longer side at which a page is looked for
 LEAST_PAGE, PAGE_FIT = 0.15, 0.93  # of the picture; of quadrilateral and found page, what both hold of what either does
 MARGIN, MARGIN_INK = (0.012, 0.03), 0.08  # of a page, where it is empty along its edge, and how much of that may be ink
+MARGIN_WINDOW = 15  # px of its side, in which most is paper
 EDGE_REACH = 0.05, 0.015  # of the longer side, within which the edge of a page is looked for again
 MOST_CORNERS = 12  # of the outline of a page, of which four are chosen
 PAPER_SHAPES, PAPER_NEAR = (2**0.5, 11 / 8.5), 0.045  # A4 and its like, letter; as a logarithm
@@ -157,13 +158,16 @@ def find_sheet(picture: Array) -> Array | None:
     noise = float(np.median(np.abs(border - table).max(axis=1)))
     bright = smooth.mean(axis=2)
     split = compute_threshold(bright)
-    for mask in (bright > split, far > 3 * noise + 12, bright < split):
-        corners = _find_quadrilateral(mask, bright)
-        if corners is not None:
-            for reach in EDGE_REACH:
-                corners = refine_corners(smooth, corners, reach * max(bright.shape))
-            return (corners + 0.5) / zoom - 0.5
-    return None
+    tint = smooth / np.maximum(smooth.sum(axis=2, keepdims=True), 1.0)  # the same in light and shade
+    tinted = np.abs(tint - table / max(float(table.sum()), 1.0)).max(axis=2) * 255
+    masks = bright > split, far > 3 * noise + 12, bright < split, tinted > compute_threshold(tinted)
+    found = [corners for mask in masks if (corners := _find_quadrilateral(mask, bright)) is not None]
+    if not found:
+        return None
+    corners = max(found, key=_measure_polygon)  # else a shadow across the page is its edge
+    for reach in EDGE_REACH:
+        corners = refine_corners(smooth, corners, reach * max(bright.shape))
+    return (corners + 0.5) / zoom - 0.5
 
 
 def refine_corners(picture: Array, corners: Array, reach: float) -> Array:
@@ -231,10 +235,10 @@ def _find_quadrilateral(mask: Array, bright: Array) -> Array | None:
     if (inside & part).sum() < PAGE_FIT * (inside | part).sum():
         return None
     depth = ndimage.distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1] / max(part.shape)
-    ring_of = bright[(depth > MARGIN[0]) & (depth < MARGIN[1])]
+    ring = (depth > MARGIN[0]) & (depth < MARGIN[1])
     within = bright[depth >= MARGIN[1]]
-    paper = np.median(ring_of)
-    if (np.abs(ring_of - paper) > 45).mean() > MARGIN_INK or (np.abs(within - paper) > 45).mean() < FEWEST_LIGHT:
+    ink = np.abs(bright - ndimage.median_filter(bright, MARGIN_WINDOW))[ring] > 45  # than the paper around it, in light or shade
+    if ink.mean() > MARGIN_INK or (np.abs(within - np.median(bright[ring])) > 45).mean() < FEWEST_LIGHT:
         return None
     clockwise = best if _measure_signed(best) > 0 else best[::-1]
     return np.roll(clockwise, -int((clockwise.sum(axis=1)).argmin()), axis=0)

@@ -14,7 +14,8 @@ import numpy as np
 from scipy import fft, ndimage
 
 from topomerge.errors import InputError
-from topomerge.io.drawing import ParsedDrawing, PictureText, TracedDrawing
+from topomerge.io.drawing import ParsedDrawing, TracedDrawing
+from topomerge.io.written_lengths import PictureText
 from topomerge.types import Array
 
 GAP = 0.6  # m between two plans on a sheet, at least

@@ -20,11 +20,12 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.drawing import NAME_HEIGHT, PictureText, build_name_landmarks
+from topomerge.io.drawing import NAME_HEIGHT, build_name_landmarks
 from topomerge.io.dxf_plan import MARGIN, Line, Swing, build_plan_masks
 from topomerge.io.frame import UNITS
 from topomerge.io.grid import Plan, extrude
 from topomerge.io.piece import Piece, ReadOptions, read_in_subprocess
+from topomerge.io.written_lengths import PictureText
 from topomerge.types import Array
 
 LARGEST_FILE = 1 << 28  # bytes

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.drawing import PictureText, trace_drawing
+from topomerge.io.drawing import trace_drawing
 from topomerge.io.drawn_page import DrawnPage, find_page
 from topomerge.io.grid import build_drawn_pieces
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_head, read_in_subprocess
+from topomerge.io.written_lengths import PictureText
 from topomerge.types import Array
 
 SECONDS, MEMORY = 300, 6 << 30  # of the processor, and bytes: a page with the network takes 20 s and 1.5 GB

@@ -35,7 +35,7 @@ from topomerge.landmarks.likelihood import (
 )
 from topomerge.landmarks.radio import MOST_RATIO, SAME_STOREY, STOREY_HEIGHT, WRONG, score_radio
 from topomerge.landmarks.sightings import Sightings, build_sightings, transform_places
-from topomerge.landmarks.text import is_cut_off, quote_text
+from topomerge.landmarks.text import is_cut_off, is_misread, quote_text
 from topomerge.types import Array, Deformation, Landmarks, Sim3, TopometricMap
 
 FALL = 0.12  # hPa a metre
@@ -416,7 +416,10 @@ def _list_witnesses(
         times = sum(weight * score_pair(*keys[k], error, kind) / share[k] for error, weight in READERS)
         sure = max(a.sigma[i], b.sigma[j]) <= rules.surest
         if met.turned[k] or (sure and times < probability[k] / 2):
-            lost = kind == "text" and not met.turned[k] and is_cut_off(*keys[k])
+            same = kind == "text" and not met.turned[k]
+            if same and is_misread(*keys[k]):
+                continue
+            lost = same and is_cut_off(*keys[k])
             out.append(_build_witness(a, b, i, j, kind, "cut off" if lost else "contradicts"))
         elif times > 2 * (1.0 if keys[k][0] == keys[k][1] else probability[k]):
             out.append(_build_witness(a, b, i, j, kind, "agrees"))

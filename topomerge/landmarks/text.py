@@ -26,6 +26,7 @@ NUMBER_ODDS = {1: 1 / 8, 2: 1 / 25, 3: 1 / 120}  # the same of digits: of a stor
 RAREST = 1 / 1500
 MOST_SHIFTED = 100  # numbers by which the rooms of another part of a building count on
 COMMON = 0.02  # share of the signs from which on a string stands in every building
+MISREAD = 7  # characters of a word, of which one may be wrong without making it another
 LETTER_ODDS = 1 / 5  # that a number bears this letter
 # Words that stand in every building, in languages of our data: (pattern of the whole string, share of all signs, by guess).
 EVERYWHERE = tuple(
@@ -125,6 +126,14 @@ def is_cut_off(one: str, other: str) -> bool:
     """Return whether one of two folded strings may be the other one, of which an end of half its length at most is missing."""
     short, long = sorted((one, other), key=len)
     return len(short) < len(long) <= 2 * len(short) and (long.startswith(short) or long.endswith(short))
+
+
+def is_misread(one: str, other: str) -> bool:
+    """Return whether two folded words are one but for a character in seven: numbers are not, of which each character counts."""
+    shorter = min(len(one), len(other))
+    if is_number(one) or is_number(other) or abs(len(one) - len(other)) > shorter // MISREAD:
+        return False
+    return sum(count_edits(one, other)) <= shorter // MISREAD
 
 
 def score_neighbour(one: str, other: str) -> float:
