@@ -126,6 +126,7 @@ def test_what_is_stated_of_the_maps_is_heard_and_stays(run: Run, folder: Path) -
     assert status == 1 and "--known" in err and not (folder / "new").exists()
 
 
+@pytest.mark.longer
 def test_three_maps_are_merged(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = Journal(folder / "house", read_atlas(folder / "house").settings)  # of the same maps
     monkeypatch.setattr("topomerge.fusion.pipeline.solve", lambda maps, settings, _: solve(maps, settings, made))

@@ -20,6 +20,7 @@ import psutil
 import pytest
 
 import topomerge
+from tests.cases import list_longer
 from tests.cli.processes import Run
 from tests.io.signs import walk_poses
 from tests.io.test_read_signs import write_corridor
@@ -176,7 +177,7 @@ def test_a_process_that_is_killed(clouds: list[str], monkeypatch: pytest.MonkeyP
         list(iter_input_maps(clouds[:2], choose(2)))
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), *list_longer((signal.SIGTERM, 143))])
 def test_a_signal_ends_all_processes(clouds: list[str], number: int, status: int) -> None:
     code = """
 import sys

@@ -221,6 +221,7 @@ def test_a_room_that_is_split_and_joined_is_what_it_was(at, line):
         assert back.rooms[name] == pytest.approx(base.rooms[name]), name
 
 
+@pytest.mark.longer
 def test_a_journal_holds_on_a_map_that_was_extracted_again():
     """The second map has other voxels; its rooms have the same places."""
     edits = [

@@ -141,6 +141,7 @@ def test_a_scan_that_is_extracted_again_keeps_its_corrections(edit: Run) -> None
     assert len(json.loads(Path("a.json").read_text())["rooms"]) == 8
 
 
+@pytest.mark.longer
 def test_merges_use_the_corrected_maps_and_say_so(tmp_path: Path) -> None:
     for name, k in (("a", 0), ("b", 2)):
         save_map(office_map(k), tmp_path / f"{name}.tmap")

@@ -109,6 +109,7 @@ def test_a_sign_has_letters_of_the_height_that_is_asked_for(height):
     assert 0.8 * height - 2 <= np.ptp(ink) + 1 <= 1.2 * height + 3
 
 
+@pytest.mark.longer
 def test_large_signs_are_read_and_tiny_ones_are_not(monkeypatch):
     pytest.importorskip("rapidocr_onnxruntime", exc_type=ImportError)
     monkeypatch.setattr(landmarks, "HEIGHTS", (3, 26))

@@ -7,6 +7,7 @@ import pytest
 
 import topomerge as tm
 from tests import scenes
+from tests.cases import list_longer
 from topomerge.errors import InputError
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.slices import raise_slice
@@ -92,7 +93,7 @@ def without_poses(cloud: PointCloud) -> PointCloud:
     return PointCloud(cloud.points)
 
 
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("known", [True, *list_longer(False)])
 def test_points_that_hang_in_a_doorway_do_not_shut_it(known):
     cloud = two_rooms(strays=12)
     map = tm.extract(cloud if known else without_poses(cloud))

@@ -65,6 +65,7 @@ def test_signs_that_agree_raise_and_those_that_contradict_refuse(bare, agree):
     assert sum(agree.posterior.values()) == pytest.approx(1.0) and other.walls > other.probability
 
 
+@pytest.mark.longer
 def test_signs_choose_among_places_that_walls_do_not_tell_apart(agree):
     shifted = [*NUMBERS[2:], "2.118", "2.119"]  # the same walls, two rooms on along the corridor
     second = register(with_signs(HALL, NUMBERS), told(HALL, shifted))
@@ -97,6 +98,7 @@ def test_alternatives_that_the_user_rules_out_stay_ruled_out():
     assert update_posterior(known, 0.61, evidence)["storey"] == 0.0
 
 
+@pytest.mark.longer
 def test_hostile_landmarks_do_no_harm(bare):
     texts = ["101"] * 8
     same = register(with_signs(HALL, texts), told(HALL, texts))

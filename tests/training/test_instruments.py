@@ -157,6 +157,7 @@ def test_an_anomaly_is_named(settings, monkeypatch) -> None:
         fit(replace(settings, anomaly=True), quiet)
 
 
+@pytest.mark.longer
 def test_the_scaler_of_half_precision_goes_on_to_the_byte(settings, tmp_path, monkeypatch) -> None:
     """As of fp16: a scale that overflows at first, and grows after three good steps."""
     from lightning_fabric import Fabric

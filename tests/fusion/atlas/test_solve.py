@@ -59,6 +59,7 @@ def test_parts_of_a_building_come_together_and_a_stranger_stays_apart(atlas):
     assert atlas.registered[0] < atlas.registered[1] == 10  # the rest follows from the links
 
 
+@pytest.mark.longer
 def test_the_order_of_the_maps_does_not_matter(atlas, maps, registrations):
     order = [3, 4, 1, 0, 2]
     turned = tm.build_atlas([maps[k] for k in order], registrations=registrations)
