@@ -155,6 +155,7 @@ def test_what_is_needed_later_is_imported_while_another_process_works(clouds: li
         assert next(iter(maps)) is here.result()
 
 
+@pytest.mark.longer
 def test_the_first_file_that_is_wrong_is_named(run: Run, clouds: list[str]) -> None:
     for name in "bc":
         Path(f"{name}.npy").write_bytes(b"no points")

@@ -69,6 +69,7 @@ def test_a_cloud_and_a_map_are_merged(folder: Path) -> None:
     assert topomerge.load_map(merged / "map.tmap").provenance is not None
 
 
+@pytest.mark.longer
 def test_a_refusal_has_status_two(run: Run, folder: Path) -> None:
     status, out, err = run("b.tmap", "c.tmap", "-o", "no")
     assert status == 2 and "not merged: probability" in out and err == ""

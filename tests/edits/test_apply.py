@@ -175,7 +175,7 @@ any_edit = st.one_of(
     st.builds(lambda at, to: build_edit("move_door", at=at, to=to), place, place),
     st.builds(lambda at, name: build_edit("rename_room", at=at, name=name), place, st.sampled_from(["A", "B", ""])),
 )
-FEW = settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+FEW = settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
 
 
 @FEW

@@ -50,6 +50,7 @@ def test_inputs_are_the_items_of_the_split():
     assert set(few) < set(more) and len(more) == 2 * len(few) == 14
 
 
+@pytest.mark.longer
 def test_signs_alone_are_scored_and_tabulated(tmp_path):
     """One building: places of five relations by three readers; the same bytes again; a wrong ten to one is counted."""
     settings = Settings(cache=str(tmp_path))

@@ -13,6 +13,7 @@ pytest.importorskip("pypdfium2")
 pytest.importorskip("resvg_py")
 
 import topomerge as tm
+from tests.cases import list_longer
 from tests.io.cad_plans import OUTER, ROOMS, parse_dark_lines
 from topomerge.errors import InputError
 from topomerge.io import drawing, pdf, svg
@@ -170,8 +171,7 @@ def write_svg(
     "size",
     [
         'width="297mm" height="210mm" viewBox="0 0 29.7 21"',
-        'viewBox="0 0 29.7 21"',
-        'width="600" height="900" viewBox="0 0 29.7 21"',
+        *list_longer('viewBox="0 0 29.7 21"', 'width="600" height="900" viewBox="0 0 29.7 21"'),
     ],
 )
 def test_a_drawing_in_svg(tmp_path: Path, size: str, parser: list[np.ndarray]) -> None:

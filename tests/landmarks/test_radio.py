@@ -122,6 +122,7 @@ def test_scores_do_not_change_with_the_frame_and_are_symmetric():
     assert any(0.5 < abs(v) < MOST_RATIO for v in one.values())
 
 
+@pytest.mark.longer
 def test_one_address_decides_nothing():
     """Two buildings in which somebody runs an access point of one name: without it, nothing is alike."""
     a, b = build(spoof(hear(2, 40), "spoofed", -45)), build(spoof(hear(2, 40, session=1, seed=4), "SPOOFED", -45))

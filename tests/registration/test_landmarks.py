@@ -50,6 +50,7 @@ def agree():
     return register(with_signs(HALL, NUMBERS), told(HALL, NUMBERS))
 
 
+@pytest.mark.longer
 def test_landmarks_of_one_map_alone_change_nothing(bare):
     one_sided = register(with_signs(HALL, NUMBERS), twin(HALL))
     assert one_sided.probability == bare.probability and one_sided.transform == bare.transform

@@ -56,6 +56,7 @@ def test_a_training_takes_all_pairs_that_share_a_room_with_their_sheets(manifest
     assert len(load_pairs(manifest, ["sheet"], limit=1)) == 1
 
 
+@pytest.mark.longer
 def test_what_a_limited_run_packed_serves_all_pairs(manifest: Path) -> None:
     shutil.rmtree(manifest.parent / "packed", ignore_errors=True)
     assert len(load_pairs(manifest, ["sheet"], limit=1)) == 1
