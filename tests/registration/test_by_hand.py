@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.fusion.atlas.atlas_scenes import office_map, truth
+from tests.scenes_map import building
 from topomerge.errors import InputError
 from topomerge.fusion.decisions import estimate_matched_poses, place_by_hand
 from topomerge.fusion.fuse import match_common_rooms
@@ -37,6 +38,7 @@ def test_matched_rooms_end_in_the_true_pose(pair):
     assert placed.start == estimate_matched_poses(a, b, rooms)[0] == estimate_matched_poses(a.load(), b.load(), rooms)[0]
 
 
+@pytest.mark.longer
 def test_a_map_that_was_moved_by_hand_snaps(pair):
     a, b, pose, _ = pair
     middle = pose.apply(b.middle[None])[0]
@@ -47,6 +49,7 @@ def test_a_map_that_was_moved_by_hand_snaps(pair):
         assert placed.snapped and off(placed.pose, pose, b.middle) < 0.1
 
 
+@pytest.mark.longer
 def test_a_map_far_from_all_walls_stays_where_it_was_put(pair):
     a, b, pose, _ = pair
     far = Sim3(pose.yaw, tuple(np.add(pose.translation, (300.0, 0.0, 0.0)).tolist()))
@@ -54,9 +57,9 @@ def test_a_map_far_from_all_walls_stays_where_it_was_put(pair):
     assert off(placed.pose, far, b.middle) < 0.6 and placed.probability < 0.5
 
 
-def test_rooms_that_fix_no_pose_are_told(pair):
-    a, b, _, rooms = pair
-    (i, j), *_ = rooms
+def test_rooms_that_fix_no_pose_are_told():
+    a, b = prepare(building(1)), prepare(building(2))
+    i, j = 0, 0
     for pairs, words in (
         ([(i, j)], "1 matched pair of rooms fix no pose"),
         ([(i, j), (i, j + 1)], "fix no pose"),

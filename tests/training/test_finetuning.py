@@ -118,6 +118,7 @@ def test_settings_that_make_no_sense(settings: Training, change: dict[str, objec
         check(replace(settings, **change))  # type: ignore[arg-type]
 
 
+@pytest.mark.longer
 def test_replay_mixes_another_set_in(settings: Training, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[list[int]] = []
     real = EmbeddingJob._draw_order
