@@ -7,7 +7,9 @@ TORCH_INDEX ?=
 export TOPOMERGE_DATA ?= $(wildcard ../shared/data)
 export MPLBACKEND := Agg
 unexport PYTHONDONTWRITEBYTECODE
+# One thread a process: as many processes as cores run beside each other.
 test test-longer: export OMP_NUM_THREADS := 1
+test test-longer: export NUMBA_NUM_THREADS := 1
 
 .PHONY: setup demo test test-longer test-slow lint docs bench results-check sealed weights clean
 setup: .venv/ready

@@ -27,6 +27,7 @@ print(sum(voxels._encode.stats.cache_misses.values()))
 ROOT = Path(__file__).parent.parent
 
 
+@pytest.mark.longer
 def test_two_processes_compile_a_kernel_once(tmp_path: Path) -> None:
     env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT), "TOPOMERGE_COMPILE_AHEAD": "0"}
     both = [subprocess.Popen([sys.executable, "-c", CALLS], stdout=subprocess.PIPE, text=True, env=env) for _ in range(2)]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import topomerge as tm
+from tests.cases import list_longer
 from tests.changes.flats import CABIN, MOVED, TABLE, flat_map
 from tests.scenes_map import building
 from topomerge.changes.compare import KINDS, Changes, compare_maps
@@ -36,7 +37,7 @@ def test_noise_of_two_centimetres_is_no_change() -> None:
     assert kinds(flat_map(), flat_map(noise=0.02)) == {}
 
 
-@pytest.mark.parametrize("shift", [0.04, 0.08])
+@pytest.mark.parametrize("shift", [0.08, *list_longer(0.04)])
 def test_a_map_that_lies_a_little_off_has_not_changed(shift: float) -> None:
     found = compare_maps(flat_map(), flat_map(noise=0.01), Placement(Sim3(0.0, (shift, -shift, 0.0))))
     assert found.count_kinds() == {}
@@ -81,7 +82,7 @@ def test_of_one_scan_what_was_corrected_is_compared() -> None:
         tm.align_maps(map, replace(map, source="copy.tmap"))
 
 
-@pytest.mark.parametrize("choices", [{"wall": True}, {"box": TABLE}])
+@pytest.mark.parametrize("choices", [{"wall": True}, *list_longer({"box": TABLE})])
 def test_the_other_way_round_new_is_gone(choices: dict[str, object]) -> None:
     there = {"new": "gone", "gone": "new", "split": "joined", "joined": "split"}
     first = compare_maps(flat_map(), flat_map(**choices))  # type: ignore[arg-type]
@@ -100,6 +101,7 @@ def test_what_one_map_did_not_see_is_not_gone() -> None:
     assert kinds(whole, flat_map()) == {"wall gone": 1, "door gone": 1, "room joined": 1, "furniture gone": 1}
 
 
+@pytest.mark.longer
 def test_a_frame_of_its_own_changes_nothing() -> None:
     here = compare_maps(flat_map(), flat_map(wall=True, box=MOVED))
     there = compare_maps(flat_map(), flat_map(frame=TURNED, wall=True, box=MOVED), Placement(TURNED.inverse()))

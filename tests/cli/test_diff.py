@@ -44,6 +44,7 @@ def test_aligned_first(folder: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert told["counts"] == {"wall new": 1, "door new": 1, "room split": 1} and told["reason"].startswith("aligned: ")
 
 
+@pytest.mark.longer
 def test_what_cannot_be_aligned_has_status_2(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli(["diff", "old.tmap", "turned.tmap", "--threshold", "1", "--json", "-o", "out"]) == 2
     out, err = capsys.readouterr()

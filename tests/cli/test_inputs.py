@@ -20,6 +20,7 @@ import psutil
 import pytest
 
 import topomerge
+from tests.cases import list_longer
 from tests.cli.processes import Run
 from tests.io.signs import walk_poses
 from tests.io.test_read_signs import write_corridor
@@ -154,6 +155,7 @@ def test_what_is_needed_later_is_imported_while_another_process_works(clouds: li
         assert next(iter(maps)) is here.result()
 
 
+@pytest.mark.longer
 def test_the_first_file_that_is_wrong_is_named(run: Run, clouds: list[str]) -> None:
     for name in "bc":
         Path(f"{name}.npy").write_bytes(b"no points")
@@ -176,7 +178,7 @@ def test_a_process_that_is_killed(clouds: list[str], monkeypatch: pytest.MonkeyP
         list(iter_input_maps(clouds[:2], choose(2)))
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), *list_longer((signal.SIGTERM, 143))])
 def test_a_signal_ends_all_processes(clouds: list[str], number: int, status: int) -> None:
     code = """
 import sys

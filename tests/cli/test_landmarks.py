@@ -189,6 +189,7 @@ def test_merge_and_extract_read_the_table_beside_their_input(marked: Run) -> Non
     assert status == 1 and "a.landmarks.csv, line 2: kind must be one of" in err
 
 
+@pytest.mark.longer
 def test_a_scan_and_the_table_beside_it_become_a_map(run: Run) -> None:
     np.save("scan.npy", two_rooms().points())
     Path("scan.landmarks.csv").write_text("kind,value,x,y,z\ntext,101,1,1,1.5\nobject,sofa,1,1,0.4\n")

@@ -69,6 +69,7 @@ def test_a_cloud_and_a_map_are_merged(folder: Path) -> None:
     assert topomerge.load_map(merged / "map.tmap").provenance is not None
 
 
+@pytest.mark.longer
 def test_a_refusal_has_status_two(run: Run, folder: Path) -> None:
     status, out, err = run("b.tmap", "c.tmap", "-o", "no")
     assert status == 2 and "not merged: probability" in out and err == ""
@@ -76,6 +77,10 @@ def test_a_refusal_has_status_two(run: Run, folder: Path) -> None:
     merge = listing(folder / "no")
     assert merge["status"] == "abstained" and merge["transforms"] == {} and merge["matches"] == []
     assert merge["reason"] in out
+
+
+@pytest.mark.longer
+def test_a_refusal_is_told_though_nothing_else_is(run: Run) -> None:
     status, out, err = run("b.tmap", "c.tmap", "-o", "no", "--quiet")
     assert status == 2 and out == "" and "not merged" in err and len(err.splitlines()) == 1
 

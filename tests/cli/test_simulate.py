@@ -88,6 +88,7 @@ def test_points_lie_in_their_rooms(folder: Path) -> None:
         assert inside.sum() > 200
 
 
+@pytest.mark.longer
 def test_the_same_seed_gives_the_same_bytes(folder: Path, tmp_path: Path) -> None:
     more = ("--signs", "good", "--landmarks", "signs,tags,wifi")
     for name in ("again", "third"):
@@ -142,6 +143,7 @@ def test_signs_lie_beside_the_clouds(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert not (tmp_path / "w").exists()
 
 
+@pytest.mark.longer
 def test_free_scale(tmp_path: Path) -> None:
     words = ["simulate", *SMALL_BUILDING, "--sensors", "tls,mono", "--scale", "free", "-o", str(tmp_path)]
     assert cli(words) == 0

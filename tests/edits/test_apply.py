@@ -175,7 +175,7 @@ any_edit = st.one_of(
     st.builds(lambda at, to: build_edit("move_door", at=at, to=to), place, place),
     st.builds(lambda at, name: build_edit("rename_room", at=at, name=name), place, st.sampled_from(["A", "B", ""])),
 )
-FEW = settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+FEW = settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
 
 
 @FEW
@@ -221,6 +221,7 @@ def test_a_room_that_is_split_and_joined_is_what_it_was(at, line):
         assert back.rooms[name] == pytest.approx(base.rooms[name]), name
 
 
+@pytest.mark.longer
 def test_a_journal_holds_on_a_map_that_was_extracted_again():
     """The second map has other voxels; its rooms have the same places."""
     edits = [

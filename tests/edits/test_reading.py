@@ -15,6 +15,7 @@ from tests.cli.processes import Run
 from tests.edits.recipes import corridor_map
 from tests.fusion.atlas.atlas_scenes import office_map
 from tests.scenes import corridor
+from tests.scenes_map import building
 from topomerge.edits.apply import load_corrected_map
 from topomerge.edits.journal import append_edits, build_edit, find_journal, read_journal
 from topomerge.errors import InputError
@@ -141,6 +142,7 @@ def test_a_scan_that_is_extracted_again_keeps_its_corrections(edit: Run) -> None
     assert len(json.loads(Path("a.json").read_text())["rooms"]) == 8
 
 
+@pytest.mark.longer
 def test_merges_use_the_corrected_maps_and_say_so(tmp_path: Path) -> None:
     for name, k in (("a", 0), ("b", 2)):
         save_map(office_map(k), tmp_path / f"{name}.tmap")
@@ -217,7 +219,7 @@ def test_matched_rooms_place_a_map(merged: Path, run: Run) -> None:
 
 
 def test_decisions_that_do_not_apply_are_told() -> None:
-    maps = [office_map(0), office_map(2)]
+    maps = [building(1), building(2)]
     eye = np.eye(4)
     far = [[500.0, 0, 0], [500.0, 0, 0]]
     decisions = find_decisions(

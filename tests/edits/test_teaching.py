@@ -47,9 +47,12 @@ def test_a_map_is_right_by_its_own_truth():
     "spoiling",
     [
         (),
-        (build_edit("join_rooms", at=[[2, 2, 0], [2, 5, 0]]),),
-        (build_edit("join_rooms", at=[[2, 2, 0], [6, 2, 0], [6, 8, 0], [6, 5, 0]]),),
-        (build_edit("split_room", at=[8, 5, 0], line=[[8, 4.2], [8, 5.8]]), build_edit("delete_door", at=[2, 4, 0])),
+        pytest.param((build_edit("join_rooms", at=[[2, 2, 0], [2, 5, 0]]),), marks=pytest.mark.longer),
+        pytest.param((build_edit("join_rooms", at=[[2, 2, 0], [6, 2, 0], [6, 8, 0], [6, 5, 0]]),), marks=pytest.mark.longer),
+        pytest.param(
+            (build_edit("split_room", at=[8, 5, 0], line=[[8, 4.2], [8, 5.8]]), build_edit("delete_door", at=[2, 4, 0])),
+            marks=pytest.mark.longer,
+        ),
         (
             build_edit("split_room", at=[2, 2, 0], line=[[0, 2], [4, 2]]),
             build_edit("join_rooms", at=[[10, 2, 0], [10, 5, 0]]),

@@ -74,6 +74,7 @@ def test_a_cloud_that_was_turned_by_any_angle_has_the_same_rows(describe: Learne
     assert all(cosine[k].mean() < 0.5 for k in range(4) if k != right)
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("turn", [pytest.param(0.0, marks=pytest.mark.longer), WINGS])
 def test_an_oblique_map_stands_as_the_wing_with_more_wall_does(describe: LearnedEmbedder, turn: float) -> None:
     """A wing of four rooms, and one of two beside it at 30 degrees; `turn` is that of the first."""
@@ -86,6 +87,7 @@ def test_an_oblique_map_stands_as_the_wing_with_more_wall_does(describe: Learned
     assert len(rows) == 6 and np.isfinite(rows).all()
 
 
+@pytest.mark.longer
 def test_rows_at_the_true_scale_are_those_of_the_map_in_metres(describe: LearnedEmbedder, map: TopometricMap) -> None:
     """A map that was made half as large again, its heights as they were, as a drawing without scale is raised."""
     larger = flat() * (1.5, 1.5, 1.0)

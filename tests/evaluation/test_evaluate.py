@@ -13,6 +13,7 @@ import pytest
 from topomerge.datasets.pairs.evaluation_pair import load_evaluation_pair
 from topomerge.datasets.pairs.items import check as check_recipe
 
+from tests.cases import list_longer
 from tests.recipes import SMALL_HOUSES
 from topomerge.config import compose
 from topomerge.errors import InputError
@@ -45,20 +46,24 @@ def test_every_set_composes(data: str) -> None:
     assert len(list(iter_variants(settings))) == 4 * 5
 
 
-def test_a_wrong_key_is_named() -> None:
-    with pytest.raises(InputError, match="slow_kk"):
-        compose("evaluate", Evaluation, ["slow_kk=3"])
-    for words, said in (
-        (["methods=[guess]"], "methods: unknown 'guess'"),
-        (["context=[max]"], "context: unknown"),
-        (["descriptors.engineered.name=deep"], "descriptors.engineered.name 'deep'"),
-        (["run=[runs/nowhere]"], "runs/nowhere"),
-        (["mergers=[x]"], "mergers: 'x'"),
-        (["only=[]"], "nothing to evaluate"),
-        (["tables=[sizes]"], "tables: unknown 'sizes'"),
-    ):
-        with pytest.raises(InputError, match=said):
-            check(compose("evaluate", Evaluation, words))
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("slow_kk=3", "slow_kk"),
+        ("methods=[guess]", "methods: unknown 'guess'"),
+        ("run=[runs/nowhere]", "runs/nowhere"),
+        *list_longer(
+            ("context=[max]", "context: unknown"),
+            ("descriptors.engineered.name=deep", "descriptors.engineered.name 'deep'"),
+            ("mergers=[x]", "mergers: 'x'"),
+            ("only=[]", "nothing to evaluate"),
+            ("tables=[sizes]", "tables: unknown 'sizes'"),
+        ),
+    ],
+)
+def test_a_wrong_key_is_named(word: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        check(compose("evaluate", Evaluation, [word]))
 
 
 def test_a_folder_of_other_settings_is_refused(tmp_path: Path) -> None:

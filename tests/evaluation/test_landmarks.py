@@ -50,6 +50,7 @@ def test_inputs_are_the_items_of_the_split():
     assert set(few) < set(more) and len(more) == 2 * len(few) == 14
 
 
+@pytest.mark.longer
 def test_signs_alone_are_scored_and_tabulated(tmp_path):
     """One building: places of five relations by three readers; the same bytes again; a wrong ten to one is counted."""
     settings = Settings(cache=str(tmp_path))
@@ -109,6 +110,7 @@ def test_a_sign_has_letters_of_the_height_that_is_asked_for(height):
     assert 0.8 * height - 2 <= np.ptp(ink) + 1 <= 1.2 * height + 3
 
 
+@pytest.mark.longer
 def test_large_signs_are_read_and_tiny_ones_are_not(monkeypatch):
     pytest.importorskip("rapidocr_onnxruntime", exc_type=ImportError)
     monkeypatch.setattr(landmarks, "HEIGHTS", (3, 26))

@@ -11,6 +11,7 @@ from topomerge.evaluation.tasks import run_task
 from topomerge.types import Array
 
 
+@pytest.mark.longer
 def test_one_small_case(tmp_path) -> None:
     page = tmp_path / "results.md"
     page.write_text("before\n<!-- walls:begin -->\nold\n<!-- walls:end -->\nafter\n")

@@ -138,9 +138,9 @@ def test_a_mezzanine_is_a_storey():
     assert "stairs" in result.edges["kind"].tolist()
 
 
-def test_ten_isolated_rooms():
-    result = extract(scenes.isolated_rooms().points(0.005))
-    assert len(result.rooms) == 10 and len(result.edges) == 0
+def test_isolated_rooms():
+    result = extract(scenes.isolated_rooms(4).points(0.005))
+    assert len(result.rooms) == 4 and len(result.edges) == 0
     assert len(extract(scenes.isolated_rooms(3).points(0.005), preset="thesis").rooms) == 1
 
 

@@ -31,7 +31,7 @@ def test_a_floor_lies_as_far_below_the_ceiling_as_in_most_buildings() -> None:
     assert len(map.rooms) == 2 and any("floor" in w for w in map.warnings)
 
 
-@pytest.mark.parametrize("lowest", [1.4, 1.5])
+@pytest.mark.parametrize("lowest", [1.4, *list_longer(1.5)])
 def test_a_low_ceiling_close_above_what_was_seen_is_no_floor(lowest: float) -> None:
     map = tm.extract(upper_half(lowest, ceiling=2.3))
     assert map.storeys["floor"][0] == pytest.approx(2.3 - 2.6, abs=0.15)
@@ -88,6 +88,7 @@ def test_the_flat_roof_beside_a_hall_is_no_storey(more: dict[str, float]) -> Non
     assert np.allclose(np.sort(map.rooms["area"])[:4], 20, atol=1.0) and abs(map.rooms["area"].max() - 140) < 3
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("ceiling", [True, *list_longer(False)])
 def test_rooms_upstairs_beside_a_hall_are_a_storey(ceiling: bool) -> None:
     """The same with two rooms on the low ones; also where their own ceiling was not scanned."""

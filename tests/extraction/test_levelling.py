@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import topomerge as tm
 from tests import scenes
+from tests.cases import list_longer
 from topomerge.extraction.levelling import (
     LARGEST_TILT,
     LEAST_TILT,
@@ -67,7 +68,7 @@ def test_up_is_found(degrees: float, noise: float) -> None:
         )
 
 
-@pytest.mark.parametrize("degrees", [0.0, 0.5 * LEAST_TILT, LARGEST_TILT + 8])
+@pytest.mark.parametrize("degrees", [0.5 * LEAST_TILT, LARGEST_TILT + 8, *list_longer(0.0)])
 def test_what_is_level_or_lies_on_its_side_is_left(degrees: float) -> None:
     assert find_up(tilted(scenes.corridor().points(0.01), degrees, 20.0)) is None
 
@@ -182,7 +183,7 @@ def test_plans_models_and_slices_are_never_levelled(tmp_path: Path) -> None:
 
 
 def test_a_scene_can_be_left_as_it_is() -> None:
-    map = tm.extract(tilted(scenes.corridor().points(), 5.0), level=False)
+    map = tm.extract(tilted(scenes.two_rooms().points(), 5.0), level=False)
     assert "levelled" not in map.parameters and not any("tilted" in w for w in map.warnings)
 
 

@@ -237,7 +237,9 @@ def test_slabs_of_points_and_threads_count_what_numpy_counts():
     parts = np.floor((points[np.isfinite(points).all(axis=1)].astype(np.float64) - lattice) * kernel.OFFSET_STEPS).astype(
         np.int64
     )
-    cells, row, number = np.unique(lattice.astype(np.int64), axis=0, return_inverse=True, return_counts=True)
+    code = (lattice.astype(np.int64) + 16) @ [1024, 32, 1]  # numbers are sorted sooner than rows
+    codes, row, number = np.unique(code, return_inverse=True, return_counts=True)
+    cells = np.column_stack([codes // 1024, codes // 32 % 32, codes % 32]) - 16
     sums = np.column_stack([np.bincount(row.ravel(), parts[:, k], len(cells)) for k in range(3)])
     before = count_threads()
     for threads in (1, 2):

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from tests.cases import list_longer
 from tests.extraction.elevations.doors import SHUT_DOOR, flush_door
 from tests.scenes import Scene, two_rooms
 from topomerge.extraction.attributes import SHUT_LATER_CHANCE, add_walked_doors, find_room_changes, find_rooms_under
@@ -155,7 +156,7 @@ def test_the_extraction_takes_the_places_of_the_file():
     assert map.edges["confidence"].tolist() == [0.98]
 
 
-@pytest.mark.parametrize("doors", [(SHUT_DOOR,), (SHUT_DOOR, 4.0)], ids=["the only door", "one of two"])
+@pytest.mark.parametrize("doors", [(SHUT_DOOR, 4.0), *list_longer(((SHUT_DOOR,),))], ids=["one of two", "the only door"])
 def test_a_leaf_across_a_doorway_that_somebody_walked_through_is_a_shut_door(doors):
     points = flush_door(doors)
     map = extract(walked(points, way((1, SHUT_DOOR), (6, SHUT_DOOR))))

@@ -95,6 +95,7 @@ def believed(west, other):
     return matching, update_match_probabilities(matching, west, other, "attention").probability
 
 
+@pytest.mark.longer
 def test_rooms_that_lie_right_are_believed_and_those_that_do_not_are_not(halves, matching):
     """North lies right on west; east is laid 9 m off, as the rooms look alike; the third one is another building."""
     west, east = halves

@@ -110,6 +110,7 @@ def walled(map: TopometricMap) -> np.ndarray:
     return np.sort(np.bincount(connected_components(links, directed=False)[1], map.rooms["area"]))
 
 
+@pytest.mark.longer
 def test_the_joined_map_has_the_rooms_of_the_whole(merged, whole):
     assert len(walled(merged.map)) == len(walled(whole)) == 9
     assert walled(merged.map) == pytest.approx(walled(whole), rel=0.07)
@@ -118,10 +119,12 @@ def test_the_joined_map_has_the_rooms_of_the_whole(merged, whole):
     assert merged.map.source == "a.ply + b.ply" and merged.map.free is not None
 
 
+@pytest.mark.longer
 def test_the_joined_map_has_as_many_rooms_as_the_whole(merged, whole):
     assert abs(len(merged.map.rooms) - len(whole.rooms)) <= 1  # corridors cross once in this office: one room or two
 
 
+@pytest.mark.longer
 def test_the_other_way_round_is_the_inverse(merged, halves):
     back = tm.merge(halves[::-1])
     assert np.allclose((merged.transforms[1] @ back.transforms[1]).matrix, np.eye(4), atol=1e-6)

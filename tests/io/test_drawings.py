@@ -320,15 +320,12 @@ def test_without_the_parsing_the_page_is_floor(tmp_path):
     assert len(map.rooms) > 5
 
 
-def test_the_case_of_a_plan_with_labels(case_dir):
-    map = extract(read_points(case_dir / "plan-with-labels" / "plan.png", resolution=0.02))
-    assert len(map.rooms) == 5 and len(map.edges) == 4 and (map.rooms["outside"] < 0.5).all()
-
-
+@pytest.mark.longer
 def test_names_and_scale_are_read_where_the_reader_is_installed(case_dir):
     pytest.importorskip("rapidocr_onnxruntime", exc_type=ImportError)
     map = extract(read_points(case_dir / "plan-with-labels" / "plan.png"))
     assert len(map.rooms) == 5 and map.rooms["area"].sum() == pytest.approx(98, rel=0.1)
+    assert len(map.edges) == 4 and (map.rooms["outside"] < 0.5).all()
     names = dict(zip(map.landmarks.get_values(), map.landmarks.table["room"].tolist(), strict=True))
     assert {"BEDROOM", "LIVING", "HALL", "KITCHEN", "OFFICE"} <= set(names) and len(set(names.values())) == 5
 

@@ -248,6 +248,7 @@ def test_other_origins_that_are_no_numbers_are_refused(tmp_path: Path, origin: s
         read_points(path)
 
 
+@pytest.mark.longer
 @pytest.mark.data
 def test_cases_of_strangers(case_dir: Path) -> None:
     """A map of Nav2, one map as JPEG and as PNG, a yaw of nan, inverted colours."""

@@ -214,6 +214,7 @@ def test_names_of_spaces_short_and_long(tmp_path: Path) -> None:
     assert found is not None and rows(add_landmarks(two_floors(), found).landmarks) == [(5, "A.01", 0), (5, "Office", 0)]
 
 
+@pytest.mark.longer
 def test_maps_without_landmarks_are_exported_as_before(tmp_path: Path) -> None:
     """The same files but for what names and marks add: nothing of it."""
     for name, suffix in (("geojson", "geojson"), ("graphml", "graphml"), ("indoorgml", "gml"), ("dsg", "json")):

@@ -345,6 +345,7 @@ def test_outputs_have_names_of_their_own(tmp_path: Path) -> None:
     assert [p.name for p, _, _ in plan_outputs([Source(tmp_path / "one/walk.g2o")], tmp_path)] == ["walk_moved.g2o"]
 
 
+@pytest.mark.longer
 def test_the_table_of_round_trips(tmp_path: Path) -> None:
     """Nothing is lost, poses are right to a millionth (in floats and in LAS to what these hold), and the page is written."""
     for name in ("pye57", "laspy", "spark_dsg", "plyfile", "google.protobuf", "pxr"):

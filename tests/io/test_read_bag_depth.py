@@ -67,6 +67,7 @@ def test_the_same_cloud_as_from_files(tmp_path: Path, expected: PointCloud, kind
     assert_the_room(read_points(write_bag(tmp_path, kind, image_messages(form))), expected)
 
 
+@pytest.mark.longer
 def test_either_order_of_bytes_and_cameras_without_rectification(tmp_path: Path, expected: PointCloud) -> None:
     for number, (form, order) in enumerate((("16UC1", ">"), ("32FC1", ">"))):
         path = write_bag(tmp_path / str(number), "mcap", image_messages(form, rectified=False, order=order))

@@ -246,6 +246,7 @@ def test_bad_sens(recordings: dict[str, Path], tmp_path: Path) -> None:
     assert "frame 0: has 640 x 480 pixels, and a camera of" in refusal_of(path)
 
 
+@pytest.mark.longer
 def test_damaged_sens(recordings: dict[str, Path], tmp_path: Path) -> None:
     """Points or one line, whatever is flipped."""
     data = recordings["sens"].read_bytes()

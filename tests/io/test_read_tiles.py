@@ -166,6 +166,7 @@ def test_a_file_is_no_folder_of_tiles(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "--one-frame" in capsys.readouterr().err
 
 
+@pytest.mark.longer
 @pytest.mark.data
 def test_the_case_of_four_tiles(case_dir: Path) -> None:
     folder = case_dir / "tiles-one-frame"

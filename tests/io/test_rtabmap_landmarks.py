@@ -81,6 +81,7 @@ def test_radio_and_pressure_of_nodes(tmp_path: Path) -> None:
     assert pressure.table["number"].tolist() == [1013.2] and radio.table["group"].tolist() == [1, 2]
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("laser", [False, *list_longer(True)])
 def test_signs_on_pictures_of_nodes(tmp_path: Path, laser: bool) -> None:
     """Also where the points are those of a laser."""

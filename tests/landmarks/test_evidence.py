@@ -238,7 +238,7 @@ def test_kinds_that_one_map_lacks_say_nothing():
     assert LandmarkEvidence().apply(UNIFORM) == pytest.approx(UNIFORM)
 
 
-@pytest.mark.parametrize("count", [100_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [20_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
 def test_many_landmarks_are_bounded_work(count):
     rng = np.random.default_rng(0)
     table = np.zeros(count, build_landmarks("text", ["x"], "t").table.dtype)
@@ -262,7 +262,7 @@ def test_another_pose_that_signs_speak_for_as_much_is_a_rival():
 TEXTS = st.lists(st.sampled_from([*NUMBERS, "3.113", "EXIT", "WC", "101", "Z.1l3", "Dr. Meier", ""]), min_size=1, max_size=6)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(TEXTS, TEXTS, st.floats(-3, 3), st.floats(-5, 5), st.sampled_from(["text", "name", "tag", "object"]))
 @example(["2.116", "2.118", "2.118", "2.118"], ["2.117", "2.117"], 2.0, 1.0, "text")  # one counts on, one back
 def test_the_maps_may_be_given_in_any_order(first, second, yaw, shift, kind):
@@ -276,7 +276,7 @@ def test_the_maps_may_be_given_in_any_order(first, second, yaw, shift, kind):
     assert sorted(w.inverse().values for w in one.witnesses) == sorted(w.values for w in other.witnesses)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(TEXTS, TEXTS, st.floats(-3, 3), st.floats(-500, 500))
 def test_the_common_frame_does_not_matter(first, second, yaw, shift):
     a, b = with_signs(first, number=0.5), with_signs(second, number=0.7)

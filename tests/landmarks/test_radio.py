@@ -122,6 +122,7 @@ def test_scores_do_not_change_with_the_frame_and_are_symmetric():
     assert any(0.5 < abs(v) < MOST_RATIO for v in one.values())
 
 
+@pytest.mark.longer
 def test_one_address_decides_nothing():
     """Two buildings in which somebody runs an access point of one name: without it, nothing is alike."""
     a, b = build(spoof(hear(2, 40), "spoofed", -45)), build(spoof(hear(2, 40, session=1, seed=4), "SPOOFED", -45))
@@ -135,6 +136,7 @@ def test_one_address_decides_nothing():
     assert all(score_radio(*single, Sim3())[name] > -0.5 for name in WRONG)
 
 
+@pytest.mark.longer
 def test_poses_are_found_though_access_points_moved():
     settings = replace(SETTINGS, moved=0.3, missed=0.3)
     a, b = build(hear(2, 45, settings=settings)), build(hear(25, 68, session=1, settings=settings), FRAME)
@@ -147,6 +149,7 @@ def test_poses_are_found_though_access_points_moved():
     assert again.pose == best.pose and np.array_equal(again.covariance, best.covariance)
 
 
+@pytest.mark.longer
 def test_a_pose_of_few_places_is_told_less_sure_than_its_law_has_it():
     """The odds that ship: surer with more places, a smaller standard deviation, a larger lead; and never surer than the law."""
     few, many = (propose_radio_poses(build(hear(2, last)), build(hear(2, last, session=1), FRAME)) for last in (12, 45))

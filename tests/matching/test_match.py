@@ -45,6 +45,7 @@ def test_attention_needs_the_embedder_that_ships(scale_free):
         match(uneven(), b, "engineered", "attention", scale_free=scale_free)
 
 
+@pytest.mark.longer
 def test_attention_at_unknown_scale():
     b, true = turned(uneven(), (7.0, -3.0, 1.5), 1.3)
     result = match(uneven(), b, method="attention", scale_free=True)

@@ -14,6 +14,7 @@ from topomerge.matching.match import match
 from topomerge.matching.room_matcher import COARSE_SCALES, find_best_scale
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("true", [0.6, *list_longer(0.8, 1.0, 1.5)])
 def test_rooms_are_surest_at_the_true_scale(true: float) -> None:
     a, describe = building(3), load_embedder()

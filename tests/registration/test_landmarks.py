@@ -50,6 +50,7 @@ def agree():
     return register(with_signs(HALL, NUMBERS), told(HALL, NUMBERS))
 
 
+@pytest.mark.longer
 def test_landmarks_of_one_map_alone_change_nothing(bare):
     one_sided = register(with_signs(HALL, NUMBERS), twin(HALL))
     assert one_sided.probability == bare.probability and one_sided.transform == bare.transform
@@ -65,6 +66,7 @@ def test_signs_that_agree_raise_and_those_that_contradict_refuse(bare, agree):
     assert sum(agree.posterior.values()) == pytest.approx(1.0) and other.walls > other.probability
 
 
+@pytest.mark.longer
 def test_signs_choose_among_places_that_walls_do_not_tell_apart(agree):
     shifted = [*NUMBERS[2:], "2.118", "2.119"]  # the same walls, two rooms on along the corridor
     second = register(with_signs(HALL, NUMBERS), told(HALL, shifted))
@@ -97,6 +99,7 @@ def test_alternatives_that_the_user_rules_out_stay_ruled_out():
     assert update_posterior(known, 0.61, evidence)["storey"] == 0.0
 
 
+@pytest.mark.longer
 def test_hostile_landmarks_do_no_harm(bare):
     texts = ["101"] * 8
     same = register(with_signs(HALL, texts), told(HALL, texts))

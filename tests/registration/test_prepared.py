@@ -36,6 +36,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return calls
 
 
+@pytest.mark.longer
 def test_of_what_was_sent_nothing_is_drawn_again_and_where_walls_decide_no_descriptor_is_needed(halves, drawn, monkeypatch):
     monkeypatch.setattr(learned, "load_embedder", lambda *_: pytest.fail("the embedder was loaded"))
     parts = [pickle.loads(pickle.dumps(prepare(map).pack())) for map in halves]

@@ -83,6 +83,7 @@ def test_the_file_is_named(files, maps) -> None:
         assert map.warnings == (f"{path}: tilted by {degrees:.1f} degrees: levelled",)
 
 
+@pytest.mark.longer
 def test_transforms_apply_to_the_files(files, merged) -> None:
     assert merged.merged
     listing = json.loads(json.dumps(serialise_merge(merged)))
@@ -97,19 +98,25 @@ def test_transforms_apply_to_the_files(files, merged) -> None:
     assert np.array_equal(merged.map.levelling, into)
 
 
-def test_a_level_map_has_no_levelling(maps) -> None:
+def test_a_level_map_has_no_levelling(small) -> None:
     level = tm.extract(two_rooms().points())
     assert np.array_equal(level.levelling, np.eye(4)) and LEVELLED not in level.parameters
     pose = Sim3(0.3, (1.0, 2.0, 0.0))
     assert convert_pose_to_files(pose, np.eye(4), np.eye(4)).tolist() == pose.matrix.tolist()
-    one, other = (m.levelling for m in maps)
+    one, other = small.levelling, tilt(9.0, 140.0)
     assert np.allclose(convert_pose_to_maps(convert_pose_to_files(pose, one, other), one, other), pose.matrix)
 
 
-def test_maps_keep_it_and_damaged_ones_are_refused(maps, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def small() -> tm.TopometricMap:
+    """Two rooms, tilted by 6 degrees."""
+    return tm.extract(transform_points(TILTS[0], two_rooms().points()).astype(np.float32))
+
+
+def test_maps_keep_it_and_damaged_ones_are_refused(small, tmp_path: Path) -> None:
     path = tmp_path / "a.tmap"
-    tm.save_map(maps[0], path)
-    assert np.array_equal(tm.load_map(path).levelling, maps[0].levelling)
+    tm.save_map(small, path)
+    assert LEVELLED in small.parameters and np.array_equal(tm.load_map(path).levelling, small.levelling)
     arrays = archive.read(path, "map")
     about = json.loads(arrays["about"].item())
     for wrong in ([[1, 2]], "askew", np.diag([1.0, 1.0, -1.0, 1.0]).tolist(), np.diag([2.0, 2.0, 2.0, 1.0]).tolist(), None):
@@ -123,6 +130,7 @@ def test_maps_keep_it_and_damaged_ones_are_refused(maps, tmp_path: Path) -> None
     assert np.array_equal(read_levelling({}), np.eye(4))
 
 
+@pytest.mark.longer
 def test_frames_of_ros_are_those_of_the_files(merged, tmp_path: Path) -> None:
     merged.save(tmp_path / "m")
     (pose,) = read_frame_poses(tmp_path / "m")
@@ -135,6 +143,7 @@ def test_frames_of_ros_are_those_of_the_files(merged, tmp_path: Path) -> None:
     assert np.allclose([said[axis] for axis in "xyz"], merged.file_transforms[1][:3, 3])
 
 
+@pytest.mark.longer
 def test_an_atlas_keeps_it(maps, tmp_path: Path) -> None:
     folder = tmp_path / "atlas"
     add(folder, list(zip(("west", "east"), maps, strict=True)), tm.render_atlas_html)

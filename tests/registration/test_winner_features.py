@@ -82,6 +82,7 @@ def test_both_ways_say_the_same(whole, points):
         assert there[name] == pytest.approx(back[name], rel=0.1, abs=0.1), name
 
 
+@pytest.mark.longer
 def test_a_wing_with_another_end_is_not_believed(points):
     twin = stretched(office(furnished=False).points(), 10.0, 1.4)
     assert not register(grid_of(points), grid_of(twin, MOVE)).accepted

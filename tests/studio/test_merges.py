@@ -89,6 +89,7 @@ def test_a_damaged_merge_is_told(tmp_path: Path) -> None:
             describe_merge(StudioFolder(tmp_path), OpenMaps(), tmp_path / "both")
 
 
+@pytest.mark.longer
 def test_rooms_that_are_one_place_a_map_and_a_map_that_was_moved_snaps(merged: Path) -> None:
     maps, paths = OpenMaps(), [merged / "west.tmap", merged / "east.tmap"]
     rooms = [m["rooms"] for m in listed(merged)["matches"]]

@@ -165,6 +165,7 @@ def test_what_the_device_cannot_make_is_refused(cache, tmp_path):
         fit(settings, lambda text: None)
 
 
+@pytest.mark.longer
 def test_a_training_with_batches_of_the_device_learns_and_repeats(cache, tmp_path, monkeypatch):
     monkeypatch.setattr(EmbeddingJob, "export_best", lambda self, folder: None)  # seconds
     network = Network(

@@ -118,6 +118,7 @@ def test_settings_that_make_no_sense(settings: Training, change: dict[str, objec
         check(replace(settings, **change))  # type: ignore[arg-type]
 
 
+@pytest.mark.longer
 def test_replay_mixes_another_set_in(settings: Training, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[list[int]] = []
     real = EmbeddingJob._draw_order
@@ -230,6 +231,7 @@ def test_bad_words_are_one_line(folder: Path, tmp_path: Path, capsys, words: lis
     assert said in err and err.count("\n") == 1 and not (tmp_path / "x").exists()
 
 
+@pytest.mark.longer
 def test_a_run_on_own_pairs_goes_on_and_other_pairs_are_refused(folder: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(EmbeddingJob, "export_best", lambda self, folder: None)
     common = {

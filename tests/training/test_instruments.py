@@ -82,6 +82,7 @@ def test_an_average_follows_the_weights() -> None:
     assert "1.num_batches_tracked" not in average.kept and "1.running_mean" in average.kept
 
 
+@pytest.mark.longer
 def test_the_average_is_validated_and_kept_and_goes_on_to_the_byte(settings, tmp_path, monkeypatch) -> None:
     averaged = replace(settings, ema=0.9)
     fit(replace(averaged, name="whole"), quiet)
@@ -157,6 +158,7 @@ def test_an_anomaly_is_named(settings, monkeypatch) -> None:
         fit(replace(settings, anomaly=True), quiet)
 
 
+@pytest.mark.longer
 def test_the_scaler_of_half_precision_goes_on_to_the_byte(settings, tmp_path, monkeypatch) -> None:
     """As of fp16: a scale that overflows at first, and grows after three good steps."""
     from lightning_fabric import Fabric

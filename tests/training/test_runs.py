@@ -102,6 +102,7 @@ def test_a_run_is_replaced_only_where_that_is_asked_for(settings, tmp_path):
     assert len((tmp_path / "run" / "metrics.jsonl").read_text().splitlines()) == 1
 
 
+@pytest.mark.longer
 def test_tasks_keep_their_runs_too(tmp_path, monkeypatch):
     from tests.training import tiny
     from topomerge.training import match_odds

@@ -345,8 +345,8 @@ def test_a_device_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.parametrize("task", list(TASKS))
 def test_a_wrong_score_to_watch_is_one_line_before_any_data_is_made(task: str, tmp_path: Path) -> None:
-    settings = compose_settings([f"task={task}", f"runs={tmp_path}", f"cache={tmp_path / 'cache'}"])
-    settings.watch = "recal@1"
+    settings = TASKS[task].convert(TASKS[task].get_schema()())
+    settings.runs, settings.cache, settings.watch = str(tmp_path), str(tmp_path / "cache"), "recal@1"
     with pytest.raises(InputError, match="watch: unknown 'recal@1'") as refused:
         train(settings, quiet)
     assert "\n" not in str(refused.value) and not list(tmp_path.iterdir())

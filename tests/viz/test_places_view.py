@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import topomerge as tm
-from tests.fusion.plans_of import office
+from tests.fusion.atlas.atlas_scenes import office_map
 from topomerge.registration.places import LOOKED, PARTS, SIDE, Crops, Places
 from topomerge.viz.merge_plan import lay_out_pair
 from topomerge.viz.merge_report import (
@@ -29,7 +28,7 @@ from topomerge.viz.merge_report import (
 
 @pytest.fixture(scope="module")
 def map():
-    return tm.extract(office().points(), name="a.ply")
+    return office_map(0)
 
 
 def places(at: list[tuple[float, float]], odds: list[float]) -> Places:

@@ -95,6 +95,7 @@ def test_a_leaf_swings_from_its_hinge_to_the_other_end_of_the_opening(house: Bui
     assert not drawing._draw_leaf_and_arc(door, np.random.default_rng(0))
 
 
+@pytest.mark.longer
 def test_maps_of_one_building_fit_by_their_true_transforms_whatever_made_them(house: Building):
     """Walls of a drawing lie on those of a scan that did not drift."""
     atlas = make_atlas(house, ("tls", "drawing", "grid"), np.random.default_rng(3), drifts=(0.0, 0.0, 0.0))

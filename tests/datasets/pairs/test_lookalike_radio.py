@@ -67,6 +67,7 @@ def test_one_place_is_heard_alike_twice_and_another_storey_is_not() -> None:
     assert max(abs(first[name] - second[name]) for name in first.keys() & second.keys()) > 10
 
 
+@pytest.mark.longer
 def test_the_same_item_gives_the_same_bytes_and_another_draw_others() -> None:
     first, repeated, drawn = (simulate("same-room", draw=draw)[0] for draw in (0, 0, 1))
     for a, b in zip(first.readings, repeated.readings, strict=True):

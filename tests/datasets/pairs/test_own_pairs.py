@@ -411,6 +411,7 @@ def test_retrieval_takes_them(houses: Path, cache: Path) -> None:
         measure_retrieval(replace(settings, path=""), quiet)
 
 
+@pytest.mark.longer
 def test_merges_of_them_are_counted(maps_folder: Path, tmp_path: Path) -> None:
     _, pose = turned(uneven(), SHIFT)
     pair = {"a": "one", "b": "two", "transform": pose.matrix.tolist()}

@@ -19,6 +19,7 @@ from topomerge.datasets.pairs.plan_examples import (
     simulate_item_scan,
 )
 
+from tests.cases import list_longer
 from tests.datasets.boxes import BARE, two_rooms
 from topomerge.errors import InputError
 from topomerge.extraction.plans.plan_network import compute_evidence
@@ -35,7 +36,7 @@ def walls_of(cloud, edge):
     return x[x[:, 2] > 0]
 
 
-@pytest.mark.parametrize("edge", [0.1, 0.08, 0.15])
+@pytest.mark.parametrize("edge", [0.1, *list_longer(0.08, 0.15)])
 def test_walls_of_a_drawn_map_are_as_full_as_those_of_a_file(edge, tmp_path):
     """They once had gaps, by which the network told drawings from real grids."""
     from PIL import Image
@@ -67,6 +68,7 @@ def test_flat_items_are_grids_drawings_and_slices():
         check_plans(PlanRecipe(scans=0, flat=True))
 
 
+@pytest.mark.longer
 def test_a_scan_is_shown_as_a_grid_to_the_network_of_grids(tmp_path):
     """Its walls are raised alike, furniture that a laser meets is wall, and what is true of each column stays."""
     scanned = make_examples(PlanItem(100_003, "procedural", 0, "", ""), None)[0]

@@ -42,6 +42,7 @@ def test_each_file_tells_what_is_true_of_each_two_maps(manifest: Path) -> None:
     assert load_example(manifest.parent / "pairs" / rows[0]["file"]).a.num_nodes == len(file["a.x"])
 
 
+@pytest.mark.longer
 def test_a_training_takes_all_pairs_that_share_a_room_with_their_sheets(manifest: Path) -> None:
     pairs = load_pairs(manifest, ["sheet"])
     rows = {json.loads(line)["file"] for line in manifest.read_text().splitlines()}
@@ -55,6 +56,7 @@ def test_a_training_takes_all_pairs_that_share_a_room_with_their_sheets(manifest
     assert len(load_pairs(manifest, ["sheet"], limit=1)) == 1
 
 
+@pytest.mark.longer
 def test_what_a_limited_run_packed_serves_all_pairs(manifest: Path) -> None:
     shutil.rmtree(manifest.parent / "packed", ignore_errors=True)
     assert len(load_pairs(manifest, ["sheet"], limit=1)) == 1

@@ -22,6 +22,7 @@ from topomerge.datasets.plans.floorplans import Refusal, group_siblings, iter_pl
 from topomerge.datasets.public import s3dis
 from topomerge.datasets.public.sources import iter_public_pairs
 
+from tests.cases import list_longer
 from tests.datasets.plans import plan_files as write
 from topomerge.cli.main import main as cli
 from topomerge.config import compose
@@ -84,11 +85,13 @@ def test_an_item_of_a_cache_that_names_a_sealed_seed_is_refused() -> None:
     [
         ("merge_belief", "grids"),
         ("plan_segmentation", "plan_scans"),
-        ("door_classification", "door_scans"),
-        ("room_odds", "room_scans"),
-        ("match_odds", "matching_train"),
-        ("match_belief", "matching_validation"),
-        ("feature_scale", "matching_train"),
+        *list_longer(
+            ("door_classification", "door_scans"),
+            ("room_odds", "room_scans"),
+            ("match_odds", "matching_train"),
+            ("match_belief", "matching_validation"),
+            ("feature_scale", "matching_train"),
+        ),
     ],
 )
 def test_training_and_fitting_are_refused(task: str, data: str, tmp_path: Path) -> None:

@@ -78,7 +78,7 @@ def test_phones_miss_readings_and_points_move():
 
 
 def test_each_storey_of_a_building_has_a_plan():
-    plans = build_radio_plans(make_building("office", 3, 2))
+    plans = build_radio_plans(make_building("house", 3, 2))
     assert len(plans) == 2 and all(0.3 < plan.wall.mean() < 0.99 and len(plan.free) > 50 for plan in plans)
 
 

@@ -30,12 +30,10 @@ from topomerge.types import classify_door_state
 @pytest.mark.parametrize(
     ("depth", "width", "bottom", "top", "behind"),
     [
-        (0.1, 0.6, 1.0, 1.6, 0.15),
-        (0.2, 0.6, 1.0, 1.6, 0.1),
         (0.2, 0.9, 0.0, 2.05, 0.15),
-        (0.3, 0.9, 0.9, 2.05, 0.1),
+        *list_longer((0.1, 0.6, 1.0, 1.6, 0.15), (0.2, 0.6, 1.0, 1.6, 0.1), (0.3, 0.9, 0.9, 2.05, 0.1)),
     ],
-    ids=["shallow", "shelf", "of a door's size", "deep"],
+    ids=["of a door's size", "shallow", "shelf", "deep"],
 )
 def test_a_niche_is_no_door(depth: float, width: float, bottom: float, top: float, behind: float):
     map = extracted(niche(depth, width, bottom, top, behind).points(0.003))
@@ -43,7 +41,7 @@ def test_a_niche_is_no_door(depth: float, width: float, bottom: float, top: floa
     assert len(map.rooms) == 2 and door["open"] and door["centre"][:2] == pytest.approx([4, 4], abs=0.15)
 
 
-@pytest.mark.parametrize("depth", [0.1, 0.2, 0.3])
+@pytest.mark.parametrize("depth", [0.2, *list_longer(0.1, 0.3)])
 def test_a_niche_in_an_outer_wall_leads_nowhere(depth: float):
     scene = Scene().shell(0, 0, 5, 4)
     scene.parts = [p[~((p[:, 0] > 5 - 1e-6) & (np.abs(p[:, 1] - 2) < 0.45) & (p[:, 2] < 2.05))] for p in scene.parts]
@@ -53,7 +51,7 @@ def test_a_niche_in_an_outer_wall_leads_nowhere(depth: float):
     assert len(map.rooms) == 1 and not len(map.edges)
 
 
-@pytest.mark.parametrize(("width", "is_open"), [(1.8, True), (1.8, False), *list_longer((2.0, True), (1.6, False), (2.0, False))])
+@pytest.mark.parametrize(("width", "is_open"), [(1.8, True), *list_longer((1.8, False), (2.0, True), (1.6, False), (2.0, False))])
 def test_a_double_door_is_one_door_as_wide(width: float, is_open: bool):
     map = extracted(double_door(width, is_open).points(0.003))
     (door,) = map.edges
@@ -61,7 +59,7 @@ def test_a_double_door_is_one_door_as_wide(width: float, is_open: bool):
     assert door["centre"][:2] == pytest.approx([3.5, 5], abs=0.1) and door["width"] == pytest.approx(width, abs=0.15)
 
 
-@pytest.mark.parametrize("cover", [0.3, 0.45])
+@pytest.mark.parametrize("cover", [0.3, *list_longer(0.45)])
 def test_a_sliding_door_that_stands_half_open_is_one_open_door(cover: float):
     (door,) = extracted(sliding_door(cover).points(0.003)).edges
     assert door["open"] and door["kind"] == "door"
@@ -75,7 +73,7 @@ def test_a_leaf_that_stands_half_open_is_told_from_one_that_is_shut_or_wide_open
     assert len(map.edges) == 3 and [classify_door_state(door) for door in (shut, ajar, wide)] == ["shut", "half open", "open"]
 
 
-@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("side", [-1, *list_longer(1)])
 def test_a_shut_door_that_was_seen_from_one_side_only(side: int):
     """The wall was not seen from the other room: neither its face nor that of the leaf has points there."""
     points = three_doors().points(0.003)
@@ -94,7 +92,7 @@ def floors(*walls: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("count", [1, 2, 30])
+@pytest.mark.parametrize("count", [1, *list_longer(2, 30)])
 def test_walls_of_hardly_any_points_have_no_doors(count: int):
     few = np.random.default_rng(count).uniform((2.5, 0, 0.3), (2.5, 4, 2.2), (count, 3))
     map = extract(floors(few))
@@ -102,7 +100,7 @@ def test_walls_of_hardly_any_points_have_no_doors(count: int):
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("count", [0, 1, 5])
+@pytest.mark.parametrize("count", [0, *list_longer(1, 5)])
 def test_elevations_of_hardly_any_points_show_no_doorways(count: int):
     """The walls stand, but of what is looked at closely hardly a point is left."""
     scan, navigable = read_navigable(three_doors().points(), 0.1, PRESETS["default"], Stopwatch())

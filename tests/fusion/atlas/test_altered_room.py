@@ -47,6 +47,7 @@ def test_an_altered_room_does_not_keep_maps_apart(parts) -> None:
     assert not (result.map.provenance[wall] & 0b001).any()  # and not by the west
 
 
+@pytest.mark.longer
 def test_places_of_conflict_are_found_and_pooled(parts) -> None:
     a, b = (prepare(parts[name]).storeys for name in ("west", "east"))
     (conflict,) = find_conflicts(a, b, FRAMES["west"] @ FRAMES["east"].inverse())

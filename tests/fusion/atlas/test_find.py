@@ -80,6 +80,7 @@ def test_a_map_of_the_atlas_finds_itself_and_rows_are_kept(house: Path) -> None:
     assert find(house, office_map(0)) == first
 
 
+@pytest.mark.longer
 def test_the_map_on_which_it_lies_best_comes_first(house: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the rooms look like; those on which it was not laid follow as they were."""
     first, second = find(house, office_map(0))
@@ -158,6 +159,7 @@ def test_an_atlas_that_may_only_be_read_is_looked_through(house: Path, monkeypat
     assert find(house, office_map(0))[0].name == NAMES[0] and not (house / ROOMS_FILE).exists()
 
 
+@pytest.mark.longer
 def test_the_command(house: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     topomerge.save_map(office_map(0), tmp_path / "new.tmap")
     assert cli(["atlas", "find", str(house), str(tmp_path / "new.tmap")]) == 0

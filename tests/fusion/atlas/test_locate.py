@@ -119,6 +119,7 @@ def test_maps_of_one_building_name_one_place() -> None:
     assert answer.status == "located" and answer.places[0].probability > 0.9
 
 
+@pytest.mark.longer
 def test_a_map_is_found_as_its_scan_is() -> None:
     answer = locate(index(), office_map(1))
     assert answer.status == "located" and answer.places[0].map == "office"
@@ -223,6 +224,7 @@ def test_an_empty_atlas_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert Entry("a", "k", "s", 1, 1).file == "maps/a.tmap"
 
 
+@pytest.mark.longer
 def test_the_command_tells_and_exits(built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def write(path: Path, points: Array) -> str:
         head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"

@@ -196,6 +196,7 @@ def test_an_index_that_is_damaged_or_another_s_is_refused(indexed: Path, monkeyp
     assert look(indexed, new, 5, monkeypatch)[0].name == "0" and path.read_bytes() == good
 
 
+@pytest.mark.longer
 def test_a_graph_that_would_lead_the_library_astray_is_refused(indexed: Path) -> None:
     """Each byte of all but the vectors is spoilt: what is not refused can be searched."""
     arrays = archive.read(indexed / INDEX_FILE)

@@ -59,6 +59,7 @@ def test_parts_of_a_building_come_together_and_a_stranger_stays_apart(atlas):
     assert atlas.registered[0] < atlas.registered[1] == 10  # the rest follows from the links
 
 
+@pytest.mark.longer
 def test_the_order_of_the_maps_does_not_matter(atlas, maps, registrations):
     order = [3, 4, 1, 0, 2]
     turned = tm.build_atlas([maps[k] for k in order], registrations=registrations)
@@ -78,6 +79,7 @@ def poisoned(maps: list[TopometricMap], registrations: dict, i: int, j: int, wro
     return {**registrations, pair: (PoseHypothesis(pose, probability=p),)}
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("p", [0.997, *list_longer(0.93)])
 def test_a_wrong_hypothesis_in_a_cycle_is_thrown_out_and_named(maps, registrations, p, monkeypatch):
     maps, first = maps[:4], {id(maps[0]), id(maps[3])}  # the poisoned pair is tried first
@@ -92,6 +94,7 @@ def test_a_wrong_hypothesis_in_a_cycle_is_thrown_out_and_named(maps, registratio
     assert "west, north" in result.format_summary() and "thrown out" in result.format_summary() and result.status == "merged"
 
 
+@pytest.mark.longer
 def test_a_claim_against_two_surer_ones_is_not_believed(maps, registrations):
     """Of west and south, of south and east: right, of west and east: wrong; no other pair is there, free space is silent."""
     sure = poisoned(maps, poisoned(maps, registrations, 0, 1, Sim3(), 0.99), 1, 2, Sim3(), 0.99)  # by their true poses
@@ -231,6 +234,7 @@ def test_with_little_time_maps_are_laid_on_those_that_look_most_like_them(looks:
     assert all(partners[k][0] == k + 40 for k in range(39))
 
 
+@pytest.mark.longer
 def test_strangers_stay_strangers(maps, registrations):
     result = tm.build_atlas([maps[0], maps[4]], registrations=registrations)
     assert (

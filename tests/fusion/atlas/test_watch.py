@@ -40,8 +40,9 @@ def room(width: int) -> tm.TopometricMap:
 
 @pytest.fixture
 def apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is registered: the atlas keeps its maps apart, at once."""
+    """Nothing is registered: the atlas keeps its maps apart, at once, however slow the machine is."""
     monkeypatch.setattr("topomerge.fusion.atlas.solve.find_hypotheses", lambda *_: ())
+    monkeypatch.setattr("topomerge.fusion.atlas.watch.SECONDS_TO_ANSWER", float("inf"))
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import pytest
 import topomerge as tm
 from tests.fusion.plans_of import MOVE, off, part
 from tests.scenes import Scene
+from tests.scenes_map import building
 from topomerge.errors import InputError
 from topomerge.registration.surfaces import estimate_room_poses
 
@@ -59,8 +60,9 @@ def test_one_wrong_match_is_outvoted(flats, partners):
     assert off(clusters[0][0], MOVE.inverse(), (0.0, 0.0, 0.0))[1] < 0.5
 
 
-def test_no_matches_give_no_pose(flats):
-    assert estimate_room_poses(*flats, np.zeros((0, 2), np.int64), np.zeros(0)) == []
+def test_no_matches_give_no_pose():
+    maps = building(1), building(2)
+    assert estimate_room_poses(*maps, np.zeros((0, 2), np.int64), np.zeros(0)) == []
 
 
 @pytest.mark.longer
@@ -73,14 +75,15 @@ def test_merge_by_rooms_alone(flats, poses):
     assert np.allclose((result.registration.transform @ back.registration.transform).matrix, np.eye(4), atol=1e-6)
 
 
-def test_merge_by_rooms_is_for_two_maps_and_by_surfaces_for_one_scale(flats):
+def test_merge_by_rooms_is_for_two_maps_and_by_surfaces_for_one_scale():
+    maps = [building(1), building(2), building(3)]
     for poses in ("rooms", "surfaces"):
         with pytest.raises(InputError, match="poses of rooms alone are for two maps"):
-            tm.merge([*flats, flats[0]], poses=poses)
+            tm.merge(maps, poses=poses)
     with pytest.raises(InputError, match="poses of surfaces are for two maps of one scale"):
-        tm.merge(flats, poses="surfaces", scale="free")
+        tm.merge(maps[:2], poses="surfaces", scale="free")
     with pytest.raises(InputError, match="search, rooms or surfaces, not 'thesis'"):
-        tm.merge(flats, poses="thesis")
+        tm.merge(maps[:2], poses="thesis")
 
 
 @pytest.mark.longer
@@ -88,6 +91,7 @@ def test_the_same_maps_give_the_same_poses(flats, partners, clusters):
     assert estimate_room_poses(*flats, partners, np.ones(len(partners))) == clusters
 
 
+@pytest.mark.longer
 def test_without_open3d_the_message_says_what_to_install(flats, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(InputError, match=r"need Open3D: pip install topomerge\[open3d\]"):
