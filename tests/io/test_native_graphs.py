@@ -178,6 +178,6 @@ def test_damage_is_told(tmp_path: Path, change: Any, told: str) -> None:
 
 
 def test_other_json_is_no_scene_graph(tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text('{"__class": "ValetudoMap"}')
+    (tmp_path / "a.json").write_text('{"type": "FeatureCollection"}')
     (tmp_path / "b.json").write_text("[")
     assert find_format(tmp_path / "a.json") is None and find_format(tmp_path / "b.json") is None
