@@ -25,6 +25,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "octree_queries": {"queries": 50, "radii": (0.2,)},
     "extract_floor": {"points": 300_000, "most": 2},
     "merge_growth": {"rooms": [10]},
+    "merge_floor": {"points": 600_000},
     "growth": {"rooms": [5]},
     "room_search": {"rooms": [2000]},
     "networks": {"sides": (64,), "strip": 40, "squares": 2},
