@@ -124,15 +124,3 @@ def meet_along_a_wall() -> TopometricMap:
     edges["kind"] = "opening"
     room = (navigable.cells[:, 0] >= 40).astype(np.int32)
     return TopometricMap(navigable, room, navigable, room, rooms, edges, storeys)
-
-
-def test_a_gap_too_narrow_for_a_door_goes_where_both_rooms_have_another_way() -> None:
-    map = meet_along_a_wall()
-    wide = map.edges[:1].copy()
-    wide["width"] = 0.9
-    gap = wide.copy()
-    gap["width"], gap["centre"][:, 1] = 0.2, wide["centre"][:, 1] + 1.0
-    both = place_drawn_doors(replace(map, edges=np.concatenate([wide, gap])), draw_door((1.0, 1.0), (1.2, 1.9)))
-    assert len(both.edges) == 1 and both.edges["width"][0] == wide["width"][0]
-    alone = replace(map, edges=gap)
-    assert place_drawn_doors(alone, draw_door((1.0, 1.0), (1.2, 1.9))) is alone

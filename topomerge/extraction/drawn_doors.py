@@ -42,8 +42,6 @@ class DrawnDoor:
 def place_drawn_doors(map: TopometricMap, drawn: Array) -> TopometricMap:
     """Return the map with the doors that a drawing shows between two of its rooms, in place of what the cut found between these.
 
-    What is too narrow for a door, and is not drawn as one, is a gap of the raster, and goes where both rooms have another way.
-
     Args:
         drawn: (k, 4) places on the floor, m, and how probably the drawing shows a door there.
     """
@@ -56,23 +54,11 @@ def place_drawn_doors(map: TopometricMap, drawn: Array) -> TopometricMap:
             same = level & (np.sort(map.edges["rooms"], axis=1) == door.rooms).all(axis=1)
             kept &= ~same
             rows.append(_build_edge(map.edges[same], door, float(storey["floor"])))
-    edges = _drop_narrow(np.concatenate([map.edges[kept], *rows]), len(map.rooms))
-    if not rows and len(edges) == len(map.edges):
+    if not rows:
         return map
+    edges = np.concatenate([map.edges[kept], *rows])
     order = np.lexsort((*edges["centre"].T[::-1], edges["rooms"][:, 1], edges["rooms"][:, 0]))
     return replace(map, edges=edges[order])
-
-
-def _drop_narrow(edges: Array, rooms: int) -> Array:
-    """Return edges without gaps narrower than doors between rooms that have another way, the narrowest first."""
-    ways = np.bincount(edges["rooms"].ravel(), minlength=rooms)
-    kept = np.ones(len(edges), bool)
-    narrow = np.isin(edges["kind"], LEVEL_KINDS) & (edges["width"] < LEAST_WIDTH)
-    for number in np.flatnonzero(narrow)[np.argsort(edges["width"][narrow], kind="stable")]:
-        if (ways[edges["rooms"][number]] > 1).all():
-            kept[number] = False
-            ways[edges["rooms"][number]] -= 1
-    return edges[kept]
 
 
 def find_drawn_doors(map: TopometricMap, storey: int, drawn: Array) -> Iterator[DrawnDoor]:
