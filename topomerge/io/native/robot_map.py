@@ -85,13 +85,14 @@ def join(sources: Sequence[Source], target: Path, doubt: Doubt) -> Tally:
         joined = _shift(joined, np.array([0, -round(valetudo.RR_SIDE * valetudo.RR_PIXEL / joined.cell)]))
     shifted, told = _shift_inside(joined)
     target.write_text(json.dumps(_build_file(shifted), allow_nan=False, separators=(",", ":")), encoding="utf-8")
-    kept = valetudo.parse_robot_map(target, load_json_map(target))
+    written = load_json_map(target)
+    kept = valetudo.parse_robot_map(target, written)
     named = sum(bool(name) for name in kept.names)
     tally = {
         "rooms": (counts["rooms"], len(kept.names)),
-        "rooms that are one": (shared, shared),
+        "rooms that are one": (shared, counts["rooms"] - len(kept.names)),
         "names": (sum(map(bool, names)), named),
-        "entities": (counts["entities"], len(shifted.entities)),
+        "entities": (counts["entities"], len(written["entities"])),
     }
     warnings = [f"{sources[0].path}: {told}"] if told else []
     if any(m.about is None for m in maps):
