@@ -349,6 +349,7 @@ def test_a_scan_in_whole_maps_is_counted_by_its_pose_and_by_the_map_with_most_in
     assert "| sweep | 3 | 2 | 2 | 1 | 1.00 | 50 | 3 | 0 | 0.50 |" in table
 
 
+@pytest.mark.longer
 def test_scans_are_compared_when_the_module_is_the_program(module, tmp_path, monkeypatch, capsys) -> None:
     scans = module("scans")
 

@@ -142,6 +142,7 @@ def test_a_door_that_stands_elsewhere_says_by_how_much(
     assert [c.guid for c in found.changes if c.kind == "element elsewhere"] == ["door"]
 
 
+@pytest.mark.longer
 def test_a_layer_before_a_wall_does_not_move_it(model: list[ModelElement], built: TopometricMap) -> None:
     """What the scan shows is the furring; of the wall behind it nothing is known."""
     hidden = box("hidden", "wall", (12.2 + THICK, 0, 0), (12.6, 8, 2.7))

@@ -38,6 +38,7 @@ def test_json_instead_of_tables(folder: Path, capsys: pytest.CaptureFixture[str]
     assert told["status"] == "compared" and all(c["probability"] >= 0.9 for c in told["changes"])
 
 
+@pytest.mark.longer
 def test_aligned_first(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli(["diff", "old.tmap", "turned.tmap", "--threshold", "0.01", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)

@@ -128,6 +128,7 @@ def test_only_what_is_likely_enough(run: Run) -> None:
     assert run(*words, "0")[1].startswith("6 rooms, 5 doors and stairs -> ")
 
 
+@pytest.mark.longer
 def test_an_origin_in_the_south(run: Run) -> None:
     for words in (("--origin", "-33.9,-151.2"), ("--origin=-33.9,-151.2,-5",)):
         assert run("export", "a.tmap", "--to", "geojson", "-o", "a.geojson", *words)[0] == 0

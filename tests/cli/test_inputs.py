@@ -93,6 +93,7 @@ def test_any_number_of_processes_gives_the_same_maps(clouds: list[str], began: l
     assert not list_children()
 
 
+@pytest.mark.longer
 def test_processes_start_before_the_maps_are_asked_for(clouds: list[str], began: list[str], method: str) -> None:
     """They import and read while a command checks what it was given, and draw what registration needs of a map."""
     with inputs.InputMaps(clouds[:2], choose(2), prepares=True) as maps:
@@ -179,6 +180,7 @@ def test_a_process_that_is_killed(clouds: list[str], monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), *list_longer((signal.SIGTERM, 143))])
+@pytest.mark.longer
 def test_a_signal_ends_all_processes(clouds: list[str], number: int, status: int) -> None:
     code = """
 import sys

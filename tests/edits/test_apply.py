@@ -180,6 +180,7 @@ FEW = settings(max_examples=12, deadline=None, suppress_health_check=list(Health
 
 @FEW
 @given(st.lists(any_edit, max_size=6), st.integers(0, 6))
+@pytest.mark.longer
 def test_any_edits_give_a_sound_map_and_the_same_one_again(edits, cut):
     done = apply_edits(corridor_map(), edits)
     assert_same_map(done.map, apply_edits(corridor_map(), edits).map)

@@ -40,6 +40,7 @@ def rooms(path: str = "a.tmap") -> int:
     return len(load_corrected_map(path).rooms)
 
 
+@pytest.mark.longer
 def test_each_option_makes_a_line_and_the_map_stays(edit: Run) -> None:
     before = Path("a.tmap").read_bytes()
     for words in (

@@ -93,6 +93,31 @@ def test_older_rows_stay_where_a_sample_of_them_comes_out_alike(
     assert calls == measured
 
 
+@pytest.mark.parametrize(("remake", "measured"), [(False, ["a", "d"]), (True, ["a", "b", "c", "d", "e"])])
+def test_rows_behind_a_page_are_confirmed_where_no_cache_is(tmp_path: Path, remake: bool, measured: list[str]) -> None:
+    calls: list[str] = []
+
+    def work(name: str) -> tasks.Row:
+        calls.append(name)
+        return {"iou": 0.5}
+
+    def measure(machine: str, code: str, settings: tasks.TaskSettings, names: str = "abcde") -> list[tasks.Row]:
+        calls.clear()
+        return tasks.measure_missing(tmp_path / machine / "rows.jsonl", {n: (n,) for n in names}, work, list, settings, code)
+
+    page = tmp_path / "results" / "page.md"
+    measure("one", "old", tasks.TaskSettings(write=str(page)))
+    kept = page.parent / "rows" / "rows.jsonl.gz"
+    before = kept.read_bytes()
+    rows = measure("another", "new", tasks.TaskSettings(write=str(page), confirm=2, remake=remake))
+    assert sorted(calls) == measured and [row["code"] for row in rows] == ["new"] * 5
+    assert set(tasks.read_rows(kept)) == set("abcde") and kept.read_bytes() != before
+    measure("third", "new", tasks.TaskSettings(write=str(page)), "af")
+    assert calls == ["f"] and set(tasks.read_rows(kept)) == set("abcdef")
+    measure("fourth", "new", tasks.TaskSettings(), "a")
+    assert calls == ["a"]  # nothing is published, and nothing that was is read
+
+
 def test_a_block_without_a_stamp_is_stale(page: Path) -> None:
     assert list(results_check.find_stale([page], page.parent)) == ["page.md rooms: nothing says what made it"]
     page.write_text(page.read_text().replace("old words", "<!-- measured at commit abc123 -->"))
@@ -136,6 +161,7 @@ def test_every_figure_of_the_readme_has_a_source() -> None:
     assert not re.findall(r"\d+(?:\.\d+)? ?%|\b\d\.\d+|\b\d+(?:\.\d+)? (?:s|seconds|times)\b|\b\d+ of \d+\b", prose)
 
 
+@pytest.mark.longer
 def test_the_check_never_fails_and_names_what_it_counts(capsys: pytest.CaptureFixture[str]) -> None:
     assert results_check.main() == 0
     *lines, last = capsys.readouterr().out.splitlines()

@@ -82,6 +82,7 @@ def gym(parapet: float = 0.0, slab: float = 0.3, hall: float = 7.0) -> np.ndarra
 
 
 @pytest.mark.parametrize("more", [{}, *list_longer({"parapet": 0.6}, {"slab": 0.6}, {"hall": 5.6})])
+@pytest.mark.longer
 def test_the_flat_roof_beside_a_hall_is_no_storey(more: dict[str, float]) -> None:
     map = tm.extract(gym(**more))
     assert len(map.storeys) == 1 and len(map.rooms) == 5

@@ -170,6 +170,7 @@ def seen_through_the_hole(below: Array, floor: float) -> Array:
     return seen
 
 
+@pytest.mark.longer
 def test_what_is_seen_through_a_stairwell_is_one_storey_below_and_changes_nothing_above() -> None:
     upper = Scene().shell(0, 0, 12, 8, 3.0)
     floor = upper.parts[0]

@@ -188,6 +188,7 @@ def test_a_scene_can_be_left_as_it_is() -> None:
 
 
 @pytest.mark.data
+@pytest.mark.longer
 def test_real_scans_that_are_level_are_left(data_dir: Path) -> None:
     for name in ("scans_real_3d/studio_3cm.laz", "scans_real_3d/atrium_two_storeys_2cm.laz"):
         points = tm.read_points(data_dir / name).points

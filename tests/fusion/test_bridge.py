@@ -153,6 +153,7 @@ def test_a_join_is_taken_back_when_evidence_turns(tmp_path: Path) -> None:
     assert event["event"] == "parted" and not merger.links and merger.list_transforms() == []
 
 
+@pytest.mark.longer
 def test_an_open_join_names_what_would_settle_it_once(tmp_path: Path) -> None:
     merger = LiveMerger(tmp_path, replace(LIVE, join=1.01, open=0.0))
     for name, k in PARTS.items():

@@ -144,6 +144,7 @@ def off_the_wall(map: TopometricMap) -> np.ndarray:
     return np.abs(at[near, 1])
 
 
+@pytest.mark.longer
 def test_a_joined_wall_is_where_the_points_of_both_maps_are():
     a, frame = scanned_rooms(0), Sim3(0.4, (1.03, -2.02, 0.0))
     points = compute_cell_means(scanned_rooms(1).grid)

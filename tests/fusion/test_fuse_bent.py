@@ -87,6 +87,7 @@ def test_a_wall_through_two_storeys_that_part_has_no_gap():
         assert abs(here[:, None] - there[None]).min() <= 1
 
 
+@pytest.mark.longer
 def test_bending_by_nothing_gives_the_same_bytes(halves, straight):
     poses = [(0, Sim3()), (1, truth(0, 2))]
     hardly = deformation(np.full((5, 4), (0.01, 0.01, 0.0, 0.0)))  # less than cells can tell

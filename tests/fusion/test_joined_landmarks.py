@@ -120,6 +120,7 @@ def test_markup_on_signs_is_shown_in_the_report_and_never_run(halves: Halves) ->
     assert "&lt;b onload=x&gt;2.113" in page and "&lt;img src=x onerror=y&gt;2.115" in page
 
 
+@pytest.mark.longer
 def test_maps_without_landmarks_are_joined_as_before(halves: Halves) -> None:
     joined = fused(*halves)
     assert isinstance(joined.landmarks, Landmarks) and len(joined.landmarks) == 0

@@ -119,6 +119,7 @@ def test_light_lines_on_dark_paper_are_turned(paper):
     assert np.abs(page.picture.mean(axis=2) - true)[(true < 5) | (true > 250)].mean() < 12
 
 
+@pytest.mark.longer
 def test_light_floor_among_dark_walls_is_no_blueprint_and_no_page():
     rng = np.random.default_rng(0)
     grid = np.full((300, 300), 0.1)
@@ -171,6 +172,7 @@ def test_a_blueprint_has_its_rooms(tmp_path):
     assert len(map.rooms) == 5 and any("dark lines on light paper" in warning for warning in map.warnings)
 
 
+@pytest.mark.longer
 def test_a_plan_of_two_levels_is_turned_and_a_grid_is_not(tmp_path):
     page = find_page((255 - np.asarray(Image.open(draw_case(tmp_path / "plan.png")))) // 2)  # crisp, and pale
     assert page.mended and page.doubtful and is_plan(page)

@@ -113,6 +113,7 @@ def test_every_format_of_the_likely_part(tmp_path: Path, name: str) -> None:
     assert files and all(file.stat().st_size for file in files)
 
 
+@pytest.mark.longer
 def test_ifc_says_how_likely_doors_are_and_what_is_outside(tmp_path: Path) -> None:
     ifcopenshell = pytest.importorskip("ifcopenshell")
     import ifcopenshell.util.element as element

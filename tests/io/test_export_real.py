@@ -32,6 +32,7 @@ QUICK = "robot grid (Freiburg 101)"
 
 
 @pytest.mark.parametrize("name", [QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in MAPS if name != QUICK)])
+@pytest.mark.longer
 def test_dsg_of_a_real_building(data_dir: Path, tmp_path: Path, name: str) -> None:
     map = MAPS[name](data_dir)
     assert len(map.rooms) > 2 and len(map.edges) > 1

@@ -202,6 +202,7 @@ def test_a_building_model_comes_back(marked: TopometricMap, tmp_path: Path) -> N
     assert np.allclose(cloud.landmarks.table["position"][sign], marked.rooms["centroid"][3], atol=1e-3)
 
 
+@pytest.mark.longer
 def test_names_of_spaces_short_and_long(tmp_path: Path) -> None:
     ifcopenshell = pytest.importorskip("ifcopenshell")
     save_export(two_floors(), "ifc", tmp_path / "a.ifc")

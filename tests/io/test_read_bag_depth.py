@@ -154,6 +154,7 @@ def test_bad_images(tmp_path: Path) -> None:
         assert named + says in refusal_with(tmp_path / name, change, "packed", packed)
 
 
+@pytest.mark.longer
 def test_bad_clocks_and_cameras(tmp_path: Path) -> None:
     def back(message: object) -> None:
         message.header.stamp.sec -= 60  # type: ignore[attr-defined]

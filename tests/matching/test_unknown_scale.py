@@ -30,6 +30,7 @@ def test_rooms_are_surest_at_the_true_scale(true: float) -> None:
     assert set(COARSE_SCALES) <= set(asked) and len(asked) == len(COARSE_SCALES) + 2
 
 
+@pytest.mark.longer
 def test_matching_at_unknown_scale_says_which_it_took() -> None:
     a = building(3)
     b, _ = turned(a, (3.0, 1.0, 0.0), 1.25)

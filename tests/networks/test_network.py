@@ -199,6 +199,7 @@ def test_inputs_that_the_graph_can_not_take_are_an_error_of_one_line_and_nothing
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.longer
 def test_importing_the_library_does_not_import_the_runtime() -> None:
     code = (
         "import sys, topomerge, topomerge.extraction.extract, topomerge.fusion.pipeline, topomerge.matching.match\n"

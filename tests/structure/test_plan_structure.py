@@ -169,6 +169,7 @@ def quarter(grid: VoxelGrid) -> tuple[VoxelGrid, np.ndarray]:
     return turned, turned.properties["row"]
 
 
+@pytest.mark.longer
 def test_a_turned_map_has_the_same_walls_turned():
     map = corridor_map()
     grid, rows = quarter(map.grid)

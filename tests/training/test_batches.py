@@ -138,6 +138,7 @@ def test_crops_and_ways_of_a_mirrored_sheet_are_the_mirrored_ones(part):
     assert not torch.equal(seen, add_views(one, [part])[part])
 
 
+@pytest.mark.longer
 def test_what_another_sensor_saw_has_the_same_walls_but_in_patches():
     one, alone = pair(2).a, Augment(walks=0.0, slices=0.0, rough=0.0, tilt=0.0, zoom=0.0, bend=0.0)
     seen = augment_sheet(one, alone, torch.Generator().manual_seed(0))

@@ -104,6 +104,7 @@ def test_the_average_is_validated_and_kept_and_goes_on_to_the_byte(settings, tmp
         fit(replace(averaged, name="whole", resume=True, ema=0.5), quiet)
 
 
+@pytest.mark.longer
 def test_the_best_epochs_are_kept(settings, tmp_path, monkeypatch) -> None:
     scores = iter([0.3, 0.5, 0.1, 0.4])
     real = EmbeddingJob.compute_scores

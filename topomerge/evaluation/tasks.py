@@ -6,6 +6,7 @@ settings from the command line, rows kept beside a report in ``runs/eval/<task>-
 
 from __future__ import annotations
 
+import gzip
 import json
 import os
 import re
@@ -78,7 +79,8 @@ class TaskSettings:
         jobs: processes.
         cache: folder of scans, maps and pairs, which are made once.
         folder: where rows and report go.
-        write: a page whose marked blocks are written; empty: none.
+        write: a page whose marked blocks are written; empty: none. The rows behind it lie in `rows` beside it, and come from there
+            where the cache has none.
         headline: a file of figures for the README whose entries of this task are written; empty: none.
         remake: measure again what is there.
         confirm: rows of an older state of the code stay where so many of them, evenly spread, come out alike when they are
@@ -216,7 +218,9 @@ def measure_missing(
     code = code or compute_code_digest(work.__module__)
     if settings.remake:
         path.unlink(missing_ok=True)
-    rows = {name: row for name, row in read_rows(path).items() if name in items}
+    kept = Path(settings.write).parent / KEPT_ROWS / f"{path.name}.gz" if settings.write else None
+    published = {} if kept is None or settings.remake else read_rows(kept)
+    rows = {name: row for name, row in (published | read_rows(path)).items() if name in items}
     older = {name: row for name, row in rows.items() if row["code"] != code}
     rows = {name: row for name, row in rows.items() if name not in older}
     sample = list(older)[:: -(-len(older) // settings.confirm)] if older and settings.confirm else []
@@ -243,7 +247,12 @@ def measure_missing(
             unlike_row = f"; {unlike[0]} came out otherwise" if unlike else ""
             log_line(f"{len(older)} rows are of another state of the code and are measured again{unlike_row}")
         measure(items)
+    if kept:
+        write_rows(kept, read_rows(kept) | rows)
     return [rows[name] for name in items]
+
+
+KEPT_ROWS = "rows"  # folder beside a page
 
 
 COSTS = re.compile(r"code|confirmed|.*(seconds|_s|_mib|_mb)")
@@ -275,9 +284,19 @@ def name_row(name: str, work: Callable[..., Row], arguments: Sequence[Any]) -> R
 
 
 def read_rows(path: Path) -> dict[str, Row]:
-    """Read the lines of a file of rows by their names, the last of each; none where there is no such file."""
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    return {row["name"]: row for row in map(json.loads, lines)}
+    """Read the lines of a file of rows, packed or not, by their names, the last of each; none where there is no such file."""
+    if not path.exists():
+        return {}
+    text = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+    return {row["name"]: row for row in map(json.loads, text.decode().splitlines())}
+
+
+def write_rows(path: Path, rows: Mapping[str, Row]) -> None:
+    """Write rows into a packed file, one line each, in the order of their names: the same rows give the same bytes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = [json.dumps(rows[name]) + "\n" for name in sorted(rows)]
+    with replace_on_success(path) as temporary:
+        temporary.write_bytes(gzip.compress("".join(lines).encode(), mtime=0))
 
 
 def find_real_data() -> Path:

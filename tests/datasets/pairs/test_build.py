@@ -260,6 +260,7 @@ def test_settings_reach_the_build(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0 and "data=train_small" in capsys.readouterr().out
 
 
+@pytest.mark.longer
 def test_no_scheduler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr(module, "PATIENCE", 1.0)

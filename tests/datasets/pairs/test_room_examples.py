@@ -43,6 +43,7 @@ def test_a_ray_that_met_nothing_is_free_to_its_end() -> None:
     assert free[at[1, 1] - 1, at[1, 0]]
 
 
+@pytest.mark.longer
 def test_a_robot_draws_nothing_beyond_what_it_believes() -> None:
     house = add_outdoors(make_building("house", 11), np.random.default_rng(1))
     laser = replace(get_sensor("laser2d"), height=1.1, reach=(0.1, 40.0))

@@ -15,6 +15,7 @@ POINTS = np.random.default_rng(0).uniform(0, 3, (20_000, 3)).astype(np.float32)
 CLOUD = PointCloud(POINTS, poses=np.eye(4)[None], pose_of=np.zeros(len(POINTS), np.int32))
 
 
+@pytest.mark.longer
 def test_a_thinned_cloud_is_part_of_the_cloud_and_the_same_again():
     by_chance = np.array([np.random.default_rng([seed, 10]).random() < LOST_BY_CHANCE for seed in range(40)])
     left = [thin_cloud(CLOUD, seed) for seed in range(40)]

@@ -23,6 +23,7 @@ def test_kind_and_seed_say_all(kind: str) -> None:
     assert abs(np.quantile(heights, 0.02)) < 0.05 and np.quantile(heights, 0.98) == pytest.approx(worlds.HEIGHT, abs=0.05)
 
 
+@pytest.mark.longer
 def test_maps_of_one_world_share_their_walls_under_the_true_frames() -> None:
     def columns(kind: str) -> tuple[set[tuple[int, ...]], set[tuple[int, ...]]]:
         pair = worlds.draw_pair(kind, 5)

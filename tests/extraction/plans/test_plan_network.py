@@ -83,6 +83,7 @@ def test_evidence(two_rooms: StoreyPlan) -> None:
 
 
 @pytest.mark.parametrize("step", [(500, 500), *list_longer(((1500, 0),), ((-30, 1400),))])
+@pytest.mark.longer
 def test_far_parts_of_a_plan_are_looked_at_one_by_one_and_alike(two_rooms, step, monkeypatch) -> None:
     wall = np.zeros((106 + abs(step[0]), 46 + abs(step[1])), bool)
     profile, inside = np.zeros(wall.shape, np.uint64), wall.copy()

@@ -58,6 +58,7 @@ def test_maps_of_an_arena_that_does_not_repeat_are_joined(arena: Arena, count: i
 
 
 @pytest.mark.data
+@pytest.mark.longer
 def test_three_robots_in_a_point_symmetric_arena(case_dir: Path) -> None:
     """Pairs of .54, .64 and .76, the last one turned wrongly: the three are not believed."""
     folder = case_dir / "symmetric-arena"

@@ -101,6 +101,7 @@ def test_a_large_joined_map_has_a_page_for_each_tile(tmp_path: Path, small_tiles
     assert not list(folder.glob("*_tile_*")) and not list(folder.glob("map_*"))
 
 
+@pytest.mark.longer
 def test_the_same_atlas_has_the_same_tiles(tmp_path: Path, small_tiles: None) -> None:
     for name in ("house", "again"):
         add(tmp_path / name / "atlas", [("one", room(0)), ("two", room(1))], tm.render_atlas_html)

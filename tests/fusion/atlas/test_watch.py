@@ -225,6 +225,7 @@ def test_the_atlas_may_lie_in_the_folder(scans, apart):
     assert len(seen(scans, scans / "site").read) == 4 and seen(scans, scans / "site").read == []
 
 
+@pytest.mark.longer
 def test_the_stamp_of_the_page_changes_with_the_atlas(scans, apart, tmp_path):
     seen(scans, tmp_path / "site")
     stamp = (tmp_path / "site" / "report_stamp.css").read_text()
