@@ -190,7 +190,9 @@ def test_links_of_an_atlas_are_edges(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["nowhere"], "is no folder of a merge"),
+        (["nowhere"], "no such file or folder"),
+        (["nowhere.g2o", "0=a.tmap"], "no such file or folder"),
+        (["."], "is no folder of a merge"),
         (["merged"], "a.tmap: is a map; name the file"),
         (["merged", "7=b.g2o"], "there is no map 7"),
         (["merged", "1=b.g2o", "1=c.g2o"], "map 1 has two files"),

@@ -99,6 +99,8 @@ def read_file_frames(place: Path) -> list[FileFrame]:
     if place.is_file() and place.suffix.lower() == ".g2o":
         vertices = read_pose_graph(place).vertices
         return [FileFrame(k, "", Motion(vertex.pose)) for k, vertex in sorted(vertices.items()) if vertex.posed]
+    if not place.exists():
+        raise InputError(f"{place}: no such file or folder; name the folder of a merge or an atlas, or a .g2o of its maps")
     listing_file = next((place / name for name in LISTINGS if (place / name).is_file()), None)
     if listing_file is None:
         raise InputError(f"{place}: is no folder of a merge or an atlas ({' or '.join(LISTINGS)} is missing), and no .g2o of one")
