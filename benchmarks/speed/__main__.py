@@ -23,10 +23,10 @@ SMALL: dict[str, dict[str, Any]] = {
     "voxelise": {"points": 200_000},
     "visibility": {"points": 200_000, "views": 5},
     "octree_queries": {"queries": 50, "radii": (0.2,)},
-    "extract_floor": {"points": 300_000, "most": 2},
+    "extract_floor": {"points": 300_000, "most": 2, "repeat": 1},
     "merge_growth": {"rooms": [10]},
     "merge_floor": {"points": 600_000},
-    "growth": {"rooms": [5]},
+    "growth": {"rooms": [4, 8]},
     "room_search": {"rooms": [2000]},
     "networks": {"sides": (64,), "strip": 40, "squares": 2},
     "build_pairs": {"pairs": 2, "rooms": 4},
@@ -36,8 +36,8 @@ SMALL: dict[str, dict[str, Any]] = {
     "readers": {"most": 0, "repeat": 1},
     "bags": {"gigabytes": [0.02], "spacing": 0.1},
 }
-# Of so few points the thesis' preset finds no room: extract_floor compares nothing in its small form.
-COMPARED: dict[str, dict[str, Any]] = {name: SMALL[name] for name in ("voxelise", "networks", "room_search")}
+WHOLE_WAY = ("start", "first_merge", "whole", "extract_floor", "growth")
+COMPARED: dict[str, dict[str, Any]] = {name: SMALL[name] for name in ("voxelise", "networks", "room_search", *WHOLE_WAY)}
 RECORDED = Path(__file__).with_name("recorded.json")  # ratios of the small forms
 
 

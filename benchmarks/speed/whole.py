@@ -2,7 +2,8 @@
 
 Run from the root: ``python -m benchmarks.speed.whole [pairs]``: ten pairs of .3 to 10 million points, simulated once below
 ``cache/benchmarks/``. Both use all cores, one after the other, the less disturbed of two runs each; ours is a command with its
-start. Lines: `name ours peer ratio` (`bench.print_line`), then how many cores ours kept busy and the share of each of its steps.
+start. Lines: `name ours peer ratio` (`bench.print_line`), of `name_cores` the peer is ours on one core alone, so that the ratio
+says how many it kept busy; then the share of each of its steps.
 """
 
 from __future__ import annotations
@@ -56,6 +57,7 @@ def main(pairs: int = len(PAIRS), repeat: int = 2) -> None:
             peer = min(run_peer(folder) for _ in range(repeat))
             print_line(name, seconds, peer)
             ratios.append(seconds / peer)
+        print_line(f"{name}_cores", seconds, seconds * cores)
         print(f"# {name}: {seconds:.1f} s, {cores:.2f} of {os.cpu_count()} cores busy; {shares}", flush=True)
     if ratios:
         print(f"# ours over peer: median {np.median(ratios):.2f}, {min(ratios):.2f} to {max(ratios):.2f}")

@@ -11,20 +11,21 @@ import numpy as np
 import pytest
 
 from tests.cli.processes import process
-from tests.scenes import two_rooms
+from tests.scenes import Scene, two_rooms
 from topomerge.cli.main import main
 from topomerge.extraction import cleaning, walls
 from topomerge.extraction.convolution import Kernel, convolve
 from topomerge.extraction.elevations.doorways import classify_places
 from topomerge.extraction.elevations.elevation import WALL_NETWORK_FILE, Elevations
-from topomerge.extraction.extract import extract
-from topomerge.extraction.plans.plan_network import LOOKS, PLAN_NETWORK_FILE
+from topomerge.extraction.extract import JOINED_LOOKS, extract
+from topomerge.extraction.plans.plan_network import GRID_NETWORK_FILE, LOOKS, PLAN_NETWORK_FILE
+from topomerge.fusion import fuse
 from topomerge.io import piece, ply
 from topomerge.io.points import read_chunks
 from topomerge.io.rooms_ply import assign_room_colours
 from topomerge.kernels import occupied_cells
 from topomerge.networks.network import Network
-from topomerge.types import PointCloud, VoxelGrid
+from topomerge.types import PointCloud, Sim3, VoxelGrid
 
 MOST_MODULES = {
     "import topomerge": 120,
@@ -134,6 +135,19 @@ def test_networks_run_once_a_look_and_once_a_strip(runs: Counter[str], monkeypat
     extract(two_rooms().points().astype(np.float32))
     assert len(strips) == 1 and strips[0] > 5
     assert runs == {PLAN_NETWORK_FILE: LOOKS, WALL_NETWORK_FILE: strips[0]}
+
+
+def test_a_merge_extracts_each_cloud_once_and_looks_once_at_what_is_joined(
+    runs: Counter[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two halves of a hall: their border is looked at, once, and no wall is read again."""
+    points = Scene().shell(0, 0, 12, 6).points().astype(np.float32)
+    halves = [extract(points[side], name="half") for side in (points[:, 0] < 6.1, points[:, 0] > 5.9)]
+    assert runs == {GRID_NETWORK_FILE: len(halves) * LOOKS}
+    runs.clear()
+    monkeypatch.setattr(fuse, "extract", lambda *_: pytest.fail("extracted again"))
+    fuse.fuse(halves, [(0, Sim3()), (1, Sim3())])
+    assert sum(runs.values()) == JOINED_LOOKS == 1
 
 
 @pytest.mark.parametrize("code", MOST_MODULES)

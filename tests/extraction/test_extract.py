@@ -11,6 +11,7 @@ from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS, DefaultParameters, ThesisParameters
 from topomerge.extraction.voxels import voxelise
+from topomerge.kernels import count_threads, occupied_cells, rasters, set_thread_count, stencil
 from topomerge.types import PointCloud, TopometricMap
 
 
@@ -116,6 +117,24 @@ def test_two_storeys_with_a_stair():
     storey = result.find_cell_storeys()
     z = result.grid.compute_centroids()[:, 2]
     assert (storey[(z > 3.2)] == 1).mean() > 0.95 and (storey[z < 1.3] == 0).all()
+
+
+def test_any_number_of_threads_extracts_the_same(monkeypatch):
+    points, before, found = scenes.two_rooms().points(0.005).astype(np.float32), count_threads(), []
+    for loops in (occupied_cells, rasters, stencil):
+        for name in {"LEAST_POINTS", "LEAST_CELLS"} & set(vars(loops)):
+            monkeypatch.setattr(loops, name, 1000)  # so that slices are taken of a small scene, too
+    try:
+        for threads in (1, 3):
+            set_thread_count(threads)
+            found.append(extract(points))
+    finally:
+        set_thread_count(before)
+    alone, shared = found
+    assert len(alone.grid) > 10_000
+    assert (alone.grid.cells == shared.grid.cells).all() and (alone.room == shared.room).all()
+    for name in ("rooms", "edges", "storeys", "areas", "narrows"):
+        assert getattr(alone, name).tobytes() == getattr(shared, name).tobytes(), name
 
 
 def test_a_ramp_is_one_way_through():

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from topomerge.kernels import compile_ahead
 
 
-@njit(cache=True, nogil=True)
+@compile_ahead("u1[:,:,::1], i2[:,::1], i8[:,::1], i8[::1], i8, i8")
 def cut(planes, room, corner, number, side, step):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Cut (n, side, side, P + 1) uint8: the planes from each corner on, then how much of each pixel is the room of that number.
 

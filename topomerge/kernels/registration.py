@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from topomerge.kernels import compile_ahead, run_in_slices
@@ -314,7 +313,7 @@ def measure_pose_evidence(
     return out
 
 
-@njit(cache=True, nogil=True)
+@compile_ahead("i8, i8, f8[:,::1], i8[:,::1], f8[:,::1], i8[::1], b1[::1], f4[:,:,::1], b1[:,:,::1], f8[::1], f8, f8, f8[:,::1]")
 def _measure_pose_evidence(first, last, poses, storeys, points, storey, is_wall, distance, floor, origin, edge, sigma, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     _, nx, ny = distance.shape
     for h in range(first, last):
@@ -341,7 +340,7 @@ def _measure_pose_evidence(first, last, poses, storeys, points, storey, is_wall,
         out[h, 0], out[h, 1], out[h, 2] = agree, against, common
 
 
-@njit(cache=True, error_model="numpy")
+@compile_ahead("f8[:,::1], f8[::1], i8[:,::1], f8[::1], i8[::1], i8[::1], f8[::1], f8", error_model="numpy")
 def sum_votes(way, rise, room, probability, voted, voters, widths, level_gap):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the sums (len(voted), len(widths)) float64 of the chances of the voters whose way is near that of each pair, by how
     near it is: the weight of a voter falls from 1 to 0 at a width (biweight). None votes for a pair that shares a room with it.
