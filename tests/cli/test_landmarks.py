@@ -105,6 +105,20 @@ def test_what_a_file_says_is_taken_and_replaced(marked: Run) -> None:
     assert "holds no landmarks and no names" in marked("mark", "a.tmap", "--from", "empty.json")[2]
 
 
+def test_an_exported_map_takes_neither_radio_nor_marks_away(marked: Run) -> None:
+    """GeoJSON has no radio, and names the sources of what it has: a table's, and "by hand"."""
+    Path("a.csv").write_text("kind,value,room,number\ntext,1,0,\nradio,aa:bb,0,-60\n")
+    assert marked("mark", "a.tmap", "--from", "a.csv", "-q")[0] == 0
+    assert marked("mark", "a.tmap", "--room", "1", "--name", "Lab", "-q")[0] == 0
+    assert marked("export", "a.tmap", "--to", "geojson", "-o", "a.geojson", "-q")[0] == 0
+    assert marked("mark", "a.tmap", "--room", "1", "--object", "sofa", "-q")[0] == 0
+    before = table()
+    assert marked("mark", "a.tmap", "--from", "a.geojson")[1] == "2 added, 4 landmarks in all -> a.tmap\n"
+    assert sorted(table()) == sorted(before)
+    Path("a.csv").write_text("kind,value,room\ntext,1,0\n")
+    assert marked("mark", "a.tmap", "--from", "a.csv")[1] == "1 added, 3 landmarks in all -> a.tmap\n"
+
+
 def test_what_comes_with_a_scan_is_taken(marked: Run) -> None:
     np.save("b.npy", two_rooms().points())
     Path("b.landmarks.csv").write_text("kind,value,room\nobject,sofa,1\n")

@@ -288,6 +288,28 @@ def test_the_common_frame_does_not_matter(first, second, yaw, shift):
         assert factor[0].get(name, 0) == pytest.approx(factor[1].get(name, 0), abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("kind", "factor", "sentences"),
+    [
+        ("radio", {"here": 3.0}, ["radio speaks for the same place"]),
+        ("pressure", {"storey": 2.0}, ["air pressure speaks for another storey with the same plan"]),
+        ("tag", {"building": 1.5}, ["tags speak as a whole for another building"]),
+        ("radio", {"here": 1.0}, []),
+        ("radio", {"here": 3.0, "wing": 2.5}, []),
+    ],
+)
+def test_kinds_without_single_witnesses_are_told_in_words(kind, factor, sentences):
+    evidence = LandmarkEvidence({kind: dict.fromkeys(ALTERNATIVES, 0.0) | factor})
+    assert evidence.list_sentences() == evidence.serialise()["sentences"] == sentences
+
+
+def test_what_radio_denies_is_not_told_as_uncontradicted():
+    signs = score(["2.113"], ["2.113"])
+    factors = dict(signs.factors) | {"radio": dict.fromkeys(ALTERNATIVES, 0.0) | {"storey": 4.0}}
+    told = replace(signs, factors=factors).list_sentences()
+    assert told == ["sign 2.113 agrees", "radio speaks for another storey with the same plan"]
+
+
 def test_joined_kinds_are_one_factor_each():
     both = replace(
         HALL,

@@ -43,7 +43,7 @@ def run_mark(args: argparse.Namespace) -> int:
         marked, what = replace(map, landmarks=map.landmarks.select(~gone)), f"{int(gone.sum())} removed"
     else:
         added = _build_added(args)
-        marked = add_landmarks(_drop_source(map, added.sources) if args.source else map, added)
+        marked = add_landmarks(_drop_earlier(map, added, Path(args.source).name) if args.source else map, added)
         what = f"{len(added)} added"
         if hasattr(args, "at") and (marked.landmarks.table["room"][-len(added) :] < 0).all():
             warn([f"{args.input}: no room is at {','.join(f'{v:g}' for v in args.at)} (--at: m in the frame of the map)"])
@@ -110,12 +110,18 @@ def _build_added(args: argparse.Namespace) -> Landmarks:
     return join_landmarks(parts)
 
 
-def _drop_source(map: TopometricMap, sources: Sequence[str]) -> TopometricMap:
-    """Return the map without what came from these sources before."""
+def _drop_earlier(map: TopometricMap, added: Landmarks, file: str) -> TopometricMap:
+    """Return the map without what a file says anew: all that came from it, and, of the sources that it names, the kinds that it
+    has (an exported map has no radio). What somebody marked by hand only goes where the file repeats it."""
     import numpy as np
 
-    of = np.array([*(source in sources for source in map.landmarks.sources), False], bool)[map.landmarks.table["source"]]
-    return replace(map, landmarks=map.landmarks.select(~of))
+    own = map.landmarks
+    source = np.array([*own.sources, ""])[own.table["source"]]
+    again = np.isin(source, [*added.sources]) & np.isin(own.table["kind"], added.table["kind"])
+    repeated = set(zip(added.table["kind"].tolist(), added.get_values().tolist(), strict=True))
+    same = [row in repeated for row in zip(own.table["kind"].tolist(), own.get_values().tolist(), strict=True)]
+    gone = (source == file) | (again & np.where(source == BY_HAND, np.array(same, bool), True))
+    return replace(map, landmarks=own.select(~gone))
 
 
 def _select_rows(args: argparse.Namespace, landmarks: Landmarks) -> Array:

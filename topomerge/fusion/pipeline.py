@@ -31,6 +31,7 @@ from topomerge.fusion.inputs import (
 )
 from topomerge.fusion.result import MERGE_STEPS, MergeResult, RoomMatch
 from topomerge.landmarks.fuse import CONTRADICTING
+from topomerge.landmarks.likelihood import WORDS
 from topomerge.landmarks.settle import Observation, find_observations
 from topomerge.matching.consistency import compute_match_probability
 from topomerge.matching.match import Matching, match
@@ -38,7 +39,7 @@ from topomerge.matching.poses import PoseHypothesis
 from topomerge.progress import Stopwatch, tell_step
 from topomerge.registration.bend.bend import NEITHER_BENDS
 from topomerge.registration.pipeline import FallbackProposals, Registration, register
-from topomerge.registration.posterior import POSTERIOR, WORDS, check_same, compute_evidence_limit, describe_posterior
+from topomerge.registration.posterior import POSTERIOR, check_same, compute_evidence_limit, describe_posterior
 from topomerge.registration.prepared import Prepared, compute_registration_order
 from topomerge.registration.surfaces import check_open3d, estimate_room_poses
 from topomerge.types import Deformation, Sim3, TopometricMap

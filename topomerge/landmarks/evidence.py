@@ -23,6 +23,7 @@ from topomerge.landmarks.likelihood import (
     GATE,
     KINDS,
     READERS,
+    WORDS,
     Associated,
     Kind,
     associate_sightings,
@@ -113,6 +114,7 @@ MOST_UNREAD = 1.0  # log odds that unread signs may cost in all
 # Shares of the tags in sight that a map may have, alike likely: so a reader that finds most is likelier than one that finds few.
 RATES = np.sqrt((np.arange(10) + 0.5) / 10)
 MISPLACED = 0.1  # probability that a rare string far from its place points there, or was put in a wrong place
+TELLING = float(np.log(3.0))  # log odds, from which on a kind is told to speak for an alternative
 FAR, MOST_FAR = 6.0, 6.0  # m beyond which two places are two, and log odds that such strings may give in all
 RARE = 0.01  # share of the signs, below which a string names one place
 SEEN_AROUND, SEEN_WITHIN = 1.5, 0.6  # m around a landmark of its own map's cells, and of those of the other map from these
@@ -188,9 +190,11 @@ class LandmarkEvidence:
     def list_sentences(self) -> list[str]:
         """List what agrees and what contradicts, a sentence a kind; the last one tells where nothing contradicts at all."""
         by_kind = {kind: [w for w in self.witnesses if w.kind == kind] for kind in self.factors}
-        sentences = [text for kind, of in by_kind.items() if (text := describe_witnesses(kind, of))]
+        sentences = [describe_witnesses(kind, of) or describe_factor(kind, self.factors[kind]) for kind, of in by_kind.items()]
+        sentences = [text for text in sentences if text]
         verdicts = {w.verdict for of in by_kind.values() for w in of}
-        if "agrees" in verdicts and "contradicts" not in verdicts:
+        against = any(max(f.values()) - f["here"] > TELLING for f in self.factors.values())
+        if "agrees" in verdicts and "contradicts" not in verdicts and not against:
             sentences[-1] += "; nothing contradicts"
         return sentences
 
@@ -235,6 +239,16 @@ def describe_witnesses(kind: str, witnesses: Sequence[Witness], shown: int = 3) 
     if away:
         parts.append(f"{label}{'s' * (len(away) > 1)} {name(away)} stand{'s' * (len(away) == 1)} elsewhere in the other map")
     return "; ".join(parts)
+
+
+def describe_factor(kind: str, factor: Mapping[str, float]) -> str:
+    """Describe what a kind says as a whole, where no single landmark of it does: "radio speaks for the same place"; nothing where
+    it hardly tells."""
+    label = {"radio": "radio speaks", "pressure": "air pressure speaks"}.get(kind) or f"{KINDS[kind].words}s speak as a whole"
+    best, next_best = sorted(factor, key=lambda name: -factor[name])[:2]
+    if best == "here":
+        return f"{label} for {WORDS[best]}" if factor[best] - factor[next_best] > TELLING else ""
+    return f"{label} for {WORDS[best]}" if factor[best] - factor["here"] > TELLING else ""
 
 
 class LandmarkScorer:

@@ -37,7 +37,16 @@ from topomerge.landmarks.text import (
 )
 from topomerge.types import Array, Sim3
 
-ALTERNATIVES = ("here", "elsewhere", "storey", "half", "wing", "building", "outside")
+WORDS = {
+    "here": "the same place",
+    "elsewhere": "another place in these maps",
+    "storey": "another storey with the same plan",
+    "half": "the other half of the building, which half a turn lays on this one",
+    "wing": "a wing, module or room that looks the same",
+    "building": "another building",
+    "outside": "a place outside the other map",
+}
+ALTERNATIVES = tuple(WORDS)
 READERS = ((0.002, 0.4), (0.02, 0.3), (0.08, 0.2), (0.2, 0.1))  # error of a character, and how many readers err so
 RENEWED = 0.003
 # Share of the shifted numbers that are shifted just so: a character that tells the storey or the wing, the count, anything else.

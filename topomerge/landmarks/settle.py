@@ -30,6 +30,7 @@ REACHED_WITHIN = 15.0  # m of them: a room that can be visited from it
 APART = 3.0  # m between two observations of a kind
 RARE = 0.01  # share of the signs, up to which one is worth reading
 MOST_SHOWN = 5
+LEAST_CHANGE = 0.02  # expected, below which an observation settles nothing and is not shown
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ def find_observations(
     picked: list[Observation] = []
     for o in found:
         near = any(p.map == o.map and np.hypot(p.at[0] - o.at[0], p.at[1] - o.at[1]) < APART for p in picked)
-        if not near and len(picked) < MOST_SHOWN and o.change > 0:
+        if not near and len(picked) < MOST_SHOWN and o.change >= LEAST_CHANGE:
             picked.append(o)
     return picked
 

@@ -14,6 +14,7 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.landmarks.evidence import LandmarkEvidence
 from topomerge.landmarks.likelihood import ALTERNATIVES as POSTERIOR
+from topomerge.landmarks.likelihood import WORDS
 from topomerge.types import Array
 
 WRONG = POSTERIOR[1:]
@@ -26,15 +27,6 @@ SAME = {
     "nothing": POSTERIOR,
     "building": ("here", "elsewhere", "storey", "half", "wing", "outside"),
     "storey": ("here", "elsewhere", "half", "wing", "outside"),
-}
-WORDS = {
-    "here": "the same place",
-    "elsewhere": "another place in these maps",
-    "storey": "another storey with the same plan",
-    "half": "the other half of the building, which half a turn lays on this one",
-    "wing": "a wing, module or room that looks the same",
-    "building": "another building",
-    "outside": "a place outside the other map",
 }
 COMMON_WALLS, COMMON_FLOOR = 1.0, 6.0  # m2 of wall columns that meet and of free floor that both saw: below, nothing can be sure
 MOST_BY_LANDMARKS = 0.95  # probability of a pose that walls alone do not carry and landmarks do
