@@ -186,9 +186,8 @@ TASKS = Registry(
             name: f"topomerge.training.{name}:TASK"
             for name in (
                 "drawing_segmentation", "door_classification", "wall_segmentation",
-                "passages", "wall_doors", "room_odds", "feature_scale", "match_odds",
-                "place_evidence", "match_belief", "merge_belief", "embedding", "room_matcher", "radio_law",
-                "locate_odds",
+                "passages", "wall_doors", "room_odds", "embedding", "room_matcher", "feature_scale", "match_odds",
+                "place_evidence", "match_belief", "merge_belief", "radio_law", "locate_odds",
             )
         },
     },

@@ -22,12 +22,12 @@ from tests.matching.turned_maps import turned
 from tests.scenes_map import building
 from topomerge.archive import find_weights_file
 from topomerge.cli.main import main as cli
-from topomerge.embedding.learned import load_embedder
+from topomerge.embedding.learned import load_embedder, read_embedder_card
 from topomerge.embedding.network import Geometry, Network, Node
 from topomerge.errors import InputError
 from topomerge.io.maps import save_map
 from topomerge.networks.network import WEIGHTS_PACKAGE, card_of
-from topomerge.training import finetuning
+from topomerge.training import finetuning, room_matcher
 from topomerge.training.embedding import EmbeddingJob, adopt_network, fit
 from topomerge.training.finetuning import judge
 from topomerge.training.settings import Training, check
@@ -268,3 +268,16 @@ def test_a_run_on_own_pairs_goes_on_and_other_pairs_are_refused(folder: Path, tm
     (folder / "pairs.yaml").write_text(yaml.safe_dump(values))
     with pytest.raises(InputError, match="holds other pairs than when the run began"):
         fit(replace(run, epochs=3, resume=True), quiet)
+
+
+@pytest.mark.longer
+def test_a_matcher_reads_rows_of_the_embedder_that_is_named(tmp_path: Path) -> None:
+    for name, node in (("turned", Node("gat", 1, width=8, ways=True)), ("plain", Node("none"))):
+        export_embedder(Embedder(Network(Geometry(["scalars"], width=8), node, size=8)).eval(), tmp_path / name, {})
+    network, digest = room_matcher.load_turned_embedder(str(tmp_path / "turned"))
+    assert network.network.size == 8
+    assert digest == read_embedder_card(tmp_path / "turned").digest != room_matcher.load_turned_embedder("pretrained")[1]
+    with pytest.raises(InputError, match=r"^embedder=.*plain: tells no turns apart, as the matcher needs"):
+        room_matcher.load_turned_embedder(str(tmp_path / "plain"))
+    with pytest.raises(InputError, match=r"nowhere/embedder.onnx: No such file"):
+        room_matcher.load_turned_embedder(str(tmp_path / "nowhere"))
