@@ -136,7 +136,7 @@ def run(words: str, folder: Path) -> None:
     """Run `python WORDS` in a folder.
 
     Raises:
-        SystemExit: it failed. That nothing helped or merged (2), or that no pair is sure enough (1 of `from-merges`), is an answer.
+        SystemExit: it failed. That nothing helped or merged (2), or that no pair is sure enough (1), is an answer.
     """
     environment = {**os.environ, "PYTHONPATH": str(folder)}
     done = subprocess.run(
