@@ -3,7 +3,7 @@
 python train.py experiment=sage_pointnet data=train_small           the task is embedding where none is named
 python train.py -m geometry=engineered,pointnet node=none,gat       a sweep
 python train.py search=optuna search.space.rate=[1e-4,1e-2,log]     a search
-torchrun --nproc-per-node 2 train.py ...                            several processes, for embedding
+torchrun --nproc-per-node 2 train.py ...                            several processes, for every network
 python -m topomerge.training run.json                               without Hydra, for embedding
 """
 

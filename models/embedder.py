@@ -17,12 +17,13 @@ from topomerge.embedding.network import (
     TABLE_PARTS,
     Network,
     check,
+    find_crop_encoder,
     find_tensor,
     list_pair_tensors,
     list_tensors,
 )
 from topomerge.embedding.surroundings import CROP_SHAPES, DOOR_PART
-from topomerge.registry import POINTS
+from topomerge.registry import GEOMETRIES
 
 DOOR_ROWS = ("door_rows", "door_slots")  # tensors of a batch: see `DoorsEncoder`
 QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # cosine and sine of 0 to 3 quarter turns
@@ -65,8 +66,10 @@ class GeometryEncoder(nn.Module):
         for part in geometry.parts:
             if part == LANDMARK_PART:
                 self.landmarks = LandmarkEncoder(count_columns(part), self.width, network.dropout)
-            elif part in POINTS:
-                self.parts[part] = YawAverage(POINTS[part](self.width), geometry.yaws, geometry.canonical)
+            elif encoder := find_crop_encoder(part):
+                self.parts[part] = GEOMETRIES[encoder](self.width)
+            elif part in GEOMETRIES:
+                self.parts[part] = YawAverage(GEOMETRIES[part](self.width), geometry.yaws, geometry.canonical)
             elif part == DOOR_PART:
                 self.parts[part] = DoorsEncoder(self.width, network.dropout)
             elif part in CROP_SHAPES:

@@ -55,7 +55,7 @@ class Truth:
         same: (N, N) bool, the two are one true room, in the two maps of a pair.
         piece: (N, N) bool, the two are of one true room in one map.
         clear: (N,) bool, both maps have most of the room; or it has no partner, and its map has most of it.
-    building: (N,) int64, a number of the physical building that a room is in.
+        building: (N,) int64, a number of the physical building that a room is in.
     """
 
     pair: Tensor

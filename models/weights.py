@@ -32,6 +32,7 @@ from topomerge.embedding.learned import (
 )
 from topomerge.embedding.network import build_embedder_signature
 from topomerge.errors import InputError
+from topomerge.networks.network import read_checked_bytes
 
 if TYPE_CHECKING:
     from topomerge.embedding.learned import LearnedEmbedder
@@ -85,6 +86,7 @@ def read_embedder(path: str | Path | None = None) -> tuple[Embedder, dict[str, A
     if folder is not None:
         return read_state(folder)
     card = read_embedder_card(find_embedder(path))
+    read_checked_bytes(card.path, card.digest)
     network = Embedder(card.network)
     unread = {"log_temperature": torch.tensor(card.temperature).log()}  # what no output depends on is not in the file
     read = {name.removeprefix("network."): value for name, value in read_weights(card.path).items()}  # those of `Ordered`

@@ -215,14 +215,14 @@ def test_the_files_of_extend_work_as_they_stand(tmp_path: Path) -> None:
     pytest.importorskip("hydra")
     text = (ROOT / "docs" / "extend.md").read_text()
     added = re.findall(r"\*\*One YAML\*\*, `configs/(\w+)/(\w+)\.yaml`.*?```yaml\n(.*?)```", text, re.DOTALL)
-    assert len(added) == text.count("```yaml") == 7
+    assert len(added) == text.count("```yaml") == 9
     for group, name, block in added:
         (tmp_path / "configs" / group).mkdir(parents=True, exist_ok=True)
         (tmp_path / "configs" / group / f"{name}.yaml").write_text(block)
     files = re.findall(r"\*\*One file\*\*, `(?:\w+/)*(\w+)\.py`.*?```python\n(.*?)```", text, re.DOTALL)
     for name, block in files:
         (tmp_path / f"{name}.py").write_text(block)
-    plugins = ["extent", "transformer", "alignment", "descent", "lines", "area", "twins"]
+    plugins = ["extent", "patches", "transformer", "alignment", "descent", "small_first", "lines", "area", "twins"]
     assert sorted(name for name, _ in files) == sorted([*plugins, "outline", "mine"])
     script = (
         "import importlib; from topomerge.training.tasks import compose_settings as c, train\n"
@@ -231,10 +231,13 @@ def test_the_files_of_extend_work_as_they_stand(tmp_path: Path) -> None:
         f"s = c(['plugins=[{','.join(plugins)}]', 'geometry=extent', 'node=transformer', 'loss=alignment',"
         " 'experiment=descent', 'data=twins', 'path=.']); check(s)\n"
         "print(s.network.geometry.parts, s.network.node.kind, s.loss.options, s.optimizer, s.schedule, s.data)\n"
+        f"s = c(['plugins=[{','.join(plugins)}]', 'geometry=patches', 'experiment=small_first', 'data=twins', 'path=.'])\n"
+        "print(s.network.geometry.parts, s.network.turns, s.sampler)\n"
         "train(c(['plugins=[area,lines]', 'task=area', 'experiment=told', 'epochs=1']), print)"
     )
     done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300)
-    assert done.stdout.startswith("['extent'] transformer {'spread': 0.5} nadam halved twins\nepoch 1/1 "), done.stderr
+    assert done.stdout.startswith("['extent'] transformer {'spread': 0.5} nadam halved twins\n"), done.stderr
+    assert "\n['scalars', 'surroundings:patches'] 4 small_first\nepoch 1/1 " in done.stdout
     assert " rectangles/s" in done.stdout and (tmp_path / "runs" / "area" / "lines.txt").is_file()
 
 

@@ -128,9 +128,11 @@ def _shorten_error(error: Exception) -> str:
 
 
 def name_by_sweep(arguments: Sequence[str]) -> list[str]:
-    """Return the words of `train.py`; of a sweep with one more, by which names of runs hold what differs between them only."""
+    """Return the words of `train.py`; of a sweep with its flag first, as Hydra takes no words on both sides of it, and with one
+    more, by which names of runs hold what differs between them only."""
     if not {"-m", "--multirun"} & set(arguments):
         return list(arguments)
+    arguments = ["-m", *(word for word in arguments if word not in ("-m", "--multirun"))]
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 

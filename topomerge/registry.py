@@ -1,5 +1,5 @@
 """Registries of parts that can be swapped by name, and added from outside of the package: encoders, losses, optimizers,
-schedules, loggers, sets, tasks.
+schedules, samplers, loggers, sets, tasks.
 
 A registry knows what ships, what packages that are installed announce (entry points of its group, such as ``topomerge.losses``),
 and what a module registered that was imported, such as one that ``plugins=[my_package.my_module]`` names:
@@ -139,7 +139,7 @@ def _shorten(error: Exception) -> str:
 
 
 NODES = Registry("node.kind", "nodes", sage="topomerge.models.nodes:build_sage", gat="topomerge.models.nodes:build_gat")
-POINTS = Registry(
+GEOMETRIES = Registry(
     "geometry.parts",
     "geometries",
     pointnet="topomerge.models.geometry:PointNet",
@@ -159,6 +159,12 @@ SCHEDULES = Registry(
     "schedules",
     cosine="topomerge.training.descent:warmup_cosine",
     constant="topomerge.training.descent:warmup_constant",
+)
+SAMPLERS = Registry(
+    "sampler",
+    "samplers",
+    shuffle="topomerge.training.samplers:shuffle_pairs",
+    buildings="topomerge.training.samplers:balance_buildings",
 )
 NO_LOGGER = "none"
 LOGGERS = Registry(
@@ -180,9 +186,8 @@ TASKS = Registry(
             name: f"topomerge.training.{name}:TASK"
             for name in (
                 "drawing_segmentation", "door_classification", "wall_segmentation",
-                "passages", "wall_doors", "room_odds", "feature_scale", "match_odds",
-                "place_evidence", "match_belief", "merge_belief", "embedding", "room_matcher", "radio_law",
-                "locate_odds",
+                "passages", "wall_doors", "room_odds", "embedding", "room_matcher", "feature_scale", "match_odds",
+                "place_evidence", "match_belief", "merge_belief", "radio_law", "locate_odds",
             )
         },
     },

@@ -23,8 +23,9 @@ from topomerge.embedding.quarter_turns import TurnedRows, join_rooms
 from topomerge.embedding.sheets import build_sheet_arrays
 from topomerge.embedding.surroundings import CROP_SHAPES
 from topomerge.errors import InputError
+from topomerge.fusion.pipeline import merge
 from topomerge.networks.network import card_of
-from topomerge.registry import NODES
+from topomerge.registry import GEOMETRIES, NODES
 from topomerge.types import build_landmarks
 
 ROOT = Path(__file__).parent.parent.parent
@@ -194,6 +195,41 @@ def test_a_node_encoder_of_somebody_else_trains_is_exported_and_loads(torch, tmp
     compare(ours, made, graphs())
     assert ours.network.node.kind == kind and ours.about["loss"] == "infonce"
     with pytest.raises(InputError, match=f"node.kind: unknown '{kind}'"):
+        read_embedder(tmp_path / "run")
+    merged = merge([building(2, origin=(x, -3.0, 0.5)) for x in (2.0, 4.0)], embedder=ours)
+    assert len(merged.maps) == 2
+
+
+@pytest.mark.longer
+def test_a_geometry_encoder_of_crops_of_somebody_else_trains_is_exported_loads_and_merges(torch, tmp_path, monkeypatch):
+    from topomerge.models.weights import read_embedder
+
+    from tests.graphs import write_set
+    from topomerge.training.embedding import fit
+    from topomerge.training.settings import Training
+
+    class Patches(torch.nn.Module):
+        def __init__(self, width: int) -> None:
+            super().__init__()
+            self.each = torch.nn.Conv2d(CROP_SHAPES["surroundings"][-1], width, 16, 16)
+
+        def forward(self, crops):
+            return self.each(crops.permute(0, 3, 1, 2).float() / 255).relu().flatten(2).mean(dim=2)
+
+    write_set(tmp_path, "some", 6)
+    with monkeypatch.context() as registered:
+        registered.setitem(GEOMETRIES._registered, "patches", Patches)
+        network = Network(Geometry(["scalars", "surroundings:patches"], width=16), Node("gat", 1, width=8, ways=True), size=8)
+        common = {"runs": str(tmp_path), "cache": str(tmp_path), "data": "some", "validation": "", "logger": []}
+        assert np.isfinite(fit(Training(**common, epochs=2, batch=2, network=network), lambda text: None)["train/loss"])
+        made, _ = read_embedder(tmp_path / "run")
+        made.eval()
+    ours, map = load_embedder(tmp_path / "run"), building(2, 2)
+    compare(ours, made, graphs())
+    assert not ours.needs_points and isinstance(ours(map), TurnedRows) and len(ours(map)) == len(map.rooms)
+    merged = merge([building(2, origin=(x, -3.0, 0.5)) for x in (2.0, 4.0)], embedder=ours)
+    assert len(merged.maps) == 2
+    with pytest.raises(InputError, match=r"^geometry.parts: unknown 'patches'; pointnet, "):
         read_embedder(tmp_path / "run")
 
 

@@ -20,12 +20,14 @@ from tests.cases import list_longer
 from tests.graphs import write_set
 from tests.matching.turned_maps import turned
 from tests.scenes_map import building
+from topomerge.archive import find_weights_file
 from topomerge.cli.main import main as cli
-from topomerge.embedding.learned import load_embedder
+from topomerge.embedding.learned import load_embedder, read_embedder_card
 from topomerge.embedding.network import Geometry, Network, Node
 from topomerge.errors import InputError
 from topomerge.io.maps import save_map
-from topomerge.training import finetuning
+from topomerge.networks.network import WEIGHTS_PACKAGE, card_of
+from topomerge.training import finetuning, room_matcher
 from topomerge.training.embedding import EmbeddingJob, adopt_network, fit
 from topomerge.training.finetuning import judge
 from topomerge.training.settings import Training, check
@@ -100,6 +102,17 @@ def test_another_network_is_refused_by_name(settings: Training, tmp_path: Path) 
     assert adopt_network(compose_settings(["init_from=pretrained"])).network == read_embedder()[0].network
     with pytest.raises(InputError, match="init_from=.*nowhere.*No such file"):
         fit(replace(settings, init_from=str(tmp_path / "nowhere")), quiet)
+
+
+@pytest.mark.parametrize("name", ["embedder.onnx", "plan_network.onnx"])
+def test_a_start_that_is_not_what_its_card_says_is_refused(settings: Training, tmp_path: Path, name: str) -> None:
+    """Cut off, or another network under its name: neither a traceback, nor random weights in the place of what is missing."""
+    shipped = find_weights_file(WEIGHTS_PACKAGE, name)
+    (tmp_path / "embedder.onnx").write_bytes(shipped.read_bytes()[: 100_000 if name == "embedder.onnx" else None])
+    shutil.copy(card_of(find_weights_file(WEIGHTS_PACKAGE, "embedder.onnx")), tmp_path)
+    with pytest.raises(InputError, match=r"embedder.onnx: cut off, damaged, or not the network that its card is about") as raised:
+        fit(replace(settings, init_from=str(tmp_path)), quiet)
+    assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(
@@ -220,7 +233,8 @@ def test_finetune_keeps_what_helped(folder: Path, tmp_path: Path, monkeypatch, c
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--rate", "0"], "rate must be above 0"),
+        (["--rate", "0"], "--rate: must be a number above 0, not '0'"),
+        (["--rate", "nan"], "--rate: must be a number above 0, not 'nan'"),
         (["--from", "nowhere"], "init_from=nowhere"),
         (["--replay", "1"], "replay must be"),
     ],
@@ -254,3 +268,16 @@ def test_a_run_on_own_pairs_goes_on_and_other_pairs_are_refused(folder: Path, tm
     (folder / "pairs.yaml").write_text(yaml.safe_dump(values))
     with pytest.raises(InputError, match="holds other pairs than when the run began"):
         fit(replace(run, epochs=3, resume=True), quiet)
+
+
+@pytest.mark.longer
+def test_a_matcher_reads_rows_of_the_embedder_that_is_named(tmp_path: Path) -> None:
+    for name, node in (("turned", Node("gat", 1, width=8, ways=True)), ("plain", Node("none"))):
+        export_embedder(Embedder(Network(Geometry(["scalars"], width=8), node, size=8)).eval(), tmp_path / name, {})
+    network, digest = room_matcher.load_turned_embedder(str(tmp_path / "turned"))
+    assert network.network.size == 8
+    assert digest == read_embedder_card(tmp_path / "turned").digest != room_matcher.load_turned_embedder("pretrained")[1]
+    with pytest.raises(InputError, match=r"^embedder=.*plain: tells no turns apart, as the matcher needs"):
+        room_matcher.load_turned_embedder(str(tmp_path / "plain"))
+    with pytest.raises(InputError, match=r"nowhere/embedder.onnx: No such file"):
+        room_matcher.load_turned_embedder(str(tmp_path / "nowhere"))

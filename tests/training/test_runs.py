@@ -179,6 +179,7 @@ def test_the_scripts_of_a_second_clone_say_so(tmp_path, script):
 def test_names_of_the_runs_of_a_sweep_hold_what_differs():
     words = ["-m", "data=some", "node=none,gat", "loss.easy=0.5", "seed=0,1", "hydra/launcher=joblib", "resume=true"]
     assert name_by_sweep(words) == [*words, "hydra.job.config.override_dirname.exclude_keys=[data,loss.easy,resume]"]
+    assert name_by_sweep([words[1], "--multirun", *words[2:]]) == name_by_sweep(words)  # Hydra takes no words on both sides of it
     assert name_by_sweep(["data=some", "node=gat"]) == ["data=some", "node=gat"]
     with pytest.raises(InputError):
         name_by_sweep(["-m", "node=[none"])

@@ -23,16 +23,14 @@ def test_steps_run_in_order_and_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(weights, "make_task", make)
     assert weights.main([f"runs={tmp_path}"]) == 130
     scans = ["plan_segmentation", "grid_segmentation", "drawing_segmentation", "door_classification", "wall_segmentation"]
-    scans += ["passages", "wall_doors", "room_odds"]
+    scans += ["passages", "wall_doors", "room_odds", "embedding", "room_matcher"]
     assert made == [*scans, "feature_scale", "match_odds"]
     assert "in all about" in capsys.readouterr().err
-    assert weights.main([f"runs={tmp_path}"]) == 0 and made[10:] == [
+    assert weights.main([f"runs={tmp_path}"]) == 0 and made[12:] == [
         "match_odds",
         "place_evidence",
         "match_belief",
         "merge_belief",
-        "embedding",
-        "room_matcher",
         "radio_law",
         "locate_odds",
     ]
@@ -51,5 +49,10 @@ def test_each_step_is_a_task_with_its_words(tmp_path: Path, monkeypatch: pytest.
     sets, settings = [a.data.name for a in asked if not hasattr(a, "task")], [a for a in asked if hasattr(a, "task")]  # type: ignore[attr-defined]
     assert sets == ["train_walks", "val_small"] and [s.task for s in settings] == list(TASKS)
     embedding = settings[list(TASKS).index("embedding")]
-    assert embedding.epochs == 12 and embedding.network.node.around == 10 and settings[0].jobs == 2
+    assert (
+        embedding.epochs == 12
+        and embedding.precision == "bf16-mixed"
+        and embedding.network.node.around == 10
+        and settings[0].jobs == 2
+    )
     assert all(s.cache == str(tmp_path) and s.export == "" and s.name == s.task for s in settings)

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from topomerge.cli.console import Command, build_option, print_line, print_text
-from topomerge.cli.options import build_quiet_option, collect_given, parse_count, parse_share, parse_whole_number
+from topomerge.cli.options import build_quiet_option, collect_given, parse_count, parse_positive, parse_share, parse_whole_number
 from topomerge.errors import InputError
 
 
@@ -126,7 +126,7 @@ FINETUNE = Command(
         build_option("-o", "--output", required=True, metavar="OUT", default=None, help="folder for embedder.onnx and the run"),
         build_option("--from", dest="init_from", metavar="EMBEDDER", help="a run or an embedder (default: the one that ships)"),
         build_option("--epochs", type=parse_count, metavar="N", help="over the pairs (default 6)"),
-        build_option("--rate", type=float, metavar="R", help="of learning (default 2e-4)"),
+        build_option("--rate", type=parse_positive, metavar="R", help="of learning (default 2e-4)"),
         build_option("--batch", type=parse_count, metavar="N", help="pairs a step (default 8)"),
         build_option("--freeze", choices=("geometry", "encoders"), help="what stays as it is"),
         build_option("--replay", type=parse_share, metavar="S", help="share of pairs from the set of --replay-data (default 0)"),

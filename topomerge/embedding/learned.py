@@ -28,7 +28,14 @@ from topomerge.embedding.graph import (
     count_columns,
     rescale_graph,
 )
-from topomerge.embedding.network import LANDMARK_PART, Network, build_embedder_signature, build_network, list_tensors
+from topomerge.embedding.network import (
+    LANDMARK_PART,
+    Network,
+    build_embedder_signature,
+    build_network,
+    find_tensor,
+    list_tensors,
+)
 from topomerge.embedding.quarter_turns import (
     Descriptor,
     Rows,
@@ -285,7 +292,7 @@ class LearnedEmbedder:
     @property
     def needs_points(self) -> bool:
         """Does the network read the points of rooms, or what is reckoned from them?"""
-        return bool(set(self.network.geometry.parts) - {"scalars", LANDMARK_PART, *CROP_SHAPES})
+        return bool({find_tensor(part) for part in self.network.geometry.parts} - {"x", LANDMARK_PART, *CROP_SHAPES})
 
     def build_views(self, map: TopometricMap) -> list[dict[str, Array]]:
         """Build the arrays of a map that `embed_graph` takes, in each direction of its walls, the first one first."""

@@ -11,7 +11,7 @@ from topomerge.embedding.graph import POINTS_PER_ROOM, TABLES
 from topomerge.embedding.surroundings import CROP_SHAPES
 from topomerge.errors import InputError
 from topomerge.networks.network import Signature, Tensor
-from topomerge.registry import NODES, POINTS
+from topomerge.registry import GEOMETRIES, NODES
 
 LANDMARK_PART = "landmarks"  # is added to what the other parts say: a room without landmarks stays as it is, to the bit
 # Part -> table of the graph that it reads.
@@ -27,7 +27,7 @@ class Geometry:
     """Room -> vector.
 
     Args:
-        parts: of `list_geometry_parts`; several are concatenated.
+        parts: of `list_geometry_parts`, or an encoder of one's own of crops, as `surroundings:mine`; several are concatenated.
         width: of the vector.
         yaws: turns over which an encoder of points takes the mean.
         canonical: turn the longest axis into x first.
@@ -85,17 +85,25 @@ class Network:
     @property
     def turns(self) -> int:
         """1, or 4 where what a room gets depends on how the map is turned: it gets a row for each quarter turn then."""
-        return 4 if CROP_SHAPES.keys() & set(self.geometry.parts) or (self.node.ways and self.node.kind != "none") else 1
+        turned = any(find_tensor(part) in CROP_SHAPES for part in self.geometry.parts)
+        return 4 if turned or (self.node.ways and self.node.kind != "none") else 1
 
 
 def list_geometry_parts() -> tuple[str, ...]:
-    """Return what a geometry can be made of: tables, encoders of points (`topomerge.registry.POINTS`) and of surroundings."""
-    return (*TABLE_PARTS, *POINTS, *CROP_SHAPES)
+    """Return what a geometry can be made of: tables, encoders of points (`topomerge.registry.GEOMETRIES`) and of surroundings."""
+    return (*TABLE_PARTS, *GEOMETRIES, *CROP_SHAPES)
 
 
 def find_tensor(part: str) -> str:
     """Return the tensor of the graph that a part of the geometry reads."""
-    return part if part in CROP_SHAPES else TABLE_PARTS.get(part, "room_points")
+    crops = part.partition(":")[0]
+    return crops if crops in CROP_SHAPES else TABLE_PARTS.get(part, "room_points")
+
+
+def find_crop_encoder(part: str) -> str:
+    """Return the registered encoder that a part such as `surroundings:mine` names; empty where it names none."""
+    crops, _, encoder = part.partition(":")
+    return encoder if crops in CROP_SHAPES else ""
 
 
 def list_pair_tensors(node: Node) -> tuple[str, ...]:
@@ -146,7 +154,9 @@ def check(network: Network) -> None:
         InputError: names the key.
     """
     for part in network.geometry.parts:
-        if not isinstance(part, str) or part not in (possible := list_geometry_parts()):
+        if isinstance(part, str) and (encoder := find_crop_encoder(part)):
+            GEOMETRIES.check(encoder)
+        elif not isinstance(part, str) or part not in (possible := list_geometry_parts()):
             raise InputError(f"geometry.parts: unknown {part!r}; {', '.join(possible)} are possible")
     if network.node.kind not in ("none", *NODES):
         raise InputError(f"node.kind: unknown {network.node.kind!r}; none, {', '.join(NODES)} are possible")

@@ -177,7 +177,7 @@ def open_network(path: Path, digest: str, signature: Signature, card: Mapping[st
     options.enable_cpu_mem_arena = False  # it would keep the memory of the largest plan for good
     options.use_deterministic_compute = True
     try:
-        session = onnxruntime.InferenceSession(_checked_bytes(path, digest), options, providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(read_checked_bytes(path, digest), options, providers=["CPUExecutionProvider"])
     except InputError:
         raise
     except Exception as error:  # ONNX Runtime has a dozen kinds
@@ -196,8 +196,12 @@ def open_network(path: Path, digest: str, signature: Signature, card: Mapping[st
     return Network(session, signature, path, card)
 
 
-def _checked_bytes(path: Path, digest: str) -> bytes:
-    """Return the bytes of a file, if they are those of its card."""
+def read_checked_bytes(path: Path, digest: str) -> bytes:
+    """Read the bytes of a file, if they are those of its card.
+
+    Raises:
+        InputError: no such file, cut off, damaged, or another one.
+    """
     try:
         if path.stat().st_size > LARGEST_FILE:
             raise InputError(f"{path}: has more than {LARGEST_FILE >> 20} MB, no network is as large; copy both files again")

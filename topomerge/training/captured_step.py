@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from topomerge.embedding.network import find_crop_encoder
 from topomerge.models.losses import Truth
 from topomerge.training.settings import Training
 
@@ -50,7 +51,9 @@ def _round_up(count: float) -> int:
 
 def can_capture(settings: Training, fabric: Any, optimizer: torch.optim.Optimizer) -> bool:
     """Tell whether steps of a training can run as graphs: on one card, and with nothing whose shape depends on values."""
-    known = settings.loss.kind in CAPTURED_LOSSES and settings.network.node.kind in CAPTURED_NODES
+    network = settings.network
+    known = settings.loss.kind in CAPTURED_LOSSES and network.node.kind in CAPTURED_NODES
+    known = known and not any(find_crop_encoder(part) for part in network.geometry.parts)
     alone = fabric.device.type == "cuda" and fabric.world_size == 1
     scaled = getattr(fabric.strategy.precision, "scaler", None) is not None
     capturable = optimizer.defaults.get("capturable", False)

@@ -39,6 +39,7 @@ from topomerge.training.loop import (
 from topomerge.training.packed_pairs import EXTRAS, GraphPair, hold_out, load_pairs
 from topomerge.training.processes import FabricProcesses, find_precision, start_fabric
 from topomerge.training.run_folder import MetricsLog, begin_run, compare_settings, describe_provenance, export_files
+from topomerge.training.samplers import draw_pairs
 from topomerge.training.settings import (
     FREEZE,
     VALIDATION,
@@ -186,8 +187,8 @@ class EmbeddingJob:
         return AugmentedPairs(self.train, names, self.augment, lambda pair: pair)
 
     def _draw_order(self, generator: torch.Generator) -> list[int]:
-        """Draw the pairs of an epoch: all of one's own, and those that are drawn for replay, with replacement, among them."""
-        order = torch.randperm(self.own, generator=generator)
+        """Draw the pairs of an epoch: those of one's own by the sampler, and those for replay, with replacement, among them."""
+        order = draw_pairs(self.settings.sampler, self.train[: self.own], generator)
         if self.drawn:
             replayed = torch.randint(self.own, len(self.train), (self.drawn,), generator=generator)
             order = torch.cat([order, replayed])[torch.randperm(self.own + self.drawn, generator=generator)]
@@ -430,8 +431,8 @@ TASK = Task(
     lower=("loss",),
     package=WEIGHTS_PACKAGE,
     file="embedder.onnx",
-    hours=0.6,
-    words=("experiment=surroundings",),
+    hours=4.5,  # two of them for the sets; by the rate of an epoch, not measured as a whole
+    words=("experiment=surroundings", "precision=bf16-mixed"),  # as the model card says
     sets=("train_walks", "val_small"),
     schema=build_recipe_schema,
     convert=convert_composed,

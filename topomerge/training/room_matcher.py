@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from topomerge.embedding.learned import read_embedder_card
+from topomerge.embedding.learned import find_embedder, read_embedder_card
 from topomerge.embedding.quarter_turns import QUARTERS, TurnedRows, compute_room_features, rotate_to_walls
 from topomerge.errors import InputError
 from topomerge.matching.assignment import assign_certain, count_pairs, has_twin, rank_partners
@@ -242,11 +242,11 @@ def fit(settings: RoomMatching, log_line: LogFn) -> dict[str, float]:
     """Train, and leave a run's folder; the scores of the best epoch.
 
     Raises:
-        InputError: no pairs, or the embedder that ships has no rows for turns.
+        InputError: no pairs, or the embedder has no rows for turns.
     """
     with let_main_process_first(settings):
         settings = with_own_sets(settings, log_line)
-    network, embedder = load_shipped_embedder()
+    network, embedder = load_turned_embedder(settings.embedder)
     learned = read_examples(settings, settings.data.name, network, settings.views, log_line)
     watched = read_examples(settings, settings.validation, network, 0, log_line)
     torch.manual_seed(derive_seed(settings.seed))
@@ -258,7 +258,7 @@ def fit(settings: RoomMatching, log_line: LogFn) -> dict[str, float]:
 def judge(settings: RoomMatching, file: Path, log_line: LogFn) -> dict[str, Any]:
     """Return scores of weights on pairs of buildings that trained nothing."""
     settings = with_own_sets(settings, log_line)
-    network, _ = load_shipped_embedder()
+    network, _ = load_turned_embedder(settings.embedder)
     watched = read_examples(settings, settings.heldout.name, network, 0, log_line)
     return {**score_matcher(watched, read_matcher(file)), "pairs": len(watched)}
 
@@ -280,16 +280,19 @@ def with_own_sets(settings: RoomMatching, log_line: LogFn) -> RoomMatching:
     return replace(settings, data=data, heldout=heldout, validation=val)
 
 
-def load_shipped_embedder() -> tuple[Embedder, str]:
-    """Load the embedder that ships, and its hash.
+def load_turned_embedder(embedder: str) -> tuple[Embedder, str]:
+    """Load an embedder, and its hash.
+
+    Args:
+        embedder: as of `embedding.learned.find_embedder`.
 
     Raises:
-        InputError: it has no rows for turns.
+        InputError: there is none, or it has no rows for turns.
     """
-    network, _ = read_embedder()
+    network, _ = read_embedder(find_embedder(embedder))
     if network.network.turns == 1:
-        raise InputError("task=room_matcher: the embedder that ships tells no turns apart; train experiment=surroundings")
-    return network, read_embedder_card().digest
+        raise InputError(f"embedder={embedder}: tells no turns apart, as the matcher needs; train experiment=surroundings")
+    return network, read_embedder_card(embedder).digest
 
 
 def read_examples(settings: RoomMatching, name: str, network: Embedder, number: int, log_line: LogFn) -> list[MatcherExample]:

@@ -14,7 +14,7 @@ from topomerge.embedding.network import check as check_network
 from topomerge.errors import InputError
 from topomerge.models.losses import LossSettings
 from topomerge.models.losses import check as check_loss
-from topomerge.registry import DATASETS, LOGGERS, NO_LOGGER, OPTIMIZERS, SCHEDULES, load_plugins
+from topomerge.registry import DATASETS, LOGGERS, NO_LOGGER, OPTIMIZERS, SAMPLERS, SCHEDULES, load_plugins
 
 
 def check_numbers(settings: Mapping[str, Any], above: str = "") -> None:
@@ -266,6 +266,7 @@ class Training(NetworkSettings):
         geometry_from: run whose geometry encoder is the start.
         freeze: of `FREEZE`, what keeps the weights that it starts from: `geometry`, or `encoders`, all but the last layers.
         replay: share of the pairs of an epoch that are drawn from the set `replay_data`, so that what it taught is not forgotten.
+        sampler: of `topomerge.registry.SAMPLERS`, which draws the pairs of an epoch.
         overfit: train on one batch, without augmentation, and validate on it.
         threads: that make batches, of each process; beside an accelerator as many as there are cores.
         accelerator: of `ACCELERATORS`.
@@ -297,6 +298,7 @@ class Training(NetworkSettings):
     freeze: str = ""
     replay: float = 0.0
     replay_data: str = REPLAYED
+    sampler: str = "shuffle"
     overfit: bool = False
     network: Network = field(default_factory=Network)
     loss: LossSettings = field(default_factory=LossSettings)
@@ -336,6 +338,7 @@ def check(settings: Training) -> None:
             raise InputError(f"{key}: unknown {getattr(settings, key)!r}; {', '.join(possible)} are possible")
     if settings.precision == "16-mixed" and settings.accelerator == "cpu":
         raise InputError("precision=16-mixed needs accelerator=cuda; a processor takes bf16-mixed or 32-true")
+    SAMPLERS.check(settings.sampler)
     if settings.freeze not in FREEZE:
         raise InputError(f"freeze: unknown {settings.freeze!r}; {' or '.join(filter(None, FREEZE))}, or nothing, are possible")
     if settings.init_from and settings.geometry_from:

@@ -136,6 +136,7 @@ class RoomMatching(NetworkTask):
         data: name of a set of pairs (`cache`/<name>.jsonl) or a manifest, and validation the one that is watched, as of
             `embedding`.
         path: of ``data=folder``, as of `embedding`; ``evaluate.py task=room_matcher`` judges by the pairs of its test.
+        embedder: whose rows it reads: `pretrained`, a run or a file.
         views: of each map that are changed, beside the one that is as it is.
         width: numbers of a room within the network; layers: of attention.
         without: parts that are left out (`models.room_matcher.MATCHER_PARTS`): votes, ways, facts, within, across.
@@ -149,6 +150,7 @@ class RoomMatching(NetworkTask):
     heldout: Recipe = field(default_factory=Recipe)
     validation: str = "val_small"
     path: str = ""
+    embedder: str = "pretrained"
     views: int = 5
     width: int = 96
     layers: int = 3
