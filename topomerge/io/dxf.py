@@ -90,8 +90,8 @@ def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
     drawing = ParsedDrawing(masks.occupied, masks.free, masks.door, nothing, nothing.astype(np.float32), 1.0)
     warnings = tuple(f"{path.name}: {text}" for text in (*notes, *far, *coarse, *masks.warnings))
     traced = TracedDrawing(drawing, pixel, texts, warnings)
-    at = {"corner": masks.corner, "unit": options.factor}
-    yield from build_drawn_pieces(path, traced, options, options.page, **at, untitled=False)
+    where = masks.corner
+    yield from build_drawn_pieces(path, traced, options, options.page, corner=where, unit=options.factor, untitled=False)
 
 
 def place_text(text: PictureText, corner: tuple[float, float], pixel: float, rows: int) -> PictureText:
