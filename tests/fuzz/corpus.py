@@ -101,7 +101,7 @@ def read_plan(path: Path) -> int:
     from topomerge.io import drawing, dxf, pdf, svg
 
     drawing.parse_drawing = parse_dark_lines
-    drawing.load_text_reader = lambda: None
+    drawing.load_text_reader = lambda **_: None
     here = {"dxf": dxf, "pdf": pdf, "svg": svg}
     for module in here.values():
         module.read_in_subprocess = lambda name, _kind, path, options, *_: here[name].read_in_process(path, options)

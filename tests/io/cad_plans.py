@@ -108,7 +108,8 @@ def write_flat(
         attributes = {"xscale": width / unit, "yscale": WALL / unit, "rotation": turn}
         model.add_blockref(names[2], place(x, y), dxfattribs=attributes)
     for name, (x, y, w, h) in ROOMS.items():
-        model.add_mtext(f"{name}\n{w * h:.1f} m2", dxfattribs={"insert": place(x + w / 2, y + h / 2), "char_height": 0.2 / unit})
+        middle = {"insert": place(x + w / 2, y + h / 2), "attachment_point": 5}
+        model.add_mtext(f"{name}\n{w * h:.1f} m2", dxfattribs={**middle, "char_height": 0.2 / unit})
     if more.get("sheet"):
         model.add_lwpolyline([place(*p) for p in ((-3, -3), (14, -3), (14, 11), (-3, 11))], close=True, dxfattribs={"layer": "0"})
         model.add_circle(place(7.0, 2.0), 0.5 / unit, dxfattribs={"layer": "MOEBEL"})

@@ -1,8 +1,10 @@
 """Drawn floor plans: what is page, wall and floor, and what the texts on them say."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 from scipy import ndimage
 from topomerge.datasets.drawings.hands import draw_plan
 from topomerge.datasets.drawings.pages import spoil_page
@@ -11,10 +13,10 @@ from topomerge.datasets.drawings.sheet import Hand, load_font
 
 from tests.cases import list_longer
 from topomerge.extraction.extract import extract
-from topomerge.io.drawing import choose_zoom, estimate_scale, find_structure
+from topomerge.io.drawing import choose_zoom, estimate_scale, find_structure, read_texts, select_lost_areas
 from topomerge.io.drawn_page import find_page
 from topomerge.io.points import read_points
-from topomerge.io.written_lengths import PictureText, find_name, parse_lengths
+from topomerge.io.written_lengths import PictureText, find_name, parse_lengths, parse_lost_area
 from topomerge.networks.drawing import DRAWING_CLASSES, compute_drawing_probabilities
 
 PLAIN = Hand("filled", (0, 0, 0), 0.25, 0.1, 2, False, "arc", "lines", 0.0, 0.0, 1.0, "m2", False, 3, 0.3)
@@ -104,6 +106,12 @@ def test_a_courtyard_is_page():
         ("10-1 x 11-1", None, None),
         ("112 SF", 112 * 0.3048**2, None),
         ("12.3 m 2", 12.3, None),
+        ("14.5 ma", 14.5, None),
+        ("14.5 ml", 14.5, None),
+        ("14.5 max", None, None),
+        ("1,200 sq ft", 1200 * 0.3048**2, None),
+        ("12,5 m²", 12.5, None),
+        ("12'6½\" x 9'", None, (12 * 0.3048 + 6 * 0.0254, 9 * 0.3048)),
         ("KITCHEN", None, None),
         ("2.113", None, None),
         ("0.001 m²", None, None),
@@ -157,6 +165,29 @@ def test_a_text_of_another_room_is_outvoted_and_doors_are_the_last_resort():
     assert estimate_scale(parsed, [*texts, wrong]).resolution == pytest.approx(1 / 30, rel=0.04)
     by_doors = estimate_scale(parsed, [])
     assert not by_doors.written and by_doors.resolution == pytest.approx(1 / 30, rel=0.2) and by_doors.spread > 0.1
+
+
+def test_areas_that_lost_their_squares_give_the_scale_and_lengths_do_not():
+    drawing = draw(Hand(**{**vars(PLAIN), "names": 0.0}))
+    parsed = find_structure(one_hot(drawing.classes), 1.0, None)
+    lengths = [replace(text, text=length) for text, length in zip(texts_of(drawing), ("8.00 m", "4.00 m", "3.90 m"), strict=True)]
+    doors = estimate_scale(parsed, lengths)
+    assert not doors.written
+    areas = [parse_lost_area(text) for text in ("13.4 m", "12:6 m", "7.1m", "22,5 m", "6.0 m")]
+    assert areas == [13.4, 12.6, 7.1, 22.5, 6.0] and parse_lost_area("6 m x 5.0 m") is None
+    true = doors.resolution * 1.05
+    lost = [(true, f"{area} m", area) for area in areas[:4]] + [(2 * true, "6.0 m", 6.0)]
+    assert select_lost_areas(lost, doors, 1.0) == [row[:2] for row in lost[:4]]
+    assert not select_lost_areas(lost[:2], doors, 1.0) and not select_lost_areas(lost, doors, 3.0)
+
+
+@pytest.mark.parametrize("turns", [1, 3])
+def test_upright_texts_are_read_from_below_and_from_above(turns):
+    pytest.importorskip("rapidocr_onnxruntime", exc_type=ImportError)
+    page = Image.new("RGB", (600, 200), "white")
+    ImageDraw.Draw(page).text((200, 80), "Kitchen", "black", ImageFont.load_default(40))
+    (text,) = read_texts(np.rot90(np.array(page), turns))
+    assert text.text == "Kitchen" and text.height == pytest.approx(45, rel=0.3)
 
 
 def write_row(texts, step, start=(100.0, 40.0), upright=False, height=10.0):

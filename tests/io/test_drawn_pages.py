@@ -1,6 +1,7 @@
 """Pages of drawings as pictures show them: on tables and screens, tilted, in shade, light on dark, several plans on a sheet."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,13 +13,23 @@ from tests.io.test_drawings import draw, draw_case
 from topomerge.errors import InputError
 from topomerge.evaluation.drawings import straighten_truth
 from topomerge.extraction.extract import extract
-from topomerge.io.drawing import ParsedDrawing, TracedDrawing, build_stairs_landmarks, find_treads, is_plan, parse_drawing
+from topomerge.io.drawing import (
+    ParsedDrawing,
+    TracedDrawing,
+    build_stairs_landmarks,
+    find_structure,
+    find_treads,
+    is_plan,
+    parse_drawing,
+    trace_drawing,
+)
 from topomerge.io.drawn_page import DrawnPage, compute_levels, find_homography, find_page, move_places
 from topomerge.io.drawn_storeys import correlate_masks, find_storeys, parse_storey
-from topomerge.io.grid import build_drawn_pieces, count_pages, read_picture
+from topomerge.io.grid import build_drawn_pieces, count_pages, read_paper, read_picture
 from topomerge.io.piece import ReadOptions
 from topomerge.io.points import read_points
 from topomerge.io.written_lengths import PictureText
+from topomerge.networks.drawing import DRAWING_CLASSES
 
 SHEET = 842, 595  # px, of A4
 
@@ -229,6 +240,42 @@ def test_a_page_with_nothing_on_it(tmp_path, name):
     Image.new("RGB", (400, 300), (250, 250, 246)).save(tmp_path / name)
     with pytest.raises(InputError, match=f"{name}: nothing is drawn on it$"):
         read_points(tmp_path / name, resolution=0.02, text=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "dots", "paper"),
+    [
+        ("a.png", (300, 300), 0.0254 / 300),
+        ("a.jpg", (150, 150), 0.0254 / 150),
+        ("a.tif", (200, 200), 0.0254 / 200),
+        ("a.png", (72, 72), None),
+        ("a.png", (96, 96), None),
+        ("a.png", (300, 150), None),
+        ("a.bmp", (0, 0), None),
+    ],
+)
+def test_dots_an_inch_say_how_long_a_pixel_is_on_paper(tmp_path, name, dots, paper):
+    Image.new("RGB", (200, 150), "white").save(tmp_path / name, dpi=dots)
+    assert read_paper(tmp_path / name) == (None if paper is None else pytest.approx(paper, rel=1e-3))
+
+
+def test_a_photograph_says_nothing_of_paper(tmp_path):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0x829A] = 0.01  # exposed for so many seconds
+    Image.new("RGB", (200, 150), "white").save(tmp_path / "a.jpg", dpi=(300, 300), exif=exif)
+    assert read_paper(tmp_path / "a.jpg") is None
+
+
+@pytest.mark.parametrize("stated", [100, 250])
+def test_a_stated_scale_counts_unless_doors_would_be_of_odd_widths(stated, monkeypatch):
+    drawing = draw()  # 30 px a metre
+    parsed = find_structure(np.eye(len(DRAWING_CLASSES), dtype=np.float32)[drawing.classes], 1.0, None)
+    monkeypatch.setattr("topomerge.io.drawing.parse_drawing", lambda picture, known=None: parsed)
+    texts = [PictureText(f"1:{stated}", (20.0, 20.0), 10.0, 1.0)]
+    traced = trace_drawing(Path("a.png"), DrawnPage(drawing.picture), None, texts, 1 / 3000)
+    is_right = stated == 100
+    assert traced.resolution == pytest.approx(1 / 30, rel=1e-6 if is_right else 0.2)
+    assert any("not taken" in warning for warning in traced.warnings) != is_right
 
 
 def test_a_tiff_of_several_pages_says_which_was_read(tmp_path):

@@ -84,6 +84,40 @@ def test_extract_finds_the_rooms_and_their_names(tmp_path: Path) -> None:
     assert pairs >= {frozenset(("LIVING", other)) for other in ("KITCHEN", "BATH", "BED")}
 
 
+def test_a_text_stands_where_its_box_is_fastened(tmp_path: Path) -> None:
+    path = write_flat(tmp_path / "flat.dxf")
+    document = ezdxf.readfile(path)
+    for text in document.modelspace().query("MTEXT"):
+        name, height = text.plain_text().split("\n")[0], text.dxf.char_height
+        x, y, _ = text.dxf.insert
+        text.dxf.insert, text.dxf.attachment_point = (x + 0.35 * height * max(len(name), 7), y - 1.6 * height), 9
+    document.saveas(path)
+    _, names, _ = read_floor(path)
+    true = [(x + w / 2, y + h / 2) for x, y, w, h in (ROOMS[name] for name in names.get_values())]
+    np.testing.assert_allclose(names.table["position"][:, :2], true, atol=0.1)
+
+
+@pytest.mark.parametrize("titles", [("GROUND FLOOR", "FIRST FLOOR"), ("FIRST FLOOR", "GROUND FLOOR"), ("HOUSE A", "HOUSE B")])
+def test_plans_with_titles_of_storeys_are_storeys(tmp_path: Path, titles: tuple[str, str]) -> None:
+    path = write_flat(tmp_path / "flat.dxf", unit=1.0, code=6)
+    document = ezdxf.readfile(path)
+    model = document.modelspace()
+    for entity in list(model):
+        copy = entity.copy()
+        copy.translate(20.0, 0.0, 0.0)
+        model.add_entity(copy)
+    for k, title in enumerate(titles):
+        model.add_text(title, dxfattribs={"insert": (3.0 + 20 * k, -2.0), "height": 0.3})
+    document.saveas(path)
+    found = tm.extract(tm.read_points(path))
+    storeys = 1 if titles[0] == "HOUSE A" else 2
+    assert len(found.storeys) == storeys and len(found.rooms) == 2 * len(ROOMS)
+    assert np.ptp(found.rooms["centroid"][:, 0]) == pytest.approx(5.0 if storeys == 2 else 25.0, abs=3.0)
+    assert len(tm.extract(tm.read_points(path, page=2)).rooms) == len(ROOMS)
+    with pytest.raises(InputError, match="has 2 plans; --page 3 is none of them"):
+        tm.read_points(path, page=3)
+
+
 def test_unit_is_what_the_user_says(tmp_path: Path) -> None:
     path = write_flat(tmp_path / "flat.dxf", unit=0.01, code=4)
     extent = np.ptp(read_floor(path, unit="cm")[0], axis=0)

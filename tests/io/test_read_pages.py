@@ -39,7 +39,7 @@ def parser(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
         return parse_dark_lines(picture)
 
     monkeypatch.setattr(drawing, "parse_drawing", parse)
-    monkeypatch.setattr(drawing, "load_text_reader", lambda: None)
+    monkeypatch.setattr(drawing, "load_text_reader", lambda **_: None)
     return seen
 
 
@@ -147,6 +147,9 @@ def test_scales_that_are_stated() -> None:
         return find_stated_scale([PictureText(text, (0, 0), 1, 1) for text in texts])
 
     assert state("M 1:100", "1 : 100 (A3)") == 100 and state("scale 1:50") == 50
+    assert state("Ech. 1/200") == state("Maßstab 1/200") == 200 and state("1/200", "on 1/12") is None
+    assert state('SCALE: 1/8" = 1\'-0"') == 96 and state("3/16''=1'") == 64 and state("1\" = 10'") == 120
+    assert state("0\" = 1'", "1/0\" = 1'") is None
     assert state("1:100", "1:20") is None and state("at 11:45", "1:5", "1:1:100", "3 m") is None
 
 

@@ -241,7 +241,7 @@ PAGE = build_option(
     "--page",
     type=parse_count,
     metavar="N",
-    help="page of a PDF, from 1 (default: the only one with content), or plan of a picture",
+    help="page of a PDF, from 1 (default: the only one with content), or plan of a picture or a DXF",
 )
 TOPIC = build_option("--topic", metavar="NAME", help="topic to read, where a bag has points of several sensors, or maps as well")
 READING_OPTIONS = (  # all that readers of a single input take
@@ -284,7 +284,7 @@ PICTURES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff", ".pdf")
 SELECTIVE = {  # of `CLOUD_OPTIONS`: inputs that take it, in words and as suffixes; none: folders
     "one_frame": ("folders of files", "folder", ()),
     "resolution": ("pictures, PDF and SVG", "file", (*PICTURES, ".svg")),
-    "page": ("pictures and PDF", "file", PICTURES),
+    "page": ("pictures, PDF and DXF", "file", (*PICTURES, ".dxf")),
     "topic": ("ROS bags", "bag", (".bag", ".db3", ".mcap")),
 }
 CLOUD_OPTIONS = (

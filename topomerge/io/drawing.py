@@ -22,6 +22,7 @@ from topomerge.io.written_lengths import (
     find_name,
     find_stated_scale,
     parse_lengths,
+    parse_lost_area,
 )
 from topomerge.kernels import run_side_by_side
 from topomerge.networks.drawing import DOOR, FLOOR, PAGE, WALL, WINDOW, compute_drawing_probabilities
@@ -47,6 +48,7 @@ NAME_SIGMA = 1.0  # m, of where a name stands in its room
 NAME_HEIGHT = 1.2  # m above the floor at which the name of a room is placed
 VARIED_ALONE, ODD_DOORS = 1.5, 3.0  # dimensions, the longest for the shortest, where no door is seen; spreads of their widths
 ALIKE = 0.3  # likewise, of how long rooms are for their width
+FEWEST_LOST = 3  # areas without their squares that are believed
 DOOR_WIDTH, DOOR_SPREAD = 0.82, 0.12  # m, usual clear width of drawn doors, and its spread as a logarithm
 
 
@@ -236,8 +238,9 @@ def estimate_scale(drawing: ParsedDrawing, texts: Sequence[PictureText]) -> Draw
     """Estimate the size of a pixel by the areas and sides that are written in rooms; else by the width of doors.
 
     Each text that lies in a room says how long a pixel is: by the room's area, or by its box; so do dimensions that stand in a
-    row. The largest group of texts that agree decides, of alike ones that which doors are nearer to. Where dimensions are of this
-    group, they alone say how large it is: walls take nothing off them.
+    row. Lengths in rooms count as areas where they fit as such alone. The largest group of texts that agree decides, of alike
+    ones that which doors are nearer to. Where dimensions are of this group, they alone say how large it is: walls take nothing
+    off them.
 
     Returns:
         None where neither texts nor doors say anything.
@@ -245,10 +248,12 @@ def estimate_scale(drawing: ParsedDrawing, texts: Sequence[PictureText]) -> Draw
     rooms, _ = ndimage.label(drawing.free & ~drawing.door)
     boxes = ndimage.find_objects(rooms)
     found: list[tuple[float, str]] = []
+    lost: list[tuple[float, str, float]] = []  # areas that may be lengths
     for text in texts:
         area, sides = parse_lengths(text.text)
+        maybe = parse_lost_area(text.text)
         number = _find_room(rooms, text, drawing.zoom)
-        if number == 0 or (area is None and sides is None):
+        if number == 0 or (area is None and sides is None and maybe is None):
             continue
         inside = rooms[boxes[number - 1]] == number
         pixels = float(ndimage.binary_fill_holes(inside).sum())
@@ -256,6 +261,8 @@ def estimate_scale(drawing: ParsedDrawing, texts: Sequence[PictureText]) -> Draw
             continue
         if area is not None:
             found.append((np.sqrt(area / pixels), text.text))
+        elif maybe is not None:
+            lost.append((np.sqrt(maybe / pixels), text.text, maybe))
         if sides is not None:
             box = sorted(float(v) for v in inside.shape)
             small, large = sorted(sides)
@@ -263,6 +270,8 @@ def estimate_scale(drawing: ParsedDrawing, texts: Sequence[PictureText]) -> Draw
                 found.append((np.sqrt(small * large / (box[0] * box[1])), text.text))
     by_doors = _estimate_scale_by_doors(drawing)
     chains = _select_chains(find_chains(texts), by_doors)
+    if by_doors is not None and not chains.texts:
+        found += select_lost_areas(lost, by_doors, drawing.zoom)
     areas = len(found)
     found += [(value / drawing.zoom, "") for value in chains.resolutions]
     if not found:
@@ -280,6 +289,23 @@ def estimate_scale(drawing: ParsedDrawing, texts: Sequence[PictureText]) -> Draw
     spread = 0.05 / np.sqrt(kept.sum()) if kept.sum() > 1 else 0.1
     reasons = tuple(dict.fromkeys(text for (_, text), good in zip(found, kept, strict=True) if good))
     return DrawingScale(float(np.exp(np.median(logs[kept]))) * drawing.zoom, float(spread), reasons)
+
+
+def select_lost_areas(lost: Sequence[tuple[float, str, float]], by_doors: DrawingScale, zoom: float) -> list[tuple[float, str]]:
+    """Select what was read as lengths in rooms and is areas: enough of different sizes agree, and doors would be of usual widths.
+
+    Args:
+        lost: m a pixel of the drawing if it is an area, the text, and that area.
+    """
+    if len(lost) < FEWEST_LOST:
+        return []
+    logs = np.log([value for value, _, _ in lost])
+    agree = np.abs(logs[:, None] - logs) <= AGREEING
+    kept = [row for row, good in zip(lost, agree[int(agree.sum(axis=1).argmax())], strict=True) if good]
+    sizes = [area for _, _, area in kept]
+    off = abs(float(np.median(np.log([value for value, _, _ in kept]))) - np.log(by_doors.resolution / zoom))
+    right = len(kept) >= max(FEWEST_LOST, len(lost) / 2) and max(sizes) >= VARIED_ALONE * min(sizes)
+    return [(value, text) for value, text, _ in kept] if right and off <= ODD_DOORS * by_doors.spread else []
 
 
 def _select_chains(found: Sequence[Chains], by_doors: DrawingScale | None) -> Chains:
@@ -344,7 +370,7 @@ def trace_drawing(
         resolution: m a pixel; None: by what is written on it, or by its doors.
         texts: of the picture that holds the page, if they are known; None: they are read where a reader is installed, unless
             `text` is False.
-        paper: m of paper a pixel, where the file says so: "1:100" is a scale then.
+        paper: m of paper a pixel, where the file says so: "1:100" is a scale then, unless doors would be of odd widths.
 
     Raises:
         InputError: it shows no room, or nothing says how large it is.
@@ -358,6 +384,8 @@ def trace_drawing(
     stated = None if paper is None else find_stated_scale(texts or ())
     known = resolution if resolution is not None or stated is None or paper is None else paper * stated
     drawing = parse_drawing(picture, known)
+    if not drawing.free.any() and known is not None and resolution is None:  # printed on paper of another size
+        known, drawing = None, parse_drawing(picture)
     if not drawing.free.any() or measure_straight_share(drawing.occupied) < LEAST_STRAIGHT:
         raise InputError(f"{path}: {explain_missing_walls(path, picture)}")
     warnings = [f"{path.name}: was read as a drawn plan, without its page, texts and furniture"]
@@ -366,8 +394,14 @@ def trace_drawing(
     dimensions: tuple[PictureText, ...] = ()
     if resolution is None:
         scale = estimate_scale(drawing, texts or ())
-        if known is not None and not (scale and scale.written and abs(np.log(scale.resolution / known)) > AGREEING):
-            scale = DrawingScale(known, 0.0, (f"1:{stated:g}",))
+        if known is not None:
+            far = 0.0 if scale is None else abs(np.log(scale.resolution / known))
+            if scale is None or far <= (AGREEING if scale.written else ODD_DOORS * scale.spread):
+                scale = DrawingScale(known, 0.0, (f"1:{stated:g}",))
+            elif not scale.written:  # printed on paper of another size
+                warnings.append(
+                    f"{path.name}: 1:{stated:g} is written on it, of which its doors would be of odd widths; not taken"
+                )
         if scale is None:
             more = "" if texts is not None else " (pip install topomerge[text] reads what is written on it)"
             raise InputError(f"{path}: an image does not say how large a pixel is; give --resolution in metres a pixel{more}")
@@ -431,13 +465,13 @@ def build_stairs_landmarks(
 
 def read_texts(picture: Array) -> tuple[PictureText, ...] | None:
     """Read the texts of a picture (h, w, 3); None where the extra `text` is not installed. Small pictures are enlarged first."""
-    reader = load_text_reader()
+    reader = load_text_reader(both_ways=True)
     if reader is None:
         return None
     finer = 2.0 if max(picture.shape[:2]) < SMALL_PICTURE else 1.0
     out = []
     for corners, text, confidence in reader(resize_picture(picture, finer)):
         middle = corners.mean(axis=0) / finer
-        height = float(np.hypot(*(corners[3] - corners[0]))) / finer
+        height = float(min(np.hypot(*(corners[3] - corners[0])), np.hypot(*(corners[1] - corners[0])))) / finer
         out.append(PictureText(clean_text(text), (float(middle[0]), float(middle[1])), height, confidence))
     return tuple(out)

@@ -45,7 +45,9 @@ class DrawnStorey:
     corner: tuple[float, float] = (0.0, 0.0)
 
 
-def find_storeys(path: Path, traced: TracedDrawing, number: int | None) -> tuple[list[DrawnStorey], tuple[str, ...]]:
+def find_storeys(
+    path: Path, traced: TracedDrawing, number: int | None, untitled: bool = True
+) -> tuple[list[DrawnStorey], tuple[str, ...]]:
     """Find the storeys on a sheet, the lowest first, and what is to be told of them.
 
     Plans that fit over each other are storeys of a building. Others stay beside each other in one map.
@@ -53,11 +55,15 @@ def find_storeys(path: Path, traced: TracedDrawing, number: int | None) -> tuple
     Args:
         path: for messages.
         number: of the only plan that is wanted, from 1: from left to right, from top to bottom; None: all.
+        untitled: plans without titles are storeys, too, in the order in which they stand.
 
     Raises:
         InputError: there is no plan of this number.
     """
     drawing = traced.drawing
+    whole = DrawnStorey(drawing.occupied, drawing.free, drawing.stairs, drawing.doorway)
+    if number is None and not untitled and len({parse_storey(text.text) for text in traced.texts} - {None}) < 2:
+        return [whole], ()
     label, count = find_plans(drawing, traced.resolution)
     plans = [_select_plan(drawing, label == k + 1) for k in range(count)]
     if number is not None:
@@ -68,11 +74,12 @@ def find_storeys(path: Path, traced: TracedDrawing, number: int | None) -> tuple
         return plans, ()
     ranks = [rank_storey(texts) for texts in find_titles(label, count, traced)]
     titled = None not in ranks and len(set(ranks)) == count
+    if not (titled or untitled):
+        return [whole], ()
     order = sorted(range(count), key=lambda k: ranks[k] or 0) if titled else list(range(count))
     placed = place_storeys([plans[k] for k in order], traced.resolution, COMMON / 2 if titled else COMMON)
     one = "--page 1 reads the first alone"
     if placed is None:
-        whole = DrawnStorey(drawing.occupied, drawing.free, drawing.stairs, drawing.doorway)
         return [whole], (f"{path.name}: holds {count} plans that do not fit over each other, read side by side; {one}",)
     how = "by their titles" if titled else "in the order in which they stand"
     return placed, (f"{path.name}: holds {count} plans, read as storeys over each other, {how}; {one}",)
@@ -114,10 +121,12 @@ def find_titles(label: Array, count: int, traced: TracedDrawing) -> list[list[Pi
     out: list[list[PictureText]] = [[] for _ in range(count)]
     gaps = np.stack([ndimage.distance_transform_edt(label != k + 1) for k in range(count)]) * traced.resolution
     for text in traced.texts:
-        column, row = (int(v) for v in text.place)
-        if 0 <= row < label.shape[0] and 0 <= column < label.shape[1] and not traced.drawing.free[row, column]:
+        place = np.floor(text.place)
+        column, row = (int(v) for v in np.clip(place, 0, np.array(label.shape[::-1]) - 1))  # titles may lie beyond
+        if not traced.drawing.free[row, column]:
             nearest = int(gaps[:, row, column].argmin())
-            if gaps[nearest, row, column] <= TITLE_REACH:
+            beyond = float(np.hypot(*(place - (column, row)))) * traced.resolution
+            if gaps[nearest, row, column] + beyond <= TITLE_REACH:
                 out[nearest].append(text)
     return out
 

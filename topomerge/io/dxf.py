@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.drawing import NAME_HEIGHT, build_name_landmarks
+from topomerge.io.drawing import ParsedDrawing, TracedDrawing
 from topomerge.io.dxf_plan import MARGIN, Line, Swing, build_plan_masks
 from topomerge.io.frame import UNITS
-from topomerge.io.grid import Plan, extrude
+from topomerge.io.grid import build_drawn_pieces
 from topomerge.io.piece import Piece, ReadOptions, read_in_subprocess
 from topomerge.io.written_lengths import PictureText
 from topomerge.types import Array
@@ -34,6 +34,7 @@ MOST_ENTITIES, MOST_LEVELS = 1_000_000, 32  # of all blocks where they are inser
 BEYOND = 1e12  # units of a coordinate: no drawing of a building
 SMOOTH = 0.002  # of the size of a curve: how far its pieces may be from it
 PIXEL = 0.03  # m
+LINE_HEIGHT = 1.6  # of the height of the letters of a text of several lines
 MOST_PIXELS = 25_000_000  # of coarser ones, if need be
 FAR = 250.0  # m from the middle of all lines: what lies farther off is no part of the building
 KINDS_OF_LINES = ("LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE", "SOLID", "TRACE", "HATCH")
@@ -84,14 +85,13 @@ def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
     if not masks.free.any():
         names = ", ".join(sorted(content.layers)[:8])
         raise InputError(f"{path}: no walls around a room were found in it (layers {names}); check --unit and the layers")
-    own = options.factor  # m of the units that are handed over
-    plan = Plan(path, pixel / own, (masks.corner[0] / own, masks.corner[1] / own, 0.0))
-    texts = [place_text(text, masks.corner, pixel, masks.free.shape[0]) for text in content.texts]
-    corner = plan.origin[:2]
-    marks = build_name_landmarks(texts, masks.free, plan.resolution, corner, NAME_HEIGHT / own, path.name)
+    texts = tuple(place_text(text, masks.corner, pixel, masks.free.shape[0]) for text in content.texts)
+    nothing = np.zeros(masks.free.shape, bool)
+    drawing = ParsedDrawing(masks.occupied, masks.free, masks.door, nothing, nothing.astype(np.float32), 1.0)
     warnings = tuple(f"{path.name}: {text}" for text in (*notes, *far, *coarse, *masks.warnings))
-    yield Piece(np.empty((0, 3)), warnings=warnings, done=0.1, landmarks=marks)
-    yield from extrude(path, masks.occupied, masks.free, plan, options)
+    traced = TracedDrawing(drawing, pixel, texts, warnings)
+    where = masks.corner
+    yield from build_drawn_pieces(path, traced, options, options.page, corner=where, unit=options.factor, untitled=False)
 
 
 def place_text(text: PictureText, corner: tuple[float, float], pixel: float, rows: int) -> PictureText:
@@ -293,12 +293,19 @@ class _Collector:
         text = entity.plain_text() if is_block else entity.dxf.get("text", "")
         height = float(entity.dxf.get("char_height" if is_block else "height", 1.0))
         place = Vec3(entity.dxf.get("insert", (0, 0, 0)))
-        if not is_block:
-            along = math.radians(entity.dxf.get("rotation", 0.0))
+        lines = text.split("\n")
+        half = 0.35 * height * max(map(len, lines))
+        if is_block:  # its place is one of nine of its box
+            row, column = divmod(int(entity.dxf.get("attachment_point", 1)) - 1, 3)
+            along, shift = (
+                math.radians(entity.get_rotation()),
+                ((1 - column) * half, (row - 1) * LINE_HEIGHT / 2 * height * len(lines)),
+            )
+        else:
             aligned = entity.dxf.get("halign", 0) or entity.dxf.get("valign", 0)
-            half = 0.0 if aligned else 0.35 * height * len(text)
             place = Vec3(entity.dxf.get("align_point", place)) if aligned else place
-            place += Vec3(half * math.cos(along), half * math.sin(along), 0)
+            along, shift = math.radians(entity.dxf.get("rotation", 0.0)), (0.0 if aligned else half, 0.0)
+        place += Vec3(*shift).rotate(along)
         place = place if matrix is None else matrix.transform(place)
         if text.strip() and all(abs(v) < BEYOND for v in (place.x, place.y, height)):
             self.content.texts.append(PictureText(" ".join(text.split()), (place.x, place.y), height, 1.0))

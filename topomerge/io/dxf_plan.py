@@ -61,10 +61,11 @@ class Swing:
 
 @dataclass(frozen=True, eq=False)
 class PlanMasks:
-    """(h, w) bool walls and floor; x and y (m) of the lower left corner; what is doubtful."""
+    """(h, w) bool walls, floor and gaps of doors; x and y (m) of the lower left corner; what is doubtful."""
 
     occupied: Array
     free: Array
+    door: Array
     corner: tuple[float, float]
     warnings: tuple[str, ...] = ()
 
@@ -282,7 +283,7 @@ def _fill_floor(raster: _LineRaster, occupied: Array, seals: Array) -> PlanMasks
     free = (size >= SMALLEST_ROOM)[label]
     occupied &= ndimage.distance_transform_edt(~free) * pixel <= NEAR if free.any() else True
     warnings = (f"its outer walls are open; openings up to {GAPS[chosen]:g} m were taken for closed",) if chosen else ()
-    return PlanMasks(occupied, free, raster.corner, warnings)
+    return PlanMasks(occupied, free, free & seals, raster.corner, warnings)
 
 
 def _find_inside(closed: Array, distance: Array, radius: float) -> Array:

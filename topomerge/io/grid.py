@@ -36,6 +36,8 @@ FEW_WALLS = 4  # of 8 directions in which a place outside of the walls meets one
 SAMPLED_PIXELS = 4_000_000  # of a larger picture every second, third ... pixel
 BODY_RADIUS = 0.25  # m; floor where no body fits is no floor but the lines of walls
 LEAST_DOORWAY, DOOR_STEP = 0.05, 0.06  # probability of a door; m between places of it, at most
+CAMERA, EXPOSURE = 0x8769, 0x829A  # tags of EXIF: of how a picture was taken, and for how long
+FEWEST_DOTS, MOST_DOTS = 99.0, 2400.0  # an inch, of a scan; 72 and 96 are those of screens
 SLAB = 0.3  # m between the walls of a drawn storey and the next floor
 INVERT = "; if it shows light lines on dark paper, invert its colours"
 NARROW, WIDE = 0.1, 0.3  # of the pixels of walls, at most, and of floor, at least, that lie deeper than that in what is like them
@@ -145,7 +147,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
             raise InputError(f"{path}: states its own resolution of {plan.resolution:g} m; leave --resolution out")
         occupied, free, warnings = read_pixels(path, plan)
     elif page is not None and (not page.doubtful or is_plan(page)):
-        traced = trace_drawing(path, page, options.resolution, text=options.text)
+        traced = trace_drawing(path, page, options.resolution, paper=read_paper(path), text=options.text)
         yield from build_drawn_pieces(path, traced, options, options.page)
         return
     elif options.resolution is None:
@@ -162,27 +164,41 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     yield from extrude(path, occupied, free, plan, options)
 
 
-def build_drawn_pieces(path: Path, traced: TracedDrawing, options: ReadOptions, number: int | None = None) -> Iterator[Piece]:
+def build_drawn_pieces(
+    path: Path,
+    traced: TracedDrawing,
+    options: ReadOptions,
+    number: int | None = None,
+    *,
+    corner: tuple[float, float] = (0.0, 0.0),
+    unit: float = 1.0,
+    untitled: bool = True,
+) -> Iterator[Piece]:
     """Yield the floor and the walls of each storey of a drawing, the names of its rooms and its stairs.
 
     Args:
         number: of the only plan that is read, from 1; None: all.
+        corner: x and y of the drawing's lower left corner, m.
+        unit: m of the units that are handed over.
+        untitled: plans without titles are storeys, too.
 
     Raises:
         InputError: there is no plan of this number.
     """
-    storeys, warnings = find_storeys(path, traced, number)
+    storeys, warnings = find_storeys(path, traced, number, untitled)
     height = (options.extrude + SLAB) / options.factor
     parts, grids, doors = [], [], []
     for level, storey in enumerate(storeys):
-        plan = Plan(path, traced.resolution, (*storey.corner, 0.0))
-        at = storey.corner, NAME_HEIGHT / options.factor + level * height, path.name
+        x, y = ((a + b) / unit for a, b in zip(corner, storey.corner, strict=True))
+        plan = Plan(path, traced.resolution / unit, (x, y, 0.0))
+        at = (x, y), NAME_HEIGHT / options.factor + level * height, path.name
         parts.append(build_name_landmarks(traced.texts, storey.free, plan.resolution, *at))
         parts.append(build_stairs_landmarks(storey.stairs, plan.resolution, *at))
         grids.append(plan)
         doors.append(list_drawn_doors(storey, plan, level * height, options.factor))
     about = Piece(np.empty((0, 3)), warnings=(*traced.warnings, *warnings), done=0.1)
-    yield replace(about, landmarks=join_landmarks(parts), drawn_doors=np.concatenate(doors))
+    drawn = np.concatenate(doors)
+    yield replace(about, landmarks=join_landmarks(parts), drawn_doors=drawn if len(drawn) else None)
     closed = options if len(storeys) == 1 else replace(options, ceiling=True)  # else the next floor is the ceiling
     for level, (storey, plan) in enumerate(zip(storeys, grids, strict=True)):
         for piece in extrude(path, storey.occupied, storey.free, plan, closed):
@@ -239,6 +255,22 @@ def read_picture(path: Path) -> Array:
         out = np.array(image.convert("RGB"))
     out[clear] = 255
     return out
+
+
+def read_paper(path: Path) -> float | None:
+    """Read how long a pixel is on paper, m; None: a picture does not say so, or only what programs and cameras write for any."""
+    from PIL import Image
+
+    with Image.open(path, formats=IMAGE_FORMATS) as opened:
+        if opened.getexif().get_ifd(CAMERA).get(EXPOSURE):
+            return None
+        try:
+            across, along = (float(v) for v in opened.info.get("dpi", (0.0, 0.0)))
+        except (TypeError, ValueError, ZeroDivisionError):
+            return None
+    if not (FEWEST_DOTS <= across <= MOST_DOTS and abs(across - along) <= 0.01 * across):
+        return None
+    return 0.0254 / across
 
 
 def read_yaml(path: Path) -> Plan:

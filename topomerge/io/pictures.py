@@ -32,6 +32,7 @@ SMALLEST_SIDE, LONGEST_SIDE = 240, 1280  # pixels: below nothing is legible, abo
 SHORTER_SIDE = (
     480  # pixels to which smaller pictures are enlarged; 736, the reader's own, takes 2.5 times as long and reads no more
 )
+UPRIGHT = 1.5  # height of a line of text by its width, from which on it is turned
 LEAST_EDGE = 20.0  # grey levels of the strongest edges, below which a picture shows nothing to read
 BLURRED, PICTURES_COMPARED = 0.4, 20  # times the median of the strongest edges of the last pictures
 BLURRED_WAY = 2.0  # times the distance and the angle, after which a blurred picture is read, too
@@ -300,8 +301,12 @@ def explain_missing_reader() -> str:
 
 
 @cache
-def load_text_reader() -> TextReader | None:
-    """Load the reader of texts; None: its package is not installed, or does not load."""
+def load_text_reader(both_ways: bool = False) -> TextReader | None:
+    """Load the reader of texts; None: its package is not installed, or does not load.
+
+    Args:
+        both_ways: read upright lines from below and from above, as plans write them; else from above alone, as signs.
+    """
     try:
         from rapidocr_onnxruntime import RapidOCR
     except ImportError:
@@ -316,7 +321,26 @@ def load_text_reader() -> TextReader | None:
         found, _ = engine(np.ascontiguousarray(image[..., ::-1]), use_cls=False)
         return [(np.asarray(box, float), str(text), float(confidence)) for box, text, confidence in found or ()]
 
-    return read
+    def read_both_ways(image: Array) -> list[tuple[Array, str, float]]:
+        picture = np.ascontiguousarray(image[..., ::-1])
+        found, _ = engine(picture, use_cls=False, use_rec=False)
+        boxes = np.asarray(found or (), np.float32).reshape(-1, 4, 2)
+        lines = engine.get_crop_img_list(picture, boxes)  # upright ones lie down to the left, as they read from above
+        upright = [k for k, box in enumerate(boxes) if is_upright(box)]
+        texts, _ = engine.text_rec(lines) if lines else ([], 0.0)
+        turned, _ = engine.text_rec([lines[k][::-1, ::-1] for k in upright]) if upright else ([], 0.0)
+        for k, other in zip(upright, turned, strict=True):
+            texts[k] = max(texts[k], other, key=lambda one: float(one[1]))
+        rows = [(np.asarray(box, float), str(one[0]), float(one[1])) for box, one in zip(boxes, texts, strict=True)]
+        return [row for row in rows if row[2] >= engine.text_score]
+
+    return read_both_ways if both_ways else read
+
+
+def is_upright(box: Array) -> bool:
+    """Return whether a line of text in a box (4, 2) runs up or down: the reader turns what is so much higher than wide."""
+    width, height = (max(np.linalg.norm(box[a] - box[b]) for a, b in pairs) for pairs in (((0, 1), (2, 3)), ((0, 3), (1, 2))))
+    return bool(height >= UPRIGHT * width)
 
 
 @cache

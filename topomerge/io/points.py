@@ -236,7 +236,7 @@ FORMATS = (
     Format("a ScanNet recording", "sens", (".sens",)),
     Format("a state of Cartographer", "pbstream", (".pbstream",), fixed=True, takes=("extrude", "ceiling")),
     Format("a pose graph of slam_toolbox", "karto", (".posegraph",), fixed=True),
-    Format("a DXF drawing", "dxf", (".dxf",), extra="dxf", takes=("extrude", "ceiling")),
+    Format("a DXF drawing", "dxf", (".dxf",), extra="dxf", takes=("extrude", "ceiling", "page")),
     Format("a PDF drawing", "pdf", (".pdf",), fixed=True, extra="pdf", takes=(*DRAWN, "page")),
     Format("an SVG drawing", "svg", (".svg",), fixed=True, extra="svg", takes=DRAWN),
     Format("a floor plan", "grid", (".yaml", ".yml", *PICTURES), fixed=True, takes=(*DRAWN, "page")),

@@ -12,17 +12,25 @@ FOOT, INCH = 0.3048, 0.0254  # m
 PLAUSIBLE_AREA, PLAUSIBLE_SIDE, PLAUSIBLE_DIMENSION = (0.8, 3000.0), (0.6, 100.0), (0.2, 200.0)  # m2, m, m
 NUMBER = r"(\d{1,5}(?:[.,]\d{1,3})?)"
 AREA = re.compile(
-    NUMBER + r"\s*(m\s?[²2](?!\d)|m\^2|qm|sqm|sq\.?\s*m\.?|kvm|㎡|sq\.?\s*ft\.?|ft²|sqft|sf\b|s\.f\.)", re.IGNORECASE
+    NUMBER + r"\s*(m\s?[²2](?!\d)|m[?*°azlI](?!\w)|m\^2|qm|sqm|sq\.?\s*m\.?|kvm|㎡|sq\.?\s*ft\.?|ft²|sqft|sf\b|s\.f\.)",
+    re.IGNORECASE,
 )
+SQUARE_LOST = re.compile(r"(\d{1,3}[.,:]\d{1,2})\s?m\.?")  # as "13.4 m²" is read where the raised number is small
 SIDES = re.compile(r"(?<![\d.,-])" + NUMBER + r"\s*(mm|cm|m)?\s*(?:[x×X*]|by)\s*" + NUMBER + r"\s*(mm|cm|m)?(?![\d'\"′])")
 SIDE_IN_FEET = (
-    r"(\d{1,3})\s*(?:['’′]|ft\.?|feet)\s*-?\s*(?:(\d{1,2})(?:[ -]\d{1,2}/\d{1,2})?\s*(?:[\"”″]|''|in(?:ches|ch|\.)?(?![a-z]))?)?"
+    r"(\d{1,3})\s*(?:['’′]|ft\.?|feet)\s*-?\s*"
+    r"(?:(\d{1,2})(?:\s?[½¼¾⅛⅜⅝⅞]|[ -]\d{1,2}/\d{1,2})?\s*(?:[\"”″]|''|in(?:ches|ch|\.)?(?![a-z]))?)?"
 )
 FEET = re.compile(SIDE_IN_FEET + r"\s*(?:[x×X*]|by)\s*" + SIDE_IN_FEET)
 DIMENSION = re.compile(r"(\d{1,2}[.,]\d{1,3}|\d{2,5})\s*(mm|cm|m)?")
 DIMENSION_IN_FEET = re.compile(SIDE_IN_FEET)
 NUMBERED = re.compile(r"[A-Za-z]{0,3}[-. ]?\d{1,3}(?:[.\-]\d{1,4}){0,2}[a-z]?(?<=..)")
-STATED_SCALE = re.compile(r"(?<![\d:.,])1\s?:\s?([1-9]\d{1,3})(?![\d:.,])")
+STATED_SCALE = re.compile(
+    r"(?:(?<![\d:.,])1\s?:|\b(?:scale|maßstab|[ée]ch(?:elle)?|escala|scala)[.:]?\s*1\s?/)\s?([1-9]\d{1,3})(?![\d:.,])",
+    re.IGNORECASE,
+)
+STATED_IN_FEET = re.compile(r"(?<![\d/])(\d{1,2})(?:/(\d{1,2}))?\s*(?:[\"”″]|'')\s*=\s*(\d{1,3})\s*['’′](?:\s?-?\s?0)?")
+THOUSANDS = re.compile(r"\d{1,3},\d{3}")
 WORD = re.compile(r"[^\W\d_]{2,}")
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 CENTIMETRES, MILLIMETRES = 60.0, 1000.0  # sides of rooms without a unit, from these on
@@ -54,7 +62,9 @@ def parse_lengths(text: str) -> tuple[float | None, tuple[float, float] | None]:
         sides = values[0] * factor, values[1] * factor
     area = None
     if found := AREA.search(text):
-        area = float(found[1].replace(",", ".")) * (FOOT**2 if "f" in found[2].lower() else 1.0)
+        in_feet = "f" in found[2].lower()
+        number = found[1].replace(",", "" if in_feet and THOUSANDS.fullmatch(found[1]) else ".")
+        area = float(number) * (FOOT**2 if in_feet else 1.0)
     if area is not None and not PLAUSIBLE_AREA[0] <= area <= PLAUSIBLE_AREA[1]:
         area = None
     if sides is not None and not all(PLAUSIBLE_SIDE[0] <= side <= PLAUSIBLE_SIDE[1] for side in sides):
@@ -74,6 +84,13 @@ def parse_dimension(text: str, whole: float) -> float | None:
     return value if value is not None and PLAUSIBLE_DIMENSION[0] <= value <= PLAUSIBLE_DIMENSION[1] else None
 
 
+def parse_lost_area(text: str) -> float | None:
+    """Parse the only number, m2, of a text that may be an area without its square: "13.4 m"."""
+    found = SQUARE_LOST.fullmatch(text.strip())
+    value = float(found[1].replace(",", ".").replace(":", ".")) if found else 0.0
+    return value if PLAUSIBLE_AREA[0] <= value <= PLAUSIBLE_AREA[1] else None
+
+
 def find_name(text: str) -> str:
     """Find the name or number of a room in a text: what is left without areas and sides; "" where that is no name."""
     left = FEET.sub(" ", SIDES.sub(" ", AREA.sub(" ", text)))
@@ -82,8 +99,14 @@ def find_name(text: str) -> str:
 
 
 def find_stated_scale(texts: Sequence[PictureText]) -> float | None:
-    """Find the one scale of a page that its texts state ("1:100" is 100); None where they state none, or several."""
+    """Find the one scale of a page that its texts state: 100 of "1:100", 96 of "1/8\" = 1'-0\""; None: none, or several."""
     found = {float(match) for text in texts for match in STATED_SCALE.findall(text.text)}
+    for text in texts:
+        found |= {
+            12 * float(f) * float(d or 1) / float(n)
+            for n, d, f in STATED_IN_FEET.findall(text.text)
+            if min(map(int, (n, d or "1", f)))
+        }
     return found.pop() if len(found) == 1 else None
 
 
