@@ -112,6 +112,8 @@ def _choose_walk_poses(walk: Walk, kind: str, room: int, rng: np.random.Generato
 MAPPED_KINDS = ("office", "hospital", "school", "hotel", "lab", "openplan", "apartment", "house")
 MAPPED_SENSORS = ("tls", "lidar", "depth", "laser2d", "tls")  # of the maps, in turn
 MAPPED_ROOMS = 14  # of a map, at most
+HOUSES_FROM = 100  # maps from here on are of houses by light sensors, which takes a second each: they fill large atlases
+HOUSE_SENSORS = ("depth", "laser2d")
 OTHER_BUILDING_SEEDS = 5_000  # seeds further on: buildings without a map
 
 
@@ -120,7 +122,8 @@ def draw_building(split: str, number: int, negative: bool = False) -> tuple[Buil
     first, _ = get_seed_range(split)
     seed = first + 40_000 + number + OTHER_BUILDING_SEEDS * negative
     rng = np.random.default_rng([seed, 54])
-    building = make_building(MAPPED_KINDS[number % len(MAPPED_KINDS)], seed, 2 if number % 6 == 5 else 1)
+    kind = MAPPED_KINDS[number % len(MAPPED_KINDS)] if number < HOUSES_FROM else "house"
+    building = make_building(kind, seed, 2 if number % 6 == 5 else 1)
     return building, sample_part(building, MAPPED_ROOMS, rng), rng
 
 
@@ -134,7 +137,8 @@ def make_located_map(split: str, number: int, folder: Path) -> Path:
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
     building, rooms, rng = draw_building(split, number)
-    sensor = get_sensor(MAPPED_SENSORS[number % len(MAPPED_SENSORS)])
+    names = MAPPED_SENSORS if number < HOUSES_FROM else HOUSE_SENSORS
+    sensor = get_sensor(names[number % len(names)])
     (frame,) = draw_frames(1, False, rng)
     session, seed = simulate_session(building, None, rng), int(rng.integers(1 << 31))
     cloud = scan_building(session, sensor, rooms, seed, frame=frame)

@@ -52,6 +52,7 @@ def test_more_maps_are_tabulated_with_what_a_thousand_would_take() -> None:
     table = tabulate([row(50), row(100)], settings)["locate-size"]
     assert "| 50 | 50 | 1 | 1 | 0 | 1 | 0 | 1.00 | 1.00 |" in table
     assert "| 1,000, by a straight line | – | – | – | – | – | – | 20 | – |" in table
+    assert "straight" not in tabulate([row(50), row(1000)], settings)["locate-size"]
 
 
 def test_a_turn_and_a_drive_are_asked_for_in_the_buildings_of_the_test() -> None:

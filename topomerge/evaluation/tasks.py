@@ -79,8 +79,8 @@ class TaskSettings:
         jobs: processes.
         cache: folder of scans, maps and pairs, which are made once.
         folder: where rows and report go.
-        write: a page whose marked blocks are written; empty: none. The rows behind it lie in `rows` beside it, and come from there
-            where the cache has none.
+        write: a page whose marked blocks are written; empty: none. The rows behind it lie in `rows` beside it, and are read
+            there where the cache has none.
         headline: a file of figures for the README whose entries of this task are written; empty: none.
         remake: measure again what is there.
         confirm: rows of an older state of the code stay where so many of them, evenly spread, come out alike when they are
