@@ -233,7 +233,7 @@ def tabulate_sizes(rows: Sequence[Row]) -> str:
         known, unknown = ([classify_outcome(s) for s in scans if s["stranger"] == no] for no in (False, True))
         counts = [len(known), known.count("right"), known.count("wrong"), len(unknown), unknown.count("wrong")]
         lines.append([size, own[0]["storeys"], *counts, f"{np.median(seconds):.2f}", f"{max(seconds):.2f}"])
-    if 1 < len(sizes) and max(sizes) < MANY:
+    if len(sizes) > 1 and max(sizes) < MANY:
         slope, start = np.polyfit(sizes, [float(line[-2]) for line in lines], 1)  # type: ignore[arg-type]
         lines.append([f"{MANY:,}, by a straight line", *["–"] * 6, f"{start + slope * MANY:.0f}", "–"])
     heads = ["maps", "storeys", "scans of a map", "told right", "told wrong", "of no map", "told wrong"]
