@@ -41,6 +41,7 @@ MODULES = {
     "windows": "windows",
     "walls": "walls",
     "drawings": "drawings",
+    "drawn_merges": "drawn_merges",
     "merges": "merges",
     "joined": "joined",
     "bending": "bending",
