@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import re
 import sys
+from ctypes import cast, create_string_buffer
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
+from PIL import Image
 
 pytest.importorskip("pypdfium2")
 pytest.importorskip("resvg_py")
+
+from pypdfium2 import PdfDocument, PdfMatrix, PdfPage, raw
 
 import topomerge as tm
 from tests.cases import list_longer
@@ -30,7 +35,8 @@ A4 = (842.0, 595.0)
 @pytest.fixture(autouse=True)
 def parser(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
     """Dark pixels are walls and what they enclose is floor; the list takes the pictures that are parsed, half as large."""
-    for module, name in ((pdf, "FINEST_DOTS"), (pdf, "LONGEST_SIDE"), (svg, "SHORTEST_SIDE"), (svg, "LONGEST_SIDE")):
+    sides = [(svg, name) for name in ("SHORTEST_SIDE", "SHORTEST_READ", "LONGEST_SIDE")]
+    for module, name in ((pdf, "FINEST_DOTS"), (pdf, "LONGEST_SIDE"), *sides):
         monkeypatch.setattr(module, name, getattr(module, name) // 2)
     seen: list[np.ndarray] = []
 
@@ -142,6 +148,82 @@ def test_a_huge_page_has_bounded_pixels(tmp_path: Path, parser: list[np.ndarray]
     assert max(parser[0].shape) == pdf.LONGEST_SIDE
 
 
+def open_page(path: Path) -> PdfPage:
+    return PdfDocument(path)[0]
+
+
+def write_form(path: Path) -> Path:
+    """Write the first page of a PDF file as a form on a page of another, half as large, as programs that place plans do."""
+    with PdfDocument(path) as source, PdfDocument.new() as target:
+        page = target.new_page(*source[0].get_size())
+        form = source.page_as_xobject(0, target).as_pageobject()
+        form.transform(PdfMatrix().scale(0.5, 0.5))
+        page.insert_obj(form)
+        page.gen_content()
+        target.save(path.with_name("form.pdf"))
+    return path.with_name("form.pdf")
+
+
+def write_scan(path: Path, picture: np.ndarray, stamp: str, mode: int = raw.FPDF_TEXTRENDERMODE_FILL) -> Path:
+    """Write a PDF page of a picture (h, w, 3) with a text over it."""
+    Image.fromarray(picture).save(path, resolution=pdf.FINEST_DOTS)
+    with PdfDocument(path.read_bytes()) as document:
+        page = document[0]
+        text = raw.FPDFPageObj_NewTextObj(document, b"Helvetica", 12)
+        raw.FPDFText_SetText(text, cast(create_string_buffer(f"{stamp}\0".encode("utf-16-le")), raw.FPDF_WIDESTRING))
+        raw.FPDFTextObj_SetTextRenderMode(text, mode)
+        raw.FPDFPageObj_Transform(text, 1, 0, 0, 1, 600, 40)
+        raw.FPDFPage_InsertObject(page, text)
+        page.gen_content()
+        document.save(path)
+    return path
+
+
+def test_letters_in_a_form_are_not_drawn(tmp_path: Path) -> None:
+    """A plan that was placed on a sheet, as it is in most title blocks, is a form: its names are texts all the same."""
+    path = write_form(write_pdf(tmp_path / "a.pdf", ["BT /F 20 Tf 100 200 Td (Hall) Tj ET"]))
+    picture, texts, _ = pdf.draw_page(path, open_page(path))
+    assert [text.text for text in texts] == ["Hall"] and (picture == 255).all()
+
+
+def test_a_text_in_parts_is_one(tmp_path: Path) -> None:
+    """Letters of another font, each word, each letter is written alone: `Office` was `O`, `ffi` and `ce`."""
+    letters = "BT /F 8 Tf 100 300 Td (O) Tj /F 8 Tf (ffi) Tj (ce) Tj 0 -10 Td (12.5 m) Tj 4 Ts /F 5 Tf (2) Tj ET"
+    upright = "BT /F 8 Tf 0 1 -1 0 300 300 Tm (Living) Tj ( r) Tj (oom) Tj ET"
+    apart = "BT /F 8 Tf 400 300 Td (Bath) Tj 28 0 Td (Store) Tj 0 30 Td (WC) Tj ET"
+    for turned in (0, 90):
+        path = write_pdf(tmp_path / "a.pdf", ["\n".join((letters, upright, apart))], more=f"/Rotate {turned}")
+        texts = pdf.find_page_texts(open_page(path), 1.0)
+        assert sorted(text.text for text in texts) == ["12.5 m 2", "Bath", "Living room", "Office", "Store", "WC"]
+
+
+@pytest.mark.longer
+def test_a_scan_with_a_stamp_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A text over a scanned plan is not all that is written on it."""
+    plan = write_pdf(tmp_path / "plan.pdf", [draw_flat(AREAS)])
+    picture, written, _ = pdf.draw_page(plan, open_page(plan))
+    path = write_scan(tmp_path / "scan.pdf", picture, "APPROVED")
+    assert pdf.is_scanned(open_page(path)) and pdf.is_scanned(open_page(write_form(path)))
+    Image.fromarray(picture).save(tmp_path / "plain.pdf", resolution=pdf.FINEST_DOTS)
+
+    def read_picture(image: np.ndarray) -> list[tuple[np.ndarray, str, float]]:
+        square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 4
+        return [(square + text.place, text.text, 0.9) for text in written]
+
+    monkeypatch.setattr(drawing, "load_text_reader", lambda **_: read_picture)
+    for scan in (path, tmp_path / "plain.pdf"):
+        floor, names, warnings = read(pdf, scan)
+        np.testing.assert_allclose(np.ptp(floor, axis=0), np.array(OUTER) - 0.4, rtol=0.02)
+        assert sorted(names.get_values()) == sorted(ROOMS) and any("m2" in warning for warning in warnings)
+
+
+def test_a_scan_whose_texts_are_known_is_not_read_again(tmp_path: Path) -> None:
+    """Those that a program recognised lie invisible over the picture; a plan without a picture is no scan."""
+    page = np.full((400, 900, 3), 255, np.uint8)
+    assert not pdf.is_scanned(open_page(write_scan(tmp_path / "a.pdf", page, "Hall", raw.FPDF_TEXTRENDERMODE_INVISIBLE)))
+    assert not pdf.is_scanned(open_page(write_pdf(tmp_path / "b.pdf", [draw_flat(AREAS)])))
+
+
 def test_scales_that_are_stated() -> None:
     def state(*texts: str) -> float | None:
         return find_stated_scale([PictureText(text, (0, 0), 1, 1) for text in texts])
@@ -186,6 +268,14 @@ def test_a_drawing_in_svg(tmp_path: Path, size: str, parser: list[np.ndarray]) -
     assert any("m²" in warning for warning in warnings) and max(parser[0].shape) >= svg.SHORTEST_SIDE - 1
 
 
+def test_letters_that_are_outlines_in_svg(tmp_path: Path, parser: list[np.ndarray]) -> None:
+    """They are read on the picture, which is drawn finer for them."""
+    path = write_svg(tmp_path / "a.svg")
+    path.write_text(re.sub("<text.*?</text>", "", path.read_text(encoding="utf-8"), flags=re.DOTALL), encoding="utf-8")
+    read(svg, path, resolution=0.01)
+    assert abs(max(parser[0].shape) - svg.SHORTEST_READ) <= 1
+
+
 def test_svg_states_its_scale(tmp_path: Path) -> None:
     path = write_svg(tmp_path / "a.svg", '<text x="20" y="20">1:100</text>')
     path.write_text(path.read_text(encoding="utf-8").replace(" m²", ""), encoding="utf-8")
@@ -196,8 +286,6 @@ def test_svg_states_its_scale(tmp_path: Path) -> None:
 
 @pytest.mark.longer
 def test_what_lies_outside_of_an_svg_is_not_read(tmp_path: Path, parser: list[np.ndarray]) -> None:
-    from PIL import Image
-
     Image.new("L", (50, 50)).save(tmp_path / "black.png")
     plain = write_svg(tmp_path / "a.svg")
     read(svg, plain)

@@ -361,6 +361,7 @@ def trace_drawing(
     texts: Sequence[PictureText] | None = None,
     paper: float | None = None,
     text: bool | None = None,
+    more_texts: bool = False,
 ) -> TracedDrawing:
     """Find walls and floor of a drawing, and how large it is.
 
@@ -371,6 +372,7 @@ def trace_drawing(
         texts: of the picture that holds the page, if they are known; None: they are read where a reader is installed, unless
             `text` is False.
         paper: m of paper a pixel, where the file says so: "1:100" is a scale then, unless doors would be of odd widths.
+        more_texts: the picture shows others than `texts`, as a scan with a stamp does; they are read, too.
 
     Raises:
         InputError: it shows no room, or nothing says how large it is.
@@ -378,9 +380,12 @@ def trace_drawing(
     picture = page.picture
     if texts is None:
         texts = read_texts(picture) if text is not False else ()
-    elif page.mended:
-        places = move_places(np.linalg.inv(page.matrix), np.array([t.place for t in texts]).reshape(-1, 2))
-        texts = [replace(t, place=(float(x), float(y))) for t, (x, y) in zip(texts, places, strict=True)]
+    else:
+        if page.mended:
+            places = move_places(np.linalg.inv(page.matrix), np.array([t.place for t in texts]).reshape(-1, 2))
+            texts = [replace(t, place=(float(x), float(y))) for t, (x, y) in zip(texts, places, strict=True)]
+        if more_texts and text is not False:
+            texts = [*texts, *(read_texts(picture) or ())]
     stated = None if paper is None else find_stated_scale(texts or ())
     known = resolution if resolution is not None or stated is None or paper is None else paper * stated
     drawing = parse_drawing(picture, known)

@@ -26,6 +26,7 @@ from topomerge.types import Array
 SECONDS, MEMORY = 300, 6 << 30  # of the processor, and bytes: a picture with the network takes 20 s and 1.5 GB
 LARGEST_FILE = 1 << 26  # bytes
 LONGEST_SIDE, SHORTEST_SIDE = 3000, 1200  # px of the longer side
+SHORTEST_READ = 2400  # px, likewise, where letters are outlines, which are read on the picture
 MOST_LEVELS, MOST_TEXTS = 200, 20_000
 PIXELS_AN_INCH = 96  # CSS
 LENGTHS = {"": 1.0, "px": 1.0, "in": 96.0, "cm": 96 / 2.54, "mm": 96 / 25.4, "pt": 96 / 72, "pc": 16.0}
@@ -49,7 +50,8 @@ def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
     root = load_svg(path)
     size, paper = measure_size(path, root)
     longest = max(size)
-    zoom = min(max(longest, SHORTEST_SIDE), LONGEST_SIDE) / longest
+    shortest = SHORTEST_SIDE if find_svg_texts(root, size, 1.0) else SHORTEST_READ
+    zoom = min(max(longest, shortest), LONGEST_SIDE) / longest
     picture = draw_svg(path, root, size, zoom)
     page = 0.0254 / PIXELS_AN_INCH / zoom if paper else None
     drawn = find_page(picture) or DrawnPage(picture)
