@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
-from topomerge.datasets.drawings.shapes import DrawingRecipe, build_drawing_shapes
 
 from tests.scenes_map import building
 from topomerge.evaluation import drawn_merges
-from topomerge.evaluation.drawings import Page
-from topomerge.evaluation.tasks import TaskSettings
+from topomerge.evaluation.tasks import Data, TaskSettings
 from topomerge.types import Sim3
 
 
@@ -26,14 +26,14 @@ def test_a_pose_is_right_by_the_middle_and_sized_by_its_scale() -> None:
     assert not drawn_merges.judge_pose(None, truth, map, map)["right"]
 
 
+@pytest.mark.data
 @pytest.mark.longer
-def test_rooms_of_a_page_and_of_a_scan_lie_where_the_plan_has_them(tmp_path) -> None:
-    shapes = next(s for s in build_drawing_shapes(DrawingRecipe("few", "validation", 4), tmp_path) if len(s.rooms) >= 5)
-    page = Page(shapes, 3, False)
+def test_rooms_of_a_page_and_of_a_scan_lie_where_the_plan_has_them(tmp_path: Path, data_dir: Path) -> None:
+    page = drawn_merges.list_drawn(TaskSettings(Data("dev", 12), cache=str(tmp_path)))[2]
     drawn = drawn_merges.read_drawn_map(page)
     scan, frame = drawn_merges.simulate_scan(page, 0)
     assert drawn.map is not None
-    true = np.array([room.polygon.mean(axis=0) for room in shapes.rooms])
+    true = np.array([room.polygon.mean(axis=0) for room in page.shapes.rooms])
     for map, pose in ((drawn.map, drawn.frame), (scan, frame)):
         cells = map.navigable.compute_centroids()
         middles = [pose.inverse().apply(cells[map.navigable_room == k].mean(axis=0)[None])[0, :2] for k in range(len(map.rooms))]
@@ -42,7 +42,16 @@ def test_rooms_of_a_page_and_of_a_scan_lie_where_the_plan_has_them(tmp_path) -> 
 
 
 def test_pages_that_are_not_read_and_merges_that_are_not_right_are_named() -> None:
-    row = {"name": "a", "whole": True, "scale_read": True, "right": True, "sized": True, "believed": True, "place": "a"}
+    row = {
+        "name": "a",
+        "whole": True,
+        "scale_read": True,
+        "right": True,
+        "sized": True,
+        "size": 1.0,
+        "believed": True,
+        "place": "a",
+    }
     row |= {"other_believed": False, "probability": 0.9, "sensor": "tls"}
     rows = [
         row,
