@@ -30,7 +30,6 @@ from topomerge.io.piece import ReadOptions
 from topomerge.io.points import read_points
 from topomerge.io.written_lengths import PictureText
 from topomerge.networks.drawing import DRAWING_CLASSES
-from topomerge.types import SCALE_SPREAD
 
 SHEET = 842, 595  # px, of A4
 
@@ -277,17 +276,6 @@ def test_a_stated_scale_counts_unless_doors_would_be_of_odd_widths(stated, monke
     is_right = stated == 100
     assert traced.resolution == pytest.approx(1 / 30, rel=1e-6 if is_right else 0.2)
     assert any("not taken" in warning for warning in traced.warnings) != is_right
-    assert (traced.spread == 0.01) == is_right and traced.spread < 0.3
-
-
-def test_a_map_remembers_how_sure_the_scale_of_its_page_is(tmp_path):
-    path = draw_case(tmp_path / "plan.png")
-    cloud = read_points(path, text=False)  # by its doors
-    assert 0.1 < cloud.scale_spread < 0.3 and extract(cloud).parameters[SCALE_SPREAD] == pytest.approx(
-        cloud.scale_spread, abs=1e-3
-    )
-    told = read_points(path, resolution=0.02, text=False)
-    assert told.scale_spread == 0 and SCALE_SPREAD not in extract(told).parameters
 
 
 def test_a_tiff_of_several_pages_says_which_was_read(tmp_path):

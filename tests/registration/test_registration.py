@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -110,14 +108,11 @@ def test_poses_of_rooms_decide_where_the_search_of_walls_fails(halves, joined, m
 
 
 @pytest.mark.longer
-@pytest.mark.parametrize(("scale", "spread"), [(0.8, None), (0.8, 0.1), (0.55, 0.1)])
-def test_an_unknown_scale_is_found_within_what_a_drawing_says(points, scale, spread):
+@pytest.mark.parametrize("scale", [0.8])
+def test_an_unknown_scale_is_found(points, scale):
     frame = Sim3(MOVE.yaw, MOVE.translation, scale)
     a, b = grid_of(part(points, high=(17, 99))), grid_of(part(points, low=(4, -99)), frame, mean=False)
-    found = register(a, replace(prepare(b), scale_spread=spread), scale="free")
-    if scale < 0.6:  # beyond what the drawing allows for: nothing is believed
-        assert not found.accepted
-        return
+    found = register(a, b, scale="free")
     assert found.transform.scale * scale == pytest.approx(1.0, abs=0.01)
     assert off(found.transform, frame.inverse(), middle_in_b(frame))[0] < 0.15
 

@@ -9,14 +9,7 @@ import numpy as np
 import pytest
 
 from topomerge.matching.poses import PoseHypothesis, pair_storeys
-from topomerge.registration.search import (
-    SEARCH,
-    TRIED_SCALES,
-    find_height_offsets,
-    find_scale_candidates,
-    find_scale_range,
-    select_strongest,
-)
+from topomerge.registration.search import SEARCH, find_height_offsets, find_scale_candidates, select_strongest
 from topomerge.structure.lines import DIRECTION_STEP, compute_direction_profile
 from topomerge.types import Sim3
 
@@ -79,15 +72,3 @@ def test_the_scale_brings_walls_as_far_apart_as_those_of_the_other_map(scale):
     best = find_scale_candidates(a, b, [np.radians(-40.0), 0.1])[0]
     assert best[1] == pytest.approx(np.radians(-40.0)) and best[2] == pytest.approx(scale, rel=0.02)
     assert best[0] == pytest.approx(2.0, abs=0.3)  # each direction correlates by 1 at most
-
-
-def test_scales_are_looked_for_as_far_as_a_drawing_is_unsure_of_its_own():
-    assert find_scale_range(None, None) is None  # a unit that nobody knows may be any
-    near, wide = find_scale_range(None, 0.01), find_scale_range(0.2, None)
-    assert near == find_scale_range(0.13, 0.0) and near[0] * near[1] == pytest.approx(1.0)  # no surer than doors are wide
-    assert near[1] == pytest.approx(np.exp(0.39)) and near[1] < wide[1] < 2.0
-    assert find_scale_range(0.5, 0.5) == TRIED_SCALES
-    a, b = walls_of((0.0, 4.2, 7.1), (0.0, 5.3, 7.2)), walls_of((0.0, 4.2, 7.1), (0.0, 5.3, 7.2), 1 / 1.7)
-    every, some = (find_scale_candidates(a, b, [0.0], limits) for limits in (TRIED_SCALES, near))
-    assert every[0][2] == pytest.approx(1.7, rel=0.02)
-    assert all(near[0] <= scale <= near[1] * 1.03 for _, _, scale in some)

@@ -111,8 +111,7 @@ def read_drawn_map(page: Page) -> DrawnMap:
                 return DrawnMap(None, Sim3(), (0.0, true), "taken for a photograph")
             traced = trace_drawing(path, found, None, paper=read_paper(path))
             resolution = traced.resolution * traced.drawing.zoom
-            cloud = replace(read_points(path, resolution=resolution, text=False), scale_spread=traced.spread)
-            map = extract(cloud)
+            map = extract(read_points(path, resolution=resolution, text=False))
         except ValueError as error:
             return DrawnMap(None, Sim3(), (0.0, true), str(error).partition(": ")[2])
     size = resolution / true

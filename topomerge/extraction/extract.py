@@ -43,7 +43,7 @@ from topomerge.extraction.views.view_rooms import segment_views
 from topomerge.extraction.walls import relabel_walls, unroll_walls
 from topomerge.numpy_nn import sigmoid
 from topomerge.progress import Progress, Stopwatch
-from topomerge.types import EDGE_DTYPE, LEVELLED, SCALE_SPREAD, Array, PointCloud, TopometricMap, VoxelGrid, add_outline_odds
+from topomerge.types import EDGE_DTYPE, LEVELLED, Array, PointCloud, TopometricMap, VoxelGrid, add_outline_odds
 
 # What the score of a passage weighs: the log odds of a door by the plan, and by the walls, on average along a doorway that they
 # show there; 0 where they show none or speak against one.
@@ -200,8 +200,6 @@ def extract(
     chosen = {**asdict(p), **floor.chosen_parameters, "voxel_size": scan.grid.edge}
     if scan.levelling is not None:
         chosen[LEVELLED] = scan.levelling.tolist()
-    if scan.scale_spread:
-        chosen[SCALE_SPREAD] = round(scan.scale_spread, 3)
     map = replace(
         map,
         free=free,

@@ -43,7 +43,6 @@ class Scan:
         flat: is it a slice, in which nothing tells walls from what else stands about (`slices.is_slice`)?
         landmarks: of its file, in the frame of the grid.
         drawn_doors: (k, 4) floor on which a drawing shows doors, in that frame: place, m, and probability; None elsewhere.
-        scale_spread: standard deviation of the logarithm of its scale, where that was estimated, as of a drawing.
     """
 
     grid: VoxelGrid
@@ -58,7 +57,6 @@ class Scan:
     flat: bool = False
     landmarks: Landmarks = field(default_factory=Landmarks)
     drawn_doors: Array | None = None
-    scale_spread: float = 0.0
 
     @property
     def places(self) -> Array:
@@ -117,7 +115,7 @@ def read_scan(
         grid = coarsen_until_dense(grid, least_neighbours, chunks.warnings)
     landmarks = join_landmarks(chunks.landmarks)
     scan = Scan(grid, close, chunks.rays, chunks.free, chunks.source, tuple(chunks.warnings), landmarks=landmarks)
-    scan = replace(scan, drawn_doors=chunks.drawn_doors, scale_spread=chunks.scale_spread)
+    scan = replace(scan, drawn_doors=chunks.drawn_doors)
     return scan if levelled is None else replace(scan, levelling=levelled.matrix, warnings=(*levelled.warnings, *scan.warnings))
 
 
@@ -150,7 +148,6 @@ class _Chunks:
         self.warnings: list[str] = []
         self.landmarks: list[Landmarks] = []
         self.drawn_doors: Array | None = None
-        self.scale_spread = 0.0
         self._rays: list[tuple[Array, Array]] = []
         self._step = 1  # of the rays, every one or every second, fourth ... is held
 
@@ -164,7 +161,6 @@ class _Chunks:
             self.free = chunk.free or self.free
             self.warnings += [w for w in chunk.warnings if w not in self.warnings]
             self.landmarks += [] if chunk.landmarks is None else [chunk.landmarks]
-            self.scale_spread = max(self.scale_spread, chunk.scale_spread)
             self.drawn_doors = self.drawn_doors if chunk.drawn_doors is None else chunk.drawn_doors
             if chunk.poses is not None and chunk.pose_of is not None and len(chunk):
                 self._add_rays(*_select_rays(chunk, chunk.poses, chunk.pose_of))

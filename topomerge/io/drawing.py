@@ -49,7 +49,6 @@ NAME_HEIGHT = 1.2  # m above the floor at which the name of a room is placed
 VARIED_ALONE, ODD_DOORS = 1.5, 3.0  # dimensions, the longest for the shortest, where no door is seen; spreads of their widths
 ALIKE = 0.3  # likewise, of how long rooms are for their width
 FEWEST_LOST = 3  # areas without their squares that are believed
-LEAST_SPREAD = 0.01  # of the logarithm of a scale that is read
 DOOR_WIDTH, DOOR_SPREAD = 0.82, 0.12  # m, usual clear width of drawn doors, and its spread as a logarithm
 
 
@@ -347,14 +346,12 @@ def _estimate_scale_by_doors(drawing: ParsedDrawing) -> DrawingScale | None:
 
 @dataclass(frozen=True, eq=False)
 class TracedDrawing:
-    """A drawing with its scale: `resolution` (m) is that of its own pixels; `texts` are in them, too; `warnings` say why.
-    `spread` is the standard deviation of its logarithm, 0 where it was told."""
+    """A drawing with its scale: `resolution` (m) is that of its own pixels; `texts` are in them, too; `warnings` say why."""
 
     drawing: ParsedDrawing
     resolution: float
     texts: tuple[PictureText, ...]
     warnings: tuple[str, ...]
-    spread: float = 0.0
 
 
 def trace_drawing(
@@ -400,12 +397,11 @@ def trace_drawing(
     if page.mended:
         warnings.append(f"{path.name}: its page was {', '.join(page.mended)} first; places are those on that page")
     dimensions: tuple[PictureText, ...] = ()
-    spread = 0.0
     if resolution is None:
         stated_scale = None if known is None else (known, f"1:{stated:g}")
         scale, doubts = settle_scale(path, drawing, texts, stated_scale)
         warnings += doubts
-        known, dimensions, spread = scale.resolution, scale.dimensions, max(scale.spread, LEAST_SPREAD)
+        known, dimensions = scale.resolution, scale.dimensions
         why = ", ".join(repr(reason) if scale.written else reason for reason in scale.reasons[:3])
         warnings.append(f"{path.name}: {known:.4g} m a pixel, give or take {scale.spread:.0%}, by {why}; --resolution sets it")
         if not np.isclose(choose_zoom(picture.shape[:2], known), drawing.zoom, rtol=0.1):
@@ -416,7 +412,7 @@ def trace_drawing(
     drawing = replace(drawing, stairs=treads & ndimage.binary_fill_holes(drawing.free | drawing.occupied))
     rest = [t for t in texts or () if t not in dimensions]
     placed = [PictureText(t.text, (t.place[0] * zoom, t.place[1] * zoom), t.height * zoom, t.confidence) for t in rest]
-    return TracedDrawing(drawing, known / zoom, tuple(placed), tuple(warnings), spread)
+    return TracedDrawing(drawing, known / zoom, tuple(placed), tuple(warnings))
 
 
 def settle_scale(

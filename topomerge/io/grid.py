@@ -126,7 +126,7 @@ def build_drawn_pieces(
         parts.append(build_stairs_landmarks(storey.stairs, plan.resolution, *at))
         grids.append(plan)
         doors.append(list_drawn_doors(storey, plan, level * height, options.factor))
-    about = Piece(np.empty((0, 3)), warnings=(*traced.warnings, *warnings), done=0.1, scale_spread=traced.spread)
+    about = Piece(np.empty((0, 3)), warnings=(*traced.warnings, *warnings), done=0.1)
     drawn = np.concatenate(doors)
     yield replace(about, landmarks=join_landmarks(parts), drawn_doors=drawn if len(drawn) else None)
     closed = options if len(storeys) == 1 else replace(options, ceiling=True)  # else the next floor is the ceiling

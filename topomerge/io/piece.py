@@ -30,9 +30,9 @@ MOST_POINTS = 100_000_000  # points that a sampled or extruded file may become; 
 
 @dataclass(frozen=True)
 class Piece:
-    """Some of the points of a file. `free`, `rooms`, `drawn_doors` and `scale_spread` describe the whole file and come with its
-    first piece; `poses` come with the first piece whose points need them, and are counted by `pose_of` over all pieces;
-    `landmarks` come with any, also with one without points."""
+    """Some of the points of a file. `free`, `rooms` and `drawn_doors` describe the whole file and come with its first piece;
+    `poses` come with the first piece whose points need them, and are counted by `pose_of` over all pieces; `landmarks` come with
+    any, also with one without points."""
 
     points: Array  # (n, 3) float, in the file's frame and unit
     colors: Array | None = None  # (n, 3) uint8
@@ -47,7 +47,6 @@ class Piece:
     classes: Array | None = None  # (n,) int32, of what the points lie on, as the file counts them; -1: none
     landmarks: Landmarks | None = None  # positions in the file's frame and unit
     drawn_doors: Array | None = None  # (k, 4) float64 floor on which a drawing shows doors: place, and how probably
-    scale_spread: float = 0.0  # standard deviation of the logarithm of the file's scale; 0: it is known
 
 
 def is_outside_link(path: Path) -> bool:

@@ -120,7 +120,6 @@ class Gatherer:
         self.objects = ObjectFinder()
         self.free: VoxelGrid | None = None
         self.drawn_doors: Array | None = None
-        self.scale_spread = 0.0
         self.rooms: tuple[TrueRoom, ...] = ()
         self.pending: PointCloud | None = None  # the last full cloud, held back because the last one carries the warnings
 
@@ -150,9 +149,7 @@ class Gatherer:
         self.warnings += warn_about(self.sample.points, self.up)
         found = join_landmarks([*self.landmarks, self.objects.find_objects("classes of points")])
         warnings = tuple(dict.fromkeys(self.warnings))
-        landmarks = found if len(found) else None
-        known = {"drawn_doors": self.drawn_doors, "scale_spread": self.scale_spread}
-        yield replace(self.pending, warnings=warnings, landmarks=landmarks, **known)
+        yield replace(self.pending, warnings=warnings, landmarks=found if len(found) else None, drawn_doors=self.drawn_doors)
 
     def _update_metadata(self, piece: Piece) -> None:
         """Keep what a piece says about the whole file."""
@@ -164,7 +161,6 @@ class Gatherer:
         if piece.landmarks is not None and len(piece.landmarks):
             place = partial(frame.transform_points, rotation=self.rotation, factor=self.factor)
             self.landmarks.append(transform_landmarks(clean_landmarks(piece.landmarks), place, scale=self.factor))
-        self.scale_spread = max(self.scale_spread, piece.scale_spread)
         if (drawn := piece.drawn_doors) is not None:
             self.drawn_doors = np.column_stack([frame.transform_points(drawn[:, :3], self.rotation, self.factor), drawn[:, 3]])
         if piece.free is not None and len(piece.free):

@@ -25,7 +25,7 @@ from topomerge.registration.places import Places, score_places
 from topomerge.registration.posterior import check_same
 from topomerge.registration.prepared import Map, Prepared, prepare
 from topomerge.registration.refine import refine_pose
-from topomerge.registration.search import find_height_offsets, find_scale_range, find_yaw_candidates, search, search_scaled
+from topomerge.registration.search import find_height_offsets, find_yaw_candidates, search, search_scaled
 from topomerge.registration.verify import (
     BASIN,
     MARGIN_CAP,
@@ -207,8 +207,7 @@ def register(
 
     Args:
         a, b: topometric maps or occupied cells, or what `prepare` made of them.
-        scale: "fixed", or "free" where b's unit may differ (looked for between 0.5 and 2; nearer where a drawing says how large
-            it is).
+        scale: "fixed", or "free" where b's unit may differ (looked for between 0.5 and 2).
         proposed: poses T_ab of matched rooms: their yaws are searched, too, and they are tried beside what the correlation
             finds; or a fallback, whose poses are tried, if at all, after that.
         free: cells of a and of b known to be empty; topometric maps bring their own.
@@ -265,7 +264,6 @@ class _Pair:
 
     def __init__(self, a: Prepared, b: Prepared, scaled: bool, clock: Stopwatch) -> None:
         self.a, self.b, self.scaled, self.clock = a, b, scaled, clock
-        self.scales = find_scale_range(a.scale_spread, b.scale_spread)  # of T_ab, where its scale is looked for
         self.judge = Judge(a.storeys, b.storeys)
         self.ranked: list[PoseHypothesis] = []
         self.looked: list[Candidate] = []
@@ -289,16 +287,12 @@ class _Pair:
     def search(self, poses: Sequence[Sim3]) -> None:
         """Add hypotheses of the correlation, and of given poses T_ab."""
         tell_step(0.1, "search poses")
-        if self.scaled:
-            self._rank(search_scaled(self.a.storeys, self.b.storeys, poses, scales=self.scales))
-        else:
-            self._rank(search(self.a.storeys, self.b.storeys, poses))
+        self._rank((search_scaled if self.scaled else search)(self.a.storeys, self.b.storeys, poses))
 
     def add(self, poses: Sequence[Sim3]) -> None:
         """Add given poses T_ab, moved to where the walls meet."""
         self.clock.lap("match")
-        least, most = self.scales or (0.0, np.inf)
-        proposals = [PoseHypothesis(pose, from_rooms=True) for pose in poses if least <= pose.scale <= most or not self.scaled]
+        proposals = [PoseHypothesis(pose, from_rooms=True) for pose in poses]
         self._rank(refine(self.a.storeys, self.b.storeys, proposals, self.scaled))
 
     def _rank(self, hypotheses: Sequence[PoseHypothesis]) -> None:

@@ -16,7 +16,7 @@ from topomerge.registration.bend.measure import Target, WallLines, build_wall_li
 from topomerge.registration.bend.pieces import Pieces, build_pieces, detect_sensor
 from topomerge.registration.refine import Surface, build_surface
 from topomerge.registration.storeys import build_plans
-from topomerge.types import SCALE_SPREAD, Array, TopometricMap, VoxelGrid
+from topomerge.types import Array, TopometricMap, VoxelGrid
 
 Map = TopometricMap | VoxelGrid
 SENT_COLUMNS = 8_000_000  # of the plans of a map: more are drawn where they are needed, and not sent from process to process
@@ -37,7 +37,6 @@ class Prepared:
         sensor: what it was measured by, as far as one can say.
         make_surface: its points and normals, for the fine registration.
         has_landmarks: does the map hold any?
-        scale_spread: standard deviation of the logarithm of its scale, where that was estimated; None where nothing is known.
     """
 
     load: Callable[[], Map]
@@ -47,7 +46,6 @@ class Prepared:
     sensor: str
     make_surface: Callable[[], Surface]
     has_landmarks: bool = False
-    scale_spread: float | None = None
 
     @property
     def surface(self) -> Surface:
@@ -104,7 +102,7 @@ def unpack_prepared(parts: Mapping[str, Any], map: Map) -> Prepared:
     """Return what `Prepared.pack` sent, with the map it was drawn from."""
     surface, grid = parts["surface"], get_grid(map)
     make_surface = cache(lambda: build_surface(grid) if surface is None else surface)
-    names = ("storeys", "order", "middle", "sensor", "has_landmarks", "scale_spread")
+    names = ("storeys", "order", "middle", "sensor", "has_landmarks")
     prepared = Prepared(load=lambda: map, make_surface=make_surface, **{name: parts[name] for name in names})
     vars(prepared).update((name, parts[name]) for name in BENDING_PARTS if name in parts)
     return prepared
@@ -130,7 +128,6 @@ def prepare(map: Map, free: VoxelGrid | None = None) -> Prepared:
         detect_sensor(map),
         make_surface,
         isinstance(map, TopometricMap) and len(map.landmarks) > 0,
-        map.parameters.get(SCALE_SPREAD) if isinstance(map, TopometricMap) else None,
     )
 
 

@@ -21,9 +21,7 @@ YAW_PEAKS = 10  # of the correlated direction profiles
 QUARTER_PEAKS = 3  # peaks that are tried in all quarters,
 QUARTER_GAP = np.radians(3.0)  # where no other peak is as near
 SAME_YAW = np.radians(0.5)  # of two yaws that are nearer one is tried
-TRIED_SCALES = (0.5, 2.0)  # least and greatest that is looked for where nothing is known
-LEAST_SPREAD = 0.13  # of the logarithm of a scale: a page is read wrongly at times, but its doors are as wide as doors
-SPREADS = 3.0  # of an estimated scale, that are looked for
+TRIED_SCALES = (0.5, 2.0)  # least and greatest that is looked for
 SCALE_STEP = 0.01  # of the logarithm
 HEAP_BIN = 0.1  # m
 HEAP_SIGMAS = (0.15, 1.0)  # m: heaps are sharper than the second and no sharper than the first
@@ -194,25 +192,16 @@ def select_strongest(hypotheses: list[PoseHypothesis]) -> list[PoseHypothesis]:
 
 
 def search_scaled(
-    a: Sequence[PlanFields],
-    b: Sequence[PlanFields],
-    proposed: Sequence[Sim3] = (),
-    yaws: Sequence[float] = (),
-    scales: tuple[float, float] | None = None,
+    a: Sequence[PlanFields], b: Sequence[PlanFields], proposed: Sequence[Sim3] = (), yaws: Sequence[float] = ()
 ) -> list[PoseHypothesis]:
-    """Return hypotheses of T_ab with their scale, refined, best first. Arguments as of `search.search`.
-
-    Args:
-        scales: the least and the greatest scale (`find_scale_range`); None: `TRIED_SCALES`, and those of rooms beyond.
-    """
-    least, most = scales or TRIED_SCALES
+    """Return hypotheses of T_ab with their scale, refined, best first. Arguments as of `search.search`."""
     hypotheses = [PoseHypothesis(pose, from_rooms=True) for pose in proposed]
     pairs = [(v, w) for v in a for w in b if min(len(v.walls), len(w.walls)) >= SEARCH.least_walls]
     pairs.sort(key=lambda p: -min(len(p[0].walls), len(p[1].walls)))
     for v, w in pairs[:4]:
         turns = select_distinct_yaws([*find_yaw_candidates(v.profile, w.profile, 5), *yaws, *(pose.yaw for pose in proposed)])
         correlators: dict[float, Correlator] = {}
-        for _, yaw, scale in find_scale_candidates(v, w, turns, (least, most))[:SCALE_YAWS]:
+        for _, yaw, scale in find_scale_candidates(v, w, turns)[:SCALE_YAWS]:
             offset = find_height_offsets([v.plan], [w.plan], scale)[0]
             upper = float(np.exp(np.ceil(np.log(scale) / SHARED_SCALES) * SHARED_SCALES))
             if upper not in correlators:  # half of the time is what concerns map a alone
@@ -221,28 +210,16 @@ def search_scaled(
                 share = score / max(np.sqrt(len(v.walls) * len(w.walls)) * scale, 1.0)  # larger maps meet more walls
                 hypotheses.append(PoseHypothesis(Sim3(yaw, (x, y, offset), scale), share))
     best = refine(a, b, select_strongest(hypotheses), True)
-    # Refinement may run away.
-    return [h for h in best if (h.from_rooms and scales is None) or least <= h.transform.scale <= most]
+    return [h for h in best if h.from_rooms or TRIED_SCALES[0] <= h.transform.scale <= TRIED_SCALES[1]]  # refinement may run away
 
 
-def find_scale_range(a: float | None, b: float | None) -> tuple[float, float] | None:
-    """Find the least and the greatest scale of T_ab by the spreads of the scales of both maps; None where neither is known to be
-    estimated: a unit that nobody knows may be any."""
-    if a is None and b is None:
-        return None
-    reach = float(np.exp(SPREADS * max(np.hypot(a or 0.0, b or 0.0), LEAST_SPREAD)))
-    return max(1 / reach, TRIED_SCALES[0]), min(reach, TRIED_SCALES[1])
-
-
-def find_scale_candidates(
-    v: PlanFields, w: PlanFields, yaws: Sequence[float], scales: tuple[float, float] = TRIED_SCALES
-) -> list[tuple[float, float, float]]:
+def find_scale_candidates(v: PlanFields, w: PlanFields, yaws: Sequence[float]) -> list[tuple[float, float, float]]:
     """Find (score, yaw, scale) whose wall spacings agree, best first; for each yaw the separate peaks over the scale."""
-    logs = np.arange(np.log(scales[0]), np.log(scales[1]) + SCALE_STEP, SCALE_STEP)
+    logs = np.arange(np.log(TRIED_SCALES[0]), np.log(TRIED_SCALES[1]) + SCALE_STEP, SCALE_STEP)
     main = v.main_direction
     axes = np.array([[np.cos(main), -np.sin(main)], [np.sin(main), np.cos(main)]])  # columns: along and across
     first, second = _sample(v.walls), _sample(w.walls)
-    span = np.hypot(*np.ptp(first, axis=0)) + scales[1] * np.hypot(*np.ptp(second, axis=0))
+    span = np.hypot(*np.ptp(first, axis=0)) + TRIED_SCALES[1] * np.hypot(*np.ptp(second, axis=0))
     size = fft.next_fast_len(int(span / HEAP_BIN) + 16, real=True)
     fixed = [np.conj(fft.rfft(_compute_heap_profiles((first - first.min(axis=0)) @ axes[:, k : k + 1], size)[0])) for k in (0, 1)]
     candidates = []

@@ -246,7 +246,6 @@ class PointCloud:
         upright: z is known to be up, so that nobody needs to level it: of a plan, a building model, a simulated scan.
         landmarks: signs, tags, radio, pressure, objects and names in the file's frame, m; of portions the last one has them.
         drawn_doors: (k, 4) floor on which a drawing shows doors: place, m, and how probably; likewise.
-        scale_spread: standard deviation of the logarithm of its scale, where that was estimated, as of a drawing; likewise.
 
     Raises:
         ValueError: arrays of other shapes, or points that are no array of numbers.
@@ -266,7 +265,6 @@ class PointCloud:
     upright: bool = False
     landmarks: Landmarks | None = None
     drawn_doors: Array | None = None
-    scale_spread: float = 0.0
 
     def __post_init__(self) -> None:
         numbers = isinstance(self.points, np.ndarray) and self.points.dtype.kind in "biuf"

@@ -14,7 +14,6 @@ from topomerge.types.grid import Array, Sim3, VoxelGrid, require
 from topomerge.types.landmarks import Landmarks
 
 EDITED = "edits"  # parameter of a corrected map: how many edits made it
-SCALE_SPREAD = "scale_spread"  # parameter of a map whose scale was estimated, as of a drawing: deviation of its logarithm
 LEVELLED = "levelled"  # parameter of a map whose cloud was tilted: the matrix, row by row
 ROUNDING = 1e-9  # by which a rotation in a file may miss one
 

@@ -20,7 +20,7 @@ from topomerge.fusion.inputs import FEW_MAPS
 from topomerge.landmarks.map_search import build_landmark_index
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.registration.judge import Judge
-from topomerge.registration.search import find_scale_range, search, search_scaled
+from topomerge.registration.search import search, search_scaled
 from topomerge.registration.verify import rank
 from topomerge.types import Array, Sim3
 
@@ -145,11 +145,7 @@ def compute_coarse_log_odds(maps: Maps, i: int, j: int, scale: str = "fixed") ->
     pair, coarse = build_coarse_key(maps, i, j), maps.memory.coarse
     if pair not in coarse:
         first, second = sorted((maps.get_prepared(i), maps.get_prepared(j)), key=lambda m: m.order)
-        if scale == "free":
-            scales = find_scale_range(first.scale_spread, second.scale_spread)
-            hypotheses = search_scaled(first.storeys, second.storeys, scales=scales)
-        else:
-            hypotheses = search(first.storeys, second.storeys)
+        hypotheses = (search_scaled if scale == "free" else search)(first.storeys, second.storeys)
         ranked = rank(hypotheses, Judge(first.storeys, second.storeys))
         coarse[pair] = ranked[0].score if ranked else NO_POSE
     return coarse[pair]
