@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from topomerge.errors import InputError
 from topomerge.io import grid, read_points
-from topomerge.io.grid import is_inverted, measure_outside_share
+from topomerge.io.floor_masks import is_inverted, measure_outside_share
 
 CELL = 0.05  # m a pixel
 WALL, FLOOR, UNKNOWN = 0, 254, 205
@@ -176,7 +176,7 @@ def test_floor_outside_of_walls_is_told(tmp_path: Path, angle: int) -> None:
 def test_large_pictures_are_looked_at_in_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     picture = two_rooms(FLOOR)
     whole = measure_outside_share(picture == WALL, picture == FLOOR)
-    monkeypatch.setattr("topomerge.io.grid.SAMPLED_PIXELS", 6000)
+    monkeypatch.setattr("topomerge.io.floor_masks.SAMPLED_PIXELS", 6000)
     assert measure_outside_share(picture == WALL, picture == FLOOR) == pytest.approx(whole, abs=0.05)
 
 

@@ -35,7 +35,8 @@ from topomerge.io.bag_file import (
 )
 from topomerge.io.bag_landmarks import PACKED, CloudSample, LandmarkReader
 from topomerge.io.depth_images import Camera, PosedScan, iter_pieces, read_pixels, unproject_depth
-from topomerge.io.grid import check_outside_floor, classify, extrude
+from topomerge.io.floor_masks import check_outside_floor
+from topomerge.io.grid import classify, extrude
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error, read_in_subprocess
 from topomerge.io.trajectory import BACKWARD, LONGEST_GAP, WORLD_NAMES, FrameTree, Trajectory, read_trajectory
 from topomerge.types import Array

@@ -398,18 +398,9 @@ def trace_drawing(
         warnings.append(f"{path.name}: its page was {', '.join(page.mended)} first; places are those on that page")
     dimensions: tuple[PictureText, ...] = ()
     if resolution is None:
-        scale = estimate_scale(drawing, texts or ())
-        if known is not None:
-            far = 0.0 if scale is None else abs(np.log(scale.resolution / known))
-            if scale is None or far <= (AGREEING if scale.written else ODD_DOORS * scale.spread):
-                scale = DrawingScale(known, 0.0, (f"1:{stated:g}",))
-            elif not scale.written:  # printed on paper of another size
-                warnings.append(
-                    f"{path.name}: 1:{stated:g} is written on it, of which its doors would be of odd widths; not taken"
-                )
-        if scale is None:
-            more = "" if texts is not None else " (pip install topomerge[text] reads what is written on it)"
-            raise InputError(f"{path}: an image does not say how large a pixel is; give --resolution in metres a pixel{more}")
+        stated_scale = None if known is None else (known, f"1:{stated:g}")
+        scale, doubts = settle_scale(path, drawing, texts, stated_scale)
+        warnings += doubts
         known, dimensions = scale.resolution, scale.dimensions
         why = ", ".join(repr(reason) if scale.written else reason for reason in scale.reasons[:3])
         warnings.append(f"{path.name}: {known:.4g} m a pixel, give or take {scale.spread:.0%}, by {why}; --resolution sets it")
@@ -424,12 +415,35 @@ def trace_drawing(
     return TracedDrawing(drawing, known / zoom, tuple(placed), tuple(warnings))
 
 
+def settle_scale(
+    path: Path, drawing: ParsedDrawing, texts: Sequence[PictureText] | None, stated: tuple[float, str] | None
+) -> tuple[DrawingScale, list[str]]:
+    """Return the size of a pixel, and doubts: as stated, unless what is written in rooms or the widths of doors contradict.
+
+    Args:
+        stated: m a pixel by the scale that the page states, and how that reads.
+
+    Raises:
+        InputError: nothing says how large it is.
+    """
+    scale = estimate_scale(drawing, texts or ())
+    if stated is not None:
+        far = 0.0 if scale is None else abs(np.log(scale.resolution / stated[0]))
+        if scale is None or far <= (AGREEING if scale.written else ODD_DOORS * scale.spread):
+            return DrawingScale(stated[0], 0.0, (stated[1],)), []
+        if not scale.written:
+            return scale, [f"{path.name}: {stated[1]} is written on it, of which its doors would be of odd widths; not taken"]
+    if scale is None:
+        more = "" if texts is not None else " (pip install topomerge[text] reads what is written on it)"
+        raise InputError(f"{path}: an image does not say how large a pixel is; give --resolution in metres a pixel{more}")
+    return scale, []
+
+
 def explain_missing_walls(path: Path, picture: Array) -> str:
     """Explain why a picture (h, w, 3) has no rooms, and what to do."""
-    if np.ptp(picture.mean(axis=2, dtype=np.float32)) < BLANK:
-        return "nothing is drawn on it"
     advice = "" if path.suffix.lower() in (".pdf", ".svg") else "; if it is a robot's grid, give --no-drawing"
-    return f"no walls around a room were found in it{advice}"
+    blank = np.ptp(picture.mean(axis=2, dtype=np.float32)) < BLANK
+    return "nothing is drawn on it" if blank else f"no walls around a room were found in it{advice}"
 
 
 def build_name_landmarks(

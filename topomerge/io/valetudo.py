@@ -22,7 +22,7 @@ from scipy import ndimage
 
 from topomerge.errors import InputError
 from topomerge.io import grid
-from topomerge.io.grid import check_outside_floor
+from topomerge.io.floor_masks import check_outside_floor
 from topomerge.io.piece import Piece, ReadOptions, build_damage_error
 from topomerge.types import Array, Landmarks, build_landmarks
 
