@@ -270,6 +270,18 @@ STEPS = """() => { window.seen = new Set(); document.addEventListener("studio:jo
 }); }"""
 
 
+def test_news_of_the_folder_do_not_lose_a_click(context: Any) -> None:
+    page = context.new_page()
+    page.goto(context.address)
+    page.locator("li[data-path] >> text=Open").first.hover()
+    page.mouse.down()
+    with page.expect_response("**/api/folder"):
+        page.evaluate("document.dispatchEvent(new CustomEvent('studio:folder'))")
+    page.wait_for_timeout(200)  # the answer is shown
+    page.mouse.up()
+    page.wait_for_function("() => document.getElementById('view').dataset.version === '0'")
+
+
 def save_two(folder: Path) -> None:
     """Two maps of one office in a folder."""
     from tests.fusion.atlas.atlas_scenes import office_map

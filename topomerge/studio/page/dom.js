@@ -18,6 +18,23 @@ export function button(words, onclick, settings = {}) {
   return el("button", { type: "button", onclick, ...settings }, words);
 }
 
+// Shows `fresh` in `place`. What is there and equal stays: a click that is under way on it would be lost with it.
+export function showAll(place, fresh) {
+  const old = [...place.children], kept = new Set();
+  for (const node of fresh) {
+    const same = old.find((one) => !kept.has(one) && one.isEqualNode(node));
+    const boxes = same ? [...same.querySelectorAll("input[type=checkbox]")] : [];
+    node.querySelectorAll("input[type=checkbox]").forEach((box, k) => { if (boxes[k]) boxes[k].checked = box.checked; });
+    kept.add(same ?? node);
+  }
+  for (const one of old) if (!kept.has(one)) one.remove();
+  let next = place.firstElementChild;
+  for (const node of kept) {
+    if (node === next) next = next.nextElementSibling;
+    else place.insertBefore(node, next);
+  }
+}
+
 export function toast(words, kind = "") {
   const note = el("div", { class: `toast ${kind}` }, words);
   document.getElementById("toasts").append(note);

@@ -1,7 +1,7 @@
 // The view of the folder: what lies in it, files that are dropped, and the jobs.
 
 import { encodePath, get, post, remove, send } from "./api.js";
-import { button, el, formatBytes, formatPercent, toast } from "./dom.js";
+import { button, el, formatBytes, formatPercent, showAll, toast } from "./dom.js";
 
 const STATES = { waiting: "waits", running: "runs", done: "done", failed: "failed", cancelled: "cancelled" };
 const KINDS = { extract: "Extract", merge: "Merge", compare: "Compare" };
@@ -11,7 +11,8 @@ export class FolderView {
     Object.assign(this, { place, chosen: new Set(), jobs: new Map(), entries: [], uploads: new Map() });
     this.list = el("div", { class: "lists" });
     this.actions = el("div", { class: "actions", hidden: true });
-    this.work = el("div", { class: "jobs" });
+    this.rows = el("ul");
+    this.work = el("div", { class: "jobs", hidden: true }, el("h2", {}, "Work"), this.rows);
     this.input = el("input", { type: "file", multiple: true, hidden: true, onchange: () => { this.sendAll([...this.input.files]); this.input.value = ""; } });
     this.drop = el("button", { type: "button", class: "drop", onclick: () => this.input.click() }, el("b", {}, "Add scans, plans or maps"), el("span", {}, "Drop files here, or click to choose them."));
     place.replaceChildren(el("div", { class: "folder" }, el("div", { class: "main" }, this.actions, this.list), el("aside", { class: "side" }, this.drop, this.input, this.work)));
@@ -78,7 +79,7 @@ export class FolderView {
       ["Pages", of("page"), (one) => this.showPage(one)],
       ["Scans with a map", scans.filter((one) => one.extracted), (one) => this.showScan(one, true)],
     ];
-    this.list.replaceChildren(...sections.filter(([, items, , empty]) => items.length || empty).map(([title, items, row, empty]) =>
+    showAll(this.list, sections.filter(([, items, , empty]) => items.length || empty).map(([title, items, row, empty]) =>
       el("section", {}, el("h2", {}, title, el("small", {}, items.length ? ` ${items.length}` : "")), items.length ? el("ul", { class: "entries" }, items.map(row)) : el("p", { class: "sub" }, empty))));
     this.showActions();
     this.showJobs();
@@ -119,7 +120,8 @@ export class FolderView {
   showJobs() {
     const uploads = [...this.uploads.values()].map((row) => el("li", { class: "running" }, el("div", { class: "row" }, el("b", {}, `Send ${row.name}`), el("span", { class: "grow" }), button("Cancel", () => row.cancel())), el("progress", { max: 1, value: row.share })));
     const jobs = [...this.jobs.values()].reverse().map((job) => this.showJob(job));
-    this.work.replaceChildren(...(uploads.length + jobs.length ? [el("h2", {}, "Work"), el("ul", {}, uploads, jobs)] : []));
+    this.work.hidden = !(uploads.length + jobs.length);
+    showAll(this.rows, [...uploads, ...jobs]);
   }
 
   showJob(job) {
