@@ -146,6 +146,8 @@ def test_patterns() -> None:
     assert fits("2.113") == ["2.113"] and fits("2?113") == ["2.113", "2x113"] and fits(" exit ") == ["EXIT"]
     assert fits("2*", "(1)") == ["2.113", "2x113", "(1)"] and fits("") == [] and len(fits("*")) == 5
     assert not match_values(landmarks, ("tag",), ["*"]).any()
+    landmarks = build_landmarks("text", ["C-209", "c 209", "C\u2013209", "C.209"], "here")
+    assert fits("c209") == fits("C-209") == ["C-209", "c 209", "C\u2013209"]
 
 
 def test_find_in_maps_folders_and_atlases(marked: Run) -> None:

@@ -142,15 +142,19 @@ def _select_rows(args: argparse.Namespace, landmarks: Landmarks) -> Array:
 def match_values(landmarks: Landmarks, kinds: Sequence[str], patterns: Sequence[str]) -> Array:
     """Return (n,) bool: is it of these kinds, and its string one of the patterns?
 
-    Case and blanks do not count; `*` stands for any signs, `?` for one.
+    Case, blanks and hyphens do not count (C-209 is c209); `*` stands for any signs, `?` for one.
     """
     import numpy as np
 
-    parts = ["".join(pattern.casefold().split()) for pattern in patterns]
+    parts = [_drop_blanks(pattern) for pattern in patterns]
     any_of = re.compile("|".join(re.escape(word).replace(r"\*", ".*").replace(r"\?", ".") for word in parts))
-    fits = [any_of.fullmatch("".join(value.casefold().split())) is not None for value in landmarks.values]
+    fits = [any_of.fullmatch(_drop_blanks(value)) is not None for value in landmarks.values]
     out: Array = np.array([*fits, False], bool)[landmarks.table["value"]] & landmarks.is_kind(*kinds)
     return out
+
+
+def _drop_blanks(text: str) -> str:
+    return re.sub(r"[\s\u00ad\u2010-\u2015-]", "", text.casefold())
 
 
 def run_find(args: argparse.Namespace) -> int:
@@ -283,6 +287,6 @@ FIND = Command(
         build_json_option("print JSON instead of a table"),
     ),
     paths=("inputs",),
-    description="Find landmarks: map, storey, room and place of each. Case and blanks do not count; `*` and `?` stand for any "
-    "signs. --text also finds names of rooms. Status 2: nothing was found.",
+    description="Find landmarks: map, storey, room and place of each. Case, blanks and hyphens do not count; `*` and `?` stand for "
+    "any signs. --text also finds names of rooms. Status 2: nothing was found.",
 )
