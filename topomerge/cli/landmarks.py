@@ -287,6 +287,6 @@ FIND = Command(
         build_json_option("print JSON instead of a table"),
     ),
     paths=("inputs",),
-    description="Find landmarks: map, storey, room and place of each. Case, blanks and hyphens do not count; `*` and `?` stand for "
-    "any signs. --text also finds names of rooms. Status 2: nothing was found.",
+    description="Find landmarks: map, storey, room and place of each. Case, blanks and hyphens do not count; `*` and `?` stand "
+    "for any signs. --text also finds names of rooms. Status 2: nothing was found.",
 )
