@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +155,10 @@ class Perceptrons(nn.Module):
             nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, 1)) for _ in range(networks)
         )
 
+    def forward(self, inputs: Sequence[Tensor]) -> list[Tensor]:
+        """Return the scores (n,) of each network of its own inputs (n, k)."""
+        return [member(rows)[:, 0] for member, rows in zip(self.members, inputs, strict=True)]
+
     def merge_layers(self) -> list[tuple[Array, Array]]:
         """Return the mean of their scores as one network with as many times the hidden units: weights (in, out) and biases."""
         first = [member[0] for member in self.members]  # type: ignore[index]
@@ -206,8 +210,8 @@ class DoorJob(NetworkJob):
         for group in self.optimizer.param_groups:
             group["lr"] = options.rate * 0.5 * (1 + math.cos(math.pi * state.epoch / options.epochs))
         losses = []
-        for member, (inputs, answers, weight) in zip(self.network.members, batch, strict=True):  # type: ignore[arg-type]
-            scores = member(inputs)[:, 0]
+        predicted = self.network([inputs for inputs, _, _ in batch])
+        for scores, (_, answers, weight) in zip(predicted, batch, strict=True):
             each = nn.functional.binary_cross_entropy_with_logits(scores, answers, reduction="none")
             losses.append((each * weight).mean())
         taken = descend_gradient(self.optimizer, torch.stack(losses).sum(), state)

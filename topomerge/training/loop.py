@@ -26,6 +26,7 @@ from topomerge.errors import InputError
 from topomerge.models.export import check_exporter, export_network, run_with_torch
 from topomerge.networks.network import Run, Signature
 from topomerge.registry import SCHEDULES, TASKS
+from topomerge.training.compilation import choose_step_context
 from topomerge.training.descent import build_optimizer
 from topomerge.training.instruments import (
     AVERAGE_FILE,
@@ -34,7 +35,6 @@ from topomerge.training.instruments import (
     TRACE_FILE,
     StepTracer,
     WeightAverage,
-    find_anomaly,
     name_top,
     rank_epochs,
     tidy_top,
@@ -150,6 +150,7 @@ class Loop:
             self.average.load(find_state_folder(self.settings.folder / "last") / AVERAGE_FILE)
         if state.scaler:
             job.get_scaler().load_state_dict(state.scaler)
+        self.step_context = choose_step_context(self.settings, job.network)
         self.traces = self.settings.profile and log is not None
 
     def run(self) -> dict[str, float]:
@@ -256,7 +257,7 @@ class Loop:
     def _take_step(self, batch: Any) -> None:
         """Train on a batch, and count it."""
         state = self.state
-        with find_anomaly() if self.settings.anomaly else nullcontext():
+        with self.step_context():
             losses = self.job.train_step(batch, state)
         for name, value in losses.items():
             state.sums[name] = state.sums.get(name, 0.0) + value
@@ -411,10 +412,6 @@ class NetworkJob(ABC):
     def write_network(self, folder: Path) -> None:
         """Write the weights as torch has them."""
         write_network(self.network, folder)
-
-    def move_to_device(self, batch: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, ...]:
-        """Move a batch to the device of the network."""
-        return tuple(tensor.to(self.device, non_blocking=True) for tensor in batch)
 
     def optimize(self, loss: torch.Tensor, options: Any, state: State) -> dict[str, float]:
         """Take a step of the optimizer at the rate of its place in the run: it rises over `options.warmup` steps, then falls."""

@@ -122,25 +122,29 @@ class PlaceJob(ExportedJob):
         super().__init__(settings, PlaceNetwork(settings.widths, settings.dropout), origin)
         self.options, self.learned, self.watched = settings, learned, watched
         self.probability = learned.weight / learned.weight.sum()
+        self.planes, self.right = (
+            torch.from_numpy(learned.planes).to(self.device),
+            torch.from_numpy(learned.right).to(self.device),
+        )
 
-    def iter_batches(self, state: State) -> Generator[tuple[torch.Tensor, ...], None, None]:
-        """Yield squares, from a generator of each step."""
+    def iter_batches(self, state: State) -> Generator[tuple[torch.Tensor, torch.Tensor], None, None]:
+        """Yield squares, by a generator of each step."""
         self.network.train()
-        options, learned = self.options, self.learned
+        options = self.options
         for step in range(state.step, options.steps):
             rng = self.start_generator(1, state.epoch, step)
-            rows = rng.choice(len(self.probability), options.batch, p=self.probability)
-            x = augment_planes(learned.planes[rows].astype(np.float32), options.augment, rng)
-            right = torch.from_numpy(learned.right[rows].astype(np.float32))
-            yield torch.from_numpy(x).permute(0, 3, 1, 2), right
+            rows = torch.from_numpy(rng.choice(len(self.probability), options.batch, p=self.probability)).to(self.device)
+            x = augment_planes(self.planes.index_select(0, rows).float(), options.augment, rng)
+            yield x.permute(0, 3, 1, 2), self.right[rows].float()
 
-    def train_step(self, batch: tuple[torch.Tensor, ...], state: State) -> dict[str, float]:
+    def train_step(self, batch: tuple[torch.Tensor, torch.Tensor], state: State) -> dict[str, float]:
         """Take one step of the optimizer."""
-        options, (x, right) = self.options, self.move_to_device(batch)
+        options, (x, right) = self.options, batch
+        torch.manual_seed(derive_seed(options.seed, state.epoch, state.step, self.fabric.global_rank, 1))  # of the dropout
         loss = functional.binary_cross_entropy_with_logits(self.network(x), right)
         return self.optimize(loss, options, state)
 
-    def count_items(self, batch: tuple[torch.Tensor, ...]) -> int:
+    def count_items(self, batch: tuple[torch.Tensor, torch.Tensor]) -> int:
         """Count the squares of a batch."""
         return len(batch[0])
 
@@ -154,15 +158,15 @@ class PlaceJob(ExportedJob):
         return score_places(compute_network_log_odds(self.watched.planes, self.run()), self.watched.right, self.watched.weight)
 
 
-def augment_planes(x: Array, augment: PlaceAugment, rng: np.random.Generator) -> Array:
+def augment_planes(x: torch.Tensor, augment: PlaceAugment, rng: np.random.Generator) -> torch.Tensor:
     """Return planes (n, side, side, PLANES) turned by quarters and mirrored, and some without what is above a body."""
-    x = np.rot90(x, int(rng.integers(4)), axes=(1, 2))
-    x = np.array(x[:, ::-1] if rng.random() < 0.5 else x)
-    blind = rng.random(len(x)) < augment.upper
-    for plane in UPPER_PLANES:
-        x[blind, :, :, plane] = 0
-    noise = rng.normal(1.0, augment.noise, (len(x), 1, 1, x.shape[3]))
-    return np.asarray(x * noise, np.float32)
+    count, planes = len(x), x.shape[3]
+    turned = torch.rot90(x, int(rng.integers(4)), (1, 2))
+    mirrored = turned.flip(1) if rng.random() < 0.5 else turned
+    blind = rng.random(count) < augment.upper
+    factor = rng.normal(1.0, augment.noise, (count, planes))
+    factor[np.ix_(blind, UPPER_PLANES)] = 0
+    return mirrored.contiguous() * torch.from_numpy(factor.astype(np.float32)).to(x.device)[:, None, None]
 
 
 def score_places(odds: Array, right: Array, weight: Array) -> dict[str, float]:

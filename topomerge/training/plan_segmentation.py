@@ -25,6 +25,8 @@ from topomerge.extraction.plans.plan_network import (
 from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES
 from topomerge.models.convolutional import PlanProbabilities, PlanUNet
 from topomerge.networks.network import Run
+from topomerge.training.grid_noise import add_grid_noise
+from topomerge.training.hashed_random import draw_uniforms
 from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, prefetch_batches, run_network
 from topomerge.training.packed_pairs import mark_watched, read_scan_building
 from topomerge.training.processes import let_main_process_first
@@ -32,105 +34,18 @@ from topomerge.training.scan_settings import GridSegmentation, PlanAugment, Plan
 from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
 
-SQUARE = np.ones((3, 3))
-MOST_THINGS = 14
-KNOWN_CHANNEL, WALL_CHANNEL, FULL_CHANNELS, GROUND_CHANNEL, TOP_CHANNEL = 0, 1, (2, 3, 4, 5, 8), 6, 9  # of `evidence`
-WALL_TOP = -0.6  # of walls that are raised, in the last of these
-
-
-def add_grid_noise(x: Array, room: Array, rng: np.random.Generator) -> Array:
-    """Return (n, n, 11) evidence of a crop of a grid, changed.
-
-    Args:
-        x: as of `plan_network.compute_evidence`; room: (n, n) bool, truly inside of a room: things stand there.
-    """
-    inside, wall = x[..., KNOWN_CHANNEL] > 0, x[..., WALL_CHANNEL] > 0
-    if rng.random() < 0.35:
-        inside, wall = _warp_walls(inside, wall, rng)
-    if rng.random() < 0.5:
-        wall = wall & ndimage.binary_dilation(inside, SQUARE)  # the cells that a ray meets
-    if rng.random() < 0.5:
-        inside, wall = _add_furniture(inside, wall, room, rng)
-    if rng.random() < 0.12:
-        rows = _draw_seat_rows(inside & room, rng) & ndimage.binary_erosion(room, SQUARE, 2)
-        inside, wall = inside & ~rows, wall | rows
-    if rng.random() < 0.5:
-        wall = wall & ~_sample_patches(wall.shape, rng.uniform(0.05, 0.5), rng)
-    if rng.random() < 0.3:
-        inside = inside & ~_sample_patches(wall.shape, rng.uniform(0.01, 0.15), rng)
-    if rng.random() < 0.25:
-        inside = inside & ndimage.binary_erosion(inside | wall, SQUARE)
-    if rng.random() < 0.3:
-        wall = wall | (inside & (rng.random(wall.shape) < rng.uniform(0.0005, 0.006)))
-    return _convert_to_evidence(x, inside & ~wall, wall)
-
-
-def _convert_to_evidence(x: Array, inside: Array, wall: Array) -> Array:
-    out = x.copy()
-    out[..., KNOWN_CHANNEL], out[..., WALL_CHANNEL], out[..., GROUND_CHANNEL] = inside, wall, inside | wall
-    out[..., list(FULL_CHANNELS)] = wall[..., None]
-    out[..., TOP_CHANNEL] = np.where(wall, WALL_TOP, 0.0)
-    return out
-
-
-def _sample_smooth_field(shape: tuple[int, ...], sigma: float, rng: np.random.Generator) -> Array:
-    field = ndimage.gaussian_filter(rng.standard_normal(shape), sigma, mode="wrap")
-    return np.asarray(field / field.std())
-
-
-def _sample_patches(shape: tuple[int, ...], share: float, rng: np.random.Generator) -> Array:
-    """Return (n, n) bool, smooth patches that cover a share of a crop."""
-    field = _sample_smooth_field(shape, rng.uniform(1, 5), rng)
-    return np.asarray(field > np.quantile(field, 1 - share))
-
-
-def _warp_walls(inside: Array, wall: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Move walls by a column or so, differently from place to place."""
-    at = np.indices(inside.shape)
-    moved = [a + _sample_smooth_field(inside.shape, rng.uniform(1.5, 6), rng) * rng.uniform(0.2, 1.0) for a in at]
-    i, j = (np.clip(np.rint(m), 0, n - 1).astype(int) for m, n in zip(moved, inside.shape, strict=True))
-    return inside[i, j], wall[i, j]
-
-
-def _add_furniture(inside: Array, wall: Array, room: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Add boxes on the floor, full, hollow, or unseen altogether."""
-    inside, wall = inside.copy(), wall.copy()
-    places = np.argwhere(ndimage.binary_erosion(inside & room, SQUARE))
-    for _ in range(int(rng.integers(1, MOST_THINGS)) if len(places) else 0):
-        middle = places[rng.integers(len(places))]
-        size = rng.integers(1, 9, 2) if rng.random() < 0.6 else rng.integers(1, 3, 2)
-        box = tuple(slice(max(int(m - s // 2), 0), int(m + s - s // 2)) for m, s in zip(middle, size, strict=True))
-        floor, rim = room[box], np.ones(room[box].shape, bool)
-        kind = int(rng.integers(3))
-        rim[1:-1, 1:-1] = kind == 0
-        inside[box] &= ~floor
-        if kind < 2:
-            wall[box] |= floor & rim
-    return inside, wall
-
-
-def _draw_seat_rows(floor: Array, rng: np.random.Generator) -> Array:
-    """Return (n, n) bool, parallel rows, whole or of single seats, somewhere on a large floor."""
-    places = np.argwhere(ndimage.binary_erosion(floor, SQUARE, 6))
-    if not len(places):
-        return np.zeros(floor.shape, bool)
-    i, j = np.indices(floor.shape) - places[rng.integers(len(places))][:, None, None]
-    turn = rng.uniform(0, np.pi) if rng.random() < 0.5 else 0.0
-    u, v = i * np.cos(turn) + j * np.sin(turn), j * np.cos(turn) - i * np.sin(turn)
-    rows = (np.abs(u) < rng.integers(10, 45) / 2) & (np.abs(v) < rng.integers(12, 50) / 2)
-    rows &= u % rng.uniform(6, 12) < rng.uniform(1, 3)
-    if rng.random() < 0.6:
-        rows &= v % rng.uniform(5, 9) < rng.uniform(2, 5)
-    return np.asarray(rows)
-
-
 LEAST_PROBABILITY = 1e-6  # of which a logarithm is taken
 LEAST_COLUMNS = 100  # inside of a plan that trains
 BARE_EVERY = 4  # plans that are shown as grids: one without furniture
 LASER_HEIGHTS, RAISED_HEIGHTS, FLOOR_HEIGHTS = (0.2, 0.5), (0.0, 2.4), (-0.1, 0.1)  # m: robots look there; walls of grids; floors
 UPPER_CHANNELS, FLOOR_CHANNEL = (5, 7, 8, 9), (6,)  # of `evidence`
+LOST_CHANNELS = slice(1, 10)  # of columns that are lost: all but whether they are known and how large they are
 FLOOR_LOST = 0.3  # share of the crops without an upper half that lose their floor instead
+OUTSIDE, INSIDE = (TRUE_CLASSES.index(name) for name in ("outside", "inside"))
+QUARTER_TURNS = np.array([[[1, 0, 0], [0, 1, 0]], [[0, 1, 0], [-1, 0, 1]], [[-1, 0, 1], [0, -1, 1]], [[0, -1, 1], [1, 0, 0]]])
+LOST_COLUMNS = 1  # stream of random numbers of a crop
 PlanTensors = tuple[Array, Array, Array]  # evidence, truth and weight of each column
+Crops = tuple[torch.Tensor, torch.Tensor, torch.Tensor]  # (n, 11, side, side) evidence, (n, side, side) truth and weight
 
 
 def fit(settings: PlanSegmentation, log_line: LogFn) -> dict[str, float]:
@@ -164,34 +79,31 @@ class PlanJob(ExportedJob):
         origin = {"set": settings.data.name, "split": settings.data.split, "plans": len(learned), "watched": len(watched)}
         super().__init__(settings, PlanUNet(settings.widths), origin)
         self.options, self.watched = settings, watched
-        self.plans = [build_plan_tensors(e, settings.loss) for e in learned]
+        plans = [build_plan_tensors(e, settings.loss) for e in learned]
+        self.plans = PackedPlans(plans, settings.crop, settings.augment, self.device)
         probability = np.sqrt([float(e.room.size) for e in learned])
         self.probability = probability / probability.sum()
 
-    def iter_batches(self, state: State) -> Generator[tuple[torch.Tensor, ...], None, None]:
+    def iter_batches(self, state: State) -> Generator[Crops, None, None]:
         """Yield crops."""
         self.network.train()
         yield from prefetch_batches(self.iter_crops(state))
 
-    def iter_crops(self, state: State) -> Iterator[tuple[torch.Tensor, ...]]:
-        """Yield the crops of the state's epoch from its step on, from a generator of each step."""
+    def iter_crops(self, state: State) -> Iterator[Crops]:
+        """Yield the crops of the state's epoch from its step on, by a generator of each step."""
         options = self.options
         for step in range(state.step, options.steps):
             rng = self.start_generator(1, state.epoch, step)
-            rows = rng.choice(len(self.plans), options.batch, p=self.probability)
-            crops = [crop(self.plans[row], options.crop, options.augment, rng) for row in rows]
-            x, truth, weight = (np.stack(arrays) for arrays in zip(*crops, strict=True))
-            labels = torch.from_numpy(truth.astype(np.int64))
-            yield torch.from_numpy(x).permute(0, 3, 1, 2), labels, torch.from_numpy(weight.astype(np.float32))
+            yield self.plans.sample_crops(rng.choice(len(self.probability), options.batch, p=self.probability), rng)
 
-    def train_step(self, batch: tuple[torch.Tensor, ...], state: State) -> dict[str, float]:
+    def train_step(self, batch: Crops, state: State) -> dict[str, float]:
         """Take one step of the optimizer."""
-        options, (x, truth, weight) = self.options, self.move_to_device(batch)
+        options, (x, truth, weight) = self.options, batch
         each = functional.cross_entropy(self.network(x), truth, reduction="none")
         loss = (each * weight).sum() / weight.sum()
         return self.optimize(loss, options, state)
 
-    def count_items(self, batch: tuple[torch.Tensor, ...]) -> int:
+    def count_items(self, batch: Crops) -> int:
         """Count the crops of a batch."""
         return len(batch[0])
 
@@ -230,26 +142,63 @@ def build_plan_tensors(example: PlanExample, loss: PlanLoss) -> PlanTensors:
     return compute_evidence(example.plan).astype(np.float16), example.truth, weight.astype(np.float16)
 
 
-def crop(plan: PlanTensors, side: int, augment: PlanAugment, rng: np.random.Generator) -> PlanTensors:
-    """Return (R, 1, 32, 32, 32), where cells with a point are 1, the others 0."""
-    x, truth, weight = plan
-    inside = np.argwhere(x[..., 0] > 0)
-    i, j = (inside[rng.integers(len(inside))] - rng.integers(side // 4, 3 * side // 4, 2)).tolist()
-    box = tuple(slice(max(k, 0), max(k + side, 0)) for k in (i, j))
-    pad = [(max(-k, 0), side - max(-k, 0) - (min(k + side, n) - max(k, 0))) for k, n in zip((i, j), truth.shape, strict=True)]
-    x = np.pad(x[box], [*pad, (0, 0)])
-    truth = np.pad(truth[box], pad, constant_values=TRUE_CLASSES.index("outside"))
-    weight = np.pad(weight[box], pad)
-    turn, mirror = int(rng.integers(4)), rng.random() < 0.5
-    x, truth, weight = (np.rot90(array, turn)[:: -1 if mirror else 1] for array in (x, truth, weight))
-    x = np.array(x, np.float32)
-    if rng.random() < augment.upper:
-        x[..., list(FLOOR_CHANNEL if rng.random() < FLOOR_LOST else UPPER_CHANNELS)] = 0
-    if augment.grid_noise and rng.random() < augment.grid_noise:
-        x = add_grid_noise(x, truth == TRUE_CLASSES.index("inside"), rng)
-    if rng.random() < augment.columns:
-        x[..., 1:10] *= rng.random((side, side, 1)) > rng.uniform(0, augment.lost)
-    return x, truth, weight
+class PackedPlans:
+    """The columns of all plans in one table on a device, out of which crops are gathered and changed there.
+
+    Args:
+        plans: as of `build_plan_tensors`; side: of a crop, columns.
+    """
+
+    def __init__(self, plans: Sequence[PlanTensors], side: int, augment: PlanAugment, device: torch.device) -> None:
+        self.side, self.augment, self.device = side, augment, device
+        self.shapes = np.array([truth.shape for _, truth, _ in plans])
+        self.first = np.cumsum([0, *(truth.size for _, truth, _ in plans)])
+        inside = [np.flatnonzero(x[..., 0] > 0).astype(np.int32) for x, _, _ in plans]
+        self.inside, self.first_inside = np.concatenate(inside), np.cumsum([0, *map(len, inside)])
+        around = np.zeros((1, EVIDENCE_CHANNELS), np.float16), np.full(1, OUTSIDE, np.uint8), np.zeros(1, np.float16)
+        columns = [[array.reshape(plan[1].size, *array.shape[2:]) for array in plan] for plan in plans]
+        self.evidence, self.truth, self.weight = (  # the last row is what lies around plans
+            torch.from_numpy(np.concatenate(arrays)).to(device) for arrays in zip(*columns, around, strict=True)
+        )
+
+    def sample_crops(self, plans: Array, rng: np.random.Generator) -> Crops:
+        """Sample a crop of each of (n,) plans about a place inside, turned, mirrored and changed."""
+        rows, count, augment = self._gather_rows(plans, rng), len(plans), self.augment
+        x = self.evidence.index_select(0, rows.flatten()).float().view(*rows.shape, -1)
+        truth, weight = self.truth[rows].long(), self.weight[rows].float()
+        blind, floor = rng.random(count) < augment.upper, rng.random(count) < FLOOR_LOST
+        for lost, channels in ((blind & ~floor, UPPER_CHANNELS), (blind & floor, FLOOR_CHANNEL)):
+            chosen = torch.from_numpy(np.flatnonzero(lost)).to(self.device)
+            for channel in channels:
+                x[chosen, :, :, channel] = 0
+        noisy = np.flatnonzero(rng.random(count) < augment.grid_noise)
+        if len(noisy):
+            chosen = torch.from_numpy(noisy).to(self.device)
+            x[chosen] = add_grid_noise(x[chosen], truth[chosen] == INSIDE, rng)
+        sparse = np.flatnonzero(rng.random(count) < augment.columns)
+        share, seed = rng.uniform(0, augment.lost, count)[sparse], rng.integers(0, 1 << 62, count)[sparse]
+        chosen, least, key = (torch.from_numpy(a).to(self.device) for a in (sparse, share.astype(np.float32), seed))
+        index = torch.arange(self.side**2, device=self.device).view(self.side, self.side)
+        kept = draw_uniforms(key[:, None, None], LOST_COLUMNS, index) > least[:, None, None]
+        x[chosen, :, :, LOST_CHANNELS] *= kept[..., None]
+        return x.permute(0, 3, 1, 2), truth, weight
+
+    def _gather_rows(self, plans: Array, rng: np.random.Generator) -> torch.Tensor:
+        """Return (n, side, side) rows of the table, of crops about places inside of plans, turned by quarters and mirrored."""
+        side, count, shape = self.side, len(plans), self.shapes[plans].T
+        places = self.inside[self.first_inside[plans] + (rng.random(count) * np.diff(self.first_inside)[plans]).astype(np.int64)]
+        start = np.stack([places // shape[1], places % shape[1]]) - rng.integers(side // 4, 3 * side // 4, (2, count))
+        turn = QUARTER_TURNS[rng.integers(4, size=count)] * (1, 1, side - 1)
+        mirror = rng.random(count) < 0.5
+        turn[mirror, :, 2] += turn[mirror, :, 0] * (side - 1)
+        turn[mirror, :, 0] *= -1
+        turn[..., 2] += start.T
+        down, across, corner = torch.from_numpy(turn.transpose(2, 1, 0).copy()).to(self.device)[..., None, None]
+        size, first = (torch.from_numpy(of.copy()).to(self.device)[..., None, None] for of in (shape, self.first[plans]))
+        at = torch.arange(side, device=self.device)
+        i, j = down * at[:, None] + across * at + corner
+        on_plan = (i >= 0) & (i < size[0]) & (j >= 0) & (j < size[1])
+        return torch.where(on_plan, first + i * size[1] + j, len(self.truth) - 1)
 
 
 def score_plans(examples: Sequence[PlanExample], network: Run) -> dict[str, float]:

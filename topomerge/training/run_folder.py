@@ -29,7 +29,7 @@ RUN_FILE, CONFIG_FILE, RUN_FORMAT = "run.json", "config.json", 1
 PACKAGES = ("torch", "torch-geometric", "numpy", "topomerge")
 # Keys that a run may go on with other values of: how long, where and by how many workers it trains, and what it tells.
 MAY_CHANGE = {"epochs", "patience", "accelerator", "precision", "batches", "graphs", "threads", "jobs", "cluster", "cache"}
-MAY_CHANGE |= {"name", "runs", "logger", "export", "resume", "overwrite", "top", "profile", "anomaly"}
+MAY_CHANGE |= {"name", "runs", "logger", "export", "resume", "overwrite", "top", "profile", "anomaly", "compile"}
 # Keys that follow from the `path` of one's own captures; `record_start` compares what the sets hold.
 OWN_SETS = {"data", "data.name", "heldout.name", "validation"}
 UNTOLD = {"name", "runs", "resume", "overwrite"}  # of them

@@ -47,6 +47,18 @@ def check_descent(settings: NetworkSettings) -> None:
     for key in ("epochs", "batch", "devices", "top"):
         if getattr(settings, key) < 1:
             raise InputError(f"{key} must be 1 or more, not {getattr(settings, key)}")
+    if settings.compile:
+        _check_compile(settings)
+
+
+def _check_compile(settings: NetworkSettings) -> None:
+    """Refuse settings that compiled steps cannot be combined with."""
+    if settings.devices > 1:
+        raise InputError(f"compile=true is for one process, not devices={settings.devices}; leave one of them out")
+    if settings.anomaly:
+        raise InputError("compile=true hides the operations that anomaly=true names; leave one of them out")
+    if getattr(settings, "graphs", False) and getattr(settings, "accelerator", "cpu") != "cpu":
+        raise InputError("compile=true cannot be combined with steps as CUDA graphs; add graphs=false, or leave it out")
 
 
 def _check_run(settings: RunSettings) -> None:
@@ -103,6 +115,7 @@ class NetworkSettings(RunSettings):
         top: so many of the best epochs are kept, in `top/`; 1: the best one only, in `best/`.
         profile: write a trace of a few steps, `trace.json`.
         anomaly: name the operation whose gradient is no number; slow.
+        compile: compile the network for the steps (`training.compilation`).
     """
 
     epochs: int = 10
@@ -119,6 +132,7 @@ class NetworkSettings(RunSettings):
     top: int = 1
     profile: bool = False
     anomaly: bool = False
+    compile: bool = False
 
 
 @dataclass

@@ -159,7 +159,8 @@ def check_start(settings: Any) -> None:
     """Refuse, before any data is made, what a training would stumble over later.
 
     Raises:
-        InputError: a score to watch that there is not, an accelerator that is not here, a folder that holds another run.
+        InputError: a score to watch that there is not, an accelerator or compiler that is not here, a folder that holds another
+            run.
     """
     from topomerge.training.run_folder import check_folder
 
@@ -167,6 +168,10 @@ def check_start(settings: Any) -> None:
     if settings.watch not in possible:
         raise InputError(f"watch: unknown {settings.watch!r}; {', '.join(possible)} are possible for task={settings.task}")
     check_accelerator(settings)
+    if getattr(settings, "compile", False):
+        from topomerge.training.compilation import check_compilation
+
+        check_compilation(settings)
     if getattr(settings, "init_from", "") and not TASKS[settings.task].is_descriptor:
         find_start(settings.task, settings.init_from)
     if names := [name for name in settings.logger if name != NO_LOGGER]:

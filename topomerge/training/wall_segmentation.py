@@ -28,11 +28,12 @@ from topomerge.extraction.elevations.elevation import (
 )
 from topomerge.models.convolutional import WallNetwork, WallProbabilities
 from topomerge.networks.network import Run
+from topomerge.training.hashed_random import draw_words
 from topomerge.training.loop import Exported, ExportedJob, State, derive_seed, run_network
 from topomerge.training.packed_pairs import mark_watched, read_scan_building
 from topomerge.training.plan_segmentation import compute_log_loss
 from topomerge.training.processes import let_main_process_first
-from topomerge.training.scan_settings import WallAugment, WallSegmentation
+from topomerge.training.scan_settings import WallSegmentation
 from topomerge.training.tasks import Task
 from topomerge.types import Array, LogFn
 
@@ -40,7 +41,8 @@ COARSE_CLASSES = ("wall", "open", "shut", "window")
 # Index of each of `WALL_CLASSES` among them: half-open doors are open, niches and cupboards are wall.
 COARSE_CLASS = np.array([0, 1, 2, 3, 1, 0, 0])
 ScanT = TypeVar("ScanT")
-Stretch = tuple[Array, Array, Array]  # strip, truth and weight of each place
+Stretches = tuple[torch.Tensor, torch.Tensor, torch.Tensor]  # (n, 17, length, 32) strips, (n, length / 2) truth and weight
+LOST_ELEMENTS = 1  # stream of random numbers of a stretch
 
 
 def fit(settings: WallSegmentation, log_line: LogFn) -> dict[str, float]:
@@ -83,31 +85,21 @@ class WallJob(ExportedJob):
         origin = {"set": settings.data.name, "split": settings.data.split, "scans": len(learned), "watched": len(watched)}
         super().__init__(settings, WallNetwork(settings.widths), origin)
         self.options, self.learned, self.watched = settings, learned, watched
-        self.holes = [np.flatnonzero(np.diff(scan.truth.astype(int)) != 0) for scan in learned]
+        self.walls = PackedWalls(learned, settings, self.device)
 
-    def iter_batches(self, state: State) -> Generator[tuple[torch.Tensor, ...], None, None]:
-        """Yield stretches, from a generator of each step."""
+    def iter_batches(self, state: State) -> Generator[Stretches, None, None]:
+        """Yield stretches, by a generator of each step."""
         self.network.train()
-        options = self.options
-        for step in range(state.step, options.steps):
-            rng = self.start_generator(1, state.epoch, step)
-            stretches = []
-            for row in rng.integers(len(self.learned), size=options.batch).tolist():
-                scan, holes = self.learned[row], self.holes[row]
-                middle = int(rng.integers(len(scan.truth)))
-                if len(holes) and rng.random() < options.at_holes:
-                    middle = int(rng.choice(holes) + rng.integers(-options.length // 3, options.length // 3 + 1))
-                stretches.append(sample_stretch(scan, middle, options, rng))
-            x, truth, weight = (np.stack(arrays) for arrays in zip(*stretches, strict=True))
-            yield torch.from_numpy(x).permute(0, 3, 1, 2), torch.from_numpy(truth), torch.from_numpy(weight)
+        for step in range(state.step, self.options.steps):
+            yield self.walls.sample_stretches(self.options.batch, self.start_generator(1, state.epoch, step))
 
-    def train_step(self, batch: tuple[torch.Tensor, ...], state: State) -> dict[str, float]:
+    def train_step(self, batch: Stretches, state: State) -> dict[str, float]:
         """Take one step of the optimizer."""
-        x, truth, weight = self.move_to_device(batch)
+        x, truth, weight = batch
         each = functional.cross_entropy(self.network(x), truth, reduction="none")
         return self.optimize((each * weight).sum() / weight.sum(), self.options, state)
 
-    def count_items(self, batch: tuple[torch.Tensor, ...]) -> int:
+    def count_items(self, batch: Stretches) -> int:
         """Count the stretches of a batch."""
         return len(batch[0])
 
@@ -127,43 +119,81 @@ def downsample_truth(truth: Array, strips: Array) -> tuple[Array, Array]:
     return truth[::PLACES].astype(np.int64), present
 
 
-def sample_stretch(scan: WallExample, middle: int, options: WallSegmentation, rng: np.random.Generator) -> Stretch:
-    """Sample a stretch of the wall that holds a place, changed as other scans might show it.
+class PackedWalls:
+    """The walls of all scans in one table on a device, out of which stretches are gathered and changed there.
 
     Args:
-        middle: a place of the scan's strips.
+        options: of the stretches.
     """
-    wall = int(np.clip(np.searchsorted(scan.first, middle, "right") - 1, 0, len(scan.first) - 2))
-    low, high = int(scan.first[wall]), int(scan.first[wall + 1])
-    start = max(min(middle - int(rng.integers(options.length)), high - options.length), low) & ~1
-    start = max(start, low)
-    stop = min(start + options.length, high)
-    x = np.zeros((options.length, DEPTHS, STRIP_CHANNELS), np.float32)
-    truth, weight = np.zeros(options.length, np.uint8), np.zeros(options.length // PLACES, np.float32)
-    x[: stop - start], truth[: stop - start] = scan.strips[start:stop] / np.float32(255), scan.truth[start:stop]
-    right, present = downsample_truth(truth, x)
-    weight[: (stop - start) // PLACES] = 1.0
-    weight *= np.array(options.classes, np.float32)[right] * np.where(present, 1.0, options.unseen)
-    if rng.random() < 0.5:
-        x, right, weight = x[::-1], right[::-1], weight[::-1]
-    return _corrupt_strip(x, options.augment, rng), np.ascontiguousarray(right), np.ascontiguousarray(weight, np.float32)
 
+    def __init__(self, scans: Sequence[WallExample], options: WallSegmentation, device: torch.device) -> None:
+        self.options, self.device = options, device
+        nothing = np.zeros((1, DEPTHS, STRIP_CHANNELS), np.uint8)
+        strips = torch.from_numpy(np.concatenate([*(scan.strips for scan in scans), nothing]))  # the last place is of no wall
+        self.rows = strips.view(-1, STRIP_CHANNELS).to(device)  # one of each depth of each place
+        self.present = (strips.flatten(1) > 0).any(dim=1).to(device)
+        self.truth = torch.from_numpy(np.concatenate([*(scan.truth for scan in scans), [0]]).astype(np.int64)).to(device)
+        self.classes = torch.tensor(options.classes, device=device)
+        self.lengths = np.array([len(scan.truth) for scan in scans])
+        self.first = np.cumsum([0, *self.lengths])
+        starts = list(zip(scans, self.first, strict=False))
+        self.low = np.concatenate([first + scan.first[:-1] for scan, first in starts])
+        self.high = np.concatenate([first + scan.first[1:] for scan, first in starts])
+        self.first_wall = np.cumsum([0, *(len(scan.first) - 1 for scan in scans)])
+        holes = [np.flatnonzero(np.diff(scan.truth.astype(int)) != 0) for scan in scans]
+        self.holes, self.first_hole = np.concatenate(holes), np.cumsum([0, *map(len, holes)])
 
-def _corrupt_strip(x: Array, augment: WallAugment, rng: np.random.Generator) -> Array:
-    """Return a strip with its face somewhat nearer or farther, without some of its points, and with what stands before it
-    hidden."""
-    x = np.roll(x, int(rng.integers(-augment.shift, augment.shift + 1)), axis=1)
-    if rng.random() < augment.sparse:
-        x = x * (rng.random(x.shape) > rng.uniform(0, augment.lost)).astype(np.float32)
-    if rng.random() < augment.hidden:
-        start, length = int(rng.integers(len(x))), int(rng.integers(4, len(x) // 2))
-        x = x.copy()
-        x[start : start + length, :, : int(rng.integers(1, BANDS))] = 0
-    for share, channels in ((augment.walk, slice(BANDS, BANDS + 1)), (augment.rays, slice(BANDS + 1, None))):
-        if rng.random() < share:
-            x = x.copy()
-            x[..., channels] = 0
-    return np.ascontiguousarray(x)
+    def sample_stretches(self, count: int, rng: np.random.Generator) -> Stretches:
+        """Sample so many stretches of walls, mirrored, nearer or farther, and changed as other scans might show them."""
+        length, most, pairs = self.options.length, self.options.augment.shift, self.options.length // PLACES
+        start, stop = self._draw_ends(count, rng)
+        numbers = np.stack([start, stop, rng.random(count) < 0.5, rng.integers(-most, most + 1, count)])
+        low, high, mirrored, shift = torch.from_numpy(numbers).to(self.device)[..., None]
+        pair = torch.arange(pairs, device=self.device)
+        first = low + PLACES * torch.where(mirrored > 0, pairs - 1 - pair, pair)
+        both = first[..., None] + torch.arange(PLACES, device=self.device)
+        both = torch.where(both < high[..., None], both, len(self.truth) - 1)
+        truth, seen = self.truth[both[..., 0]], self.present[both].any(dim=2)
+        weight = self.classes[truth] * torch.where(seen, 1.0, self.options.unseen) * (first + PLACES <= high)
+        places = torch.where(mirrored[..., None] > 0, both.flip(2), both).view(count, length)
+        depths = (torch.arange(DEPTHS, device=self.device) - shift) % DEPTHS
+        rows = places[..., None] * DEPTHS + depths[:, None]
+        x = self.rows.index_select(0, rows.flatten()).view(*rows.shape, STRIP_CHANNELS)
+        return self._corrupt(x, rng).permute(0, 3, 1, 2), truth, weight
+
+    def _draw_ends(self, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Draw where stretches of walls begin and end, many of them about the side of a door or window."""
+        length, scans = self.options.length, rng.integers(len(self.lengths), size=count)
+        middle = self.first[scans] + (rng.random(count) * self.lengths[scans]).astype(np.int64)
+        holes = np.diff(self.first_hole)[scans]
+        at_hole = (rng.random(count) < self.options.at_holes) & (holes > 0)
+        chosen = (self.first_hole[scans] + (rng.random(count) * holes).astype(np.int64))[at_hole]
+        off = rng.integers(-length // 3, length // 3 + 1, count)[at_hole]
+        middle[at_hole] = self.first[scans][at_hole] + self.holes[chosen] + off
+        wall = np.searchsorted(self.low, middle, "right") - 1
+        wall = np.clip(wall, self.first_wall[scans], self.first_wall[scans + 1] - 1)
+        low, high = self.low[wall], self.high[wall]
+        start = np.maximum(np.minimum(middle - rng.integers(length, size=count), high - length), low)
+        start = np.maximum(start - (start - self.first[scans]) % PLACES, low)
+        return start, np.minimum(start + length, high)
+
+    def _corrupt(self, x: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
+        """Return (n, length, 32, 17) strips, 0 to 1, without some of their points, and with what stands before them hidden."""
+        count, length, augment = len(x), x.shape[1], self.options.augment
+        sparse = np.flatnonzero(rng.random(count) < augment.sparse)
+        least = rng.uniform(0, augment.lost * (1 << 16), count).astype(np.int32)[sparse]
+        seed = rng.integers(0, 1 << 62, count)[sparse]
+        chosen, key, lowest = (torch.from_numpy(numbers).to(self.device) for numbers in (sparse, seed, least))
+        words = draw_words(key, LOST_ELEMENTS, x[0].numel()).view(-1, *x.shape[1:])
+        x[chosen] *= words >= lowest[:, None, None, None]
+        begin, size = rng.integers(length, size=count), rng.integers(4, max(length // 2, 5), count)
+        at, channel = np.arange(length), np.arange(STRIP_CHANNELS)
+        covered = (at >= begin[:, None]) & (at < (begin + size)[:, None]) & (rng.random(count) < augment.hidden)[:, None]
+        lost = covered[..., None] & (channel < rng.integers(1, BANDS, count)[:, None])[:, None]
+        for share, channels in ((augment.walk, channel == BANDS), (augment.rays, channel > BANDS)):
+            lost |= (rng.random(count) < share)[:, None, None] & channels
+        x *= torch.from_numpy(~lost).to(self.device)[:, :, None]
+        return x.float() / 255
 
 
 def score_walls(examples: Sequence[WallExample], network: Run) -> dict[str, float]:
