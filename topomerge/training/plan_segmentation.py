@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from torch.nn import functional
 
 from topomerge.datasets.pairs.drawing import TRUE_CLASSES
 from topomerge.datasets.pairs.plan_examples import FLAT_SENSOR_SHARES, PlanExample, PlanRecipe, build_plans, load_examples
+from topomerge.datasets.real.home_plans import UNTOLD, load_home_examples
 from topomerge.errors import InputError
 from topomerge.extraction.plans.plan_network import (
     EVIDENCE_CHANNELS,
@@ -64,10 +66,35 @@ def fit(settings: PlanSegmentation, log_line: LogFn) -> dict[str, float]:
         learned, watched = ([convert_to_grid(e, k % BARE_EVERY > 0) for k, e in enumerate(some)] for some in (learned, watched))
     if not learned or not watched:
         raise InputError(f"data.scans={settings.data.scans}: too few scans to train on some and watch others")
+    homes = load_homes(settings.homes) if isinstance(settings, GridSegmentation) else []
     torch.manual_seed(derive_seed(settings.seed))
-    job = PlanJob(settings, learned, watched)
-    log_line(f"{len(learned)} plans, {sum(p.numel() for p in job.network.parameters())} weights")
+    job = PlanJob(settings, learned, watched, homes)
+    log_line(f"{len(learned) + len(homes)} plans, {sum(p.numel() for p in job.network.parameters())} weights")
     return run_network(job, settings, settings.steps, log_line)
+
+
+def load_homes(paths: Sequence[str]) -> list[PlanExample]:
+    """Load the plans of real homes.
+
+    Args:
+        paths: files of vacuum robots, or folders of them, of which those are left out that tell no rooms apart.
+
+    Raises:
+        InputError: a file is none, or none of a folder's is any use.
+    """
+    examples = []
+    for path in map(Path, paths):
+        if not path.is_dir():
+            examples += load_home_examples(path)
+            continue
+        found = []
+        for file in sorted(path.glob("*.json")):
+            with suppress(InputError):
+                found += load_home_examples(file)
+        if not found:
+            raise InputError(f"homes: {path} holds no robot's map with two rooms or more")
+        examples += found
+    return examples
 
 
 class PlanJob(ExportedJob):
@@ -75,14 +102,24 @@ class PlanJob(ExportedJob):
 
     unit = "crops"
 
-    def __init__(self, settings: PlanSegmentation, learned: Sequence[PlanExample], watched: Sequence[PlanExample]) -> None:
+    def __init__(
+        self,
+        settings: PlanSegmentation,
+        learned: Sequence[PlanExample],
+        watched: Sequence[PlanExample],
+        homes: Sequence[PlanExample] = (),
+    ) -> None:
         origin = {"set": settings.data.name, "split": settings.data.split, "plans": len(learned), "watched": len(watched)}
+        origin |= {"homes": len(homes)} if homes else {}
         super().__init__(settings, PlanUNet(settings.widths), origin)
         self.options, self.watched = settings, watched
-        plans = [build_plan_tensors(e, settings.loss) for e in learned]
+        plans = [build_plan_tensors(e, settings.loss) for e in (*learned, *homes)]
         self.plans = PackedPlans(plans, settings.crop, settings.augment, self.device)
         probability = np.sqrt([float(e.room.size) for e in learned])
         self.probability = probability / probability.sum()
+        if homes:
+            share = settings.home_share if isinstance(settings, GridSegmentation) else 0.0
+            self.probability = np.append(self.probability * (1 - share), np.full(len(homes), share / len(homes)))
 
     def iter_batches(self, state: State) -> Generator[Crops, None, None]:
         """Yield crops."""
@@ -138,8 +175,10 @@ def convert_to_grid(example: PlanExample, furnished: bool) -> PlanExample:
 def build_plan_tensors(example: PlanExample, loss: PlanLoss) -> PlanTensors:
     """Build evidence, truth and weight of each column."""
     seen = ndimage.binary_dilation(example.plan.inside | example.plan.wall, np.ones((3, 3)))
-    weight = np.array(loss.classes, np.float32)[example.truth] * np.where(seen, 1.0, loss.unseen)
-    return compute_evidence(example.plan).astype(np.float16), example.truth, weight.astype(np.float16)
+    told = example.truth != UNTOLD
+    truth = np.where(told, example.truth, np.uint8(INSIDE))
+    weight = np.array(loss.classes, np.float32)[truth] * np.where(seen, 1.0, loss.unseen) * told
+    return compute_evidence(example.plan).astype(np.float16), truth, weight.astype(np.float16)
 
 
 class PackedPlans:

@@ -77,7 +77,12 @@ class PlanSegmentation(RasterTask):
 
 @dataclass
 class GridSegmentation(PlanSegmentation):
-    """The same for robots' grids and drawings; fewer steps, as longer training learns how scans are simulated (docs/adr/0005)."""
+    """The same for robots' grids and drawings; fewer steps, as longer training learns how scans are simulated (docs/adr/0005).
+
+    Args:
+        homes: maps of vacuum robots (Valetudo's JSON), or folders of them, whose own rooms are learned from, too.
+        home_share: of the crops that are of these homes.
+    """
 
     task: str = "grid_segmentation"
     name: str = "grid_segmentation"
@@ -85,6 +90,14 @@ class GridSegmentation(PlanSegmentation):
     warmup: int = 200
     rate: float = 3e-3
     augment: PlanAugment = field(default_factory=lambda: PlanAugment(upper=0.0, columns=0.0, grid_noise=0.15))
+    homes: list[str] = field(default_factory=list)
+    home_share: float = 0.4
+
+    def check(self) -> None:
+        """Refuse what makes no sense."""
+        super().check()
+        if not 0 < self.home_share < 1:
+            raise InputError(f"home_share must be above 0 and below 1, not {self.home_share}")
 
 
 @dataclass
