@@ -60,6 +60,15 @@ def data_dir() -> Path:
 
 
 @pytest.fixture(scope="session")
+def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for `cache/` of all tests of one's own pairs, also of those in other processes: they extract the same houses."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "own_cache"
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+@pytest.fixture(scope="session")
 def case_dir(data_dir: Path) -> Path:
     """The folder `cases` beside that of real data: small files of strangers that failed once, not in the repository."""
     folder = data_dir.parent / "cases"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 
 from benchmarks.speed.researcher import OWN_CONFIGS, OWN_PARTS
+from tests.forked import run_words
 from tests.graphs import write_set
 from tests.scenes_map import building
 from topomerge.config import find_plugins
@@ -111,9 +111,7 @@ epochs: 4
 
 def run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     """Run a script of this repository in a folder."""
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "error::UserWarning"}
-    command = [sys.executable, str(ROOT / words[0]), *words[1:]]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300, check=False, env=environment)
+    return run_words([ROOT / words[0], *words[1:]], folder)
 
 
 @pytest.mark.longer
@@ -188,7 +186,6 @@ def test_what_is_wrong_is_one_line(
     sys.modules.pop("mine", None)
 
 
-@pytest.mark.longer
 def test_the_script_ends_with_that_line(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text("import nothing_like_this")
     done = run(tmp_path, "train.py", "plugins=[mine]", "data=procedural")
