@@ -20,11 +20,10 @@ from tests.fusion.atlas.atlas_scenes import office_map, stranger
 from tests.fusion.live_robots import FRAMES, iter_messages, list_scans
 from topomerge.cli.main import main as cli
 from topomerge.errors import InputError
-from topomerge.fusion.bridge import Bridge, RobotTopics, parse_robot
+from topomerge.fusion.bridge import Bridge, PoseBook, RobotTopics, find_pose, parse_robot
 from topomerge.fusion.live import LIVE, GrowingMap, LiveLink, LiveMerger, describe_event
 from topomerge.io import streams
 from topomerge.io.bag_file import Message
-from topomerge.io.pose_book import PoseBook, find_pose
 from topomerge.io.streams import FOXGLOVE, Connection, StreamCounts, build_message, read_foxglove, read_mcap, read_rosbridge
 from topomerge.registration.prepared import prepare
 from topomerge.types import Sim3
