@@ -170,6 +170,7 @@ def test_ranges_and_choices() -> None:
 
 
 @pytest.mark.longer
+@pytest.mark.usefixtures("unexported")
 def test_processes_share_a_search(tmp_path) -> None:
     write_set(tmp_path / "cache", "procedural", 6)
     words = ["search=optuna", "search.space.network.node.kind=[gat,sage]", "search.space.rate=[1e-4,1e-2,log]", "search.jobs=2"]
@@ -178,4 +179,4 @@ def test_processes_share_a_search(tmp_path) -> None:
         done = run_words([ROOT / "train.py", *words], tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("| ended |") == 2 and "best: runs/x/trial_00" in done.stdout
-    assert (tmp_path / "runs" / "x" / "trial_001" / "best" / "embedder.onnx").is_file()
+    assert (tmp_path / "runs" / "x" / "trial_001" / "best" / "embedder.safetensors").is_file()
