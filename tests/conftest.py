@@ -26,6 +26,12 @@ def pytest_configure(config: pytest.Config) -> None:
         compile_once()
 
 
+def pytest_runtest_setup() -> None:
+    from tests.exporting import share_registry
+
+    share_registry()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _forked_readers() -> Generator[None]:
     """Readers of files of strangers are forks of this process; a fresh process takes a second to start."""

@@ -21,9 +21,11 @@ import tempfile
 import traceback
 import warnings
 from collections.abc import Callable, Iterable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, NoReturn
 
+from tests.exporting import build_registry
 from topomerge.io import piece
 
 ROOT = Path(__file__).parent.parent
@@ -124,9 +126,11 @@ def run_two(words: Iterable[str | Path], folder: Path) -> list[subprocess.Comple
 
 @functools.cache
 def _import_what_it_needs(script: str) -> None:
-    """Import in this process what a script of the repository imports at its top, so that each fork finds it."""
+    """Import in this process what a script of the repository imports at its top, and an export needs: each fork finds it."""
     if (ROOT / script).is_file():
         runpy.run_path(str(ROOT / script), run_name="imported")
+    if script == "train.py" and find_spec("onnxscript"):
+        build_registry()
 
 
 def _run_script(script: str, words: list[str]) -> None:
