@@ -204,7 +204,6 @@ def test_seeds_are_gathered_with_mean_and_interval(settings, tmp_path):
     assert mean == 1 and np.isnan(low) and np.isnan(high)
 
 
-@pytest.mark.longer
 @pytest.mark.usefixtures("unexported")
 def test_two_processes_take_the_step_of_one_with_all_pairs(settings, tmp_path):
     """As by torchrun: rooms of the other process are negatives, with gradients; weights end as those of one process."""
