@@ -26,6 +26,12 @@ def pytest_configure(config: pytest.Config) -> None:
         compile_once()
 
 
+def pytest_runtest_setup() -> None:
+    from tests.exporting import share_registry
+
+    share_registry()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _forked_readers() -> Generator[None]:
     """Readers of files of strangers are forks of this process; a fresh process takes a second to start."""
@@ -56,6 +62,15 @@ def data_dir() -> Path:
     folder = Path(name)
     if not folder.is_dir():
         pytest.skip(f"TOPOMERGE_DATA={name} is not a folder")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for `cache/` of all tests of one's own pairs, also of those in other processes: they extract the same houses."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "own_cache"
+    folder.mkdir(exist_ok=True)
     return folder
 
 

@@ -6,6 +6,7 @@ import ast
 import importlib.util
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from pathlib import Path
 import pytest
 
 from tests.docs_examples import ROOT, Example, commands, examples, pages
+from tests.forked import run_words
 from tests.io.walks import house_walk, write_kitti, write_scans
 from topomerge import registry
 from topomerge.cli.main import COMMANDS, EXIT_STATUSES
@@ -58,15 +60,22 @@ def within(folder: Path) -> Iterator[None]:
         os.chdir(before)
 
 
-def run_commands(example: Example, where: str) -> None:
-    """Run what is typed, in a shell, with the `topomerge` and `python` of this environment."""
+def run_command(command: str) -> subprocess.CompletedProcess[str]:
+    """Run a line in a shell, with the `topomerge` and `python` of this environment; in a fork what needs no shell."""
+    words = shlex.split(command)
+    if words[0] in ("topomerge", "python") and not set(command) & set("|&;<>$*\\`"):
+        return run_words(words[words[0] == "python" :], Path.cwd())
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    environment = {**os.environ, "PATH": path}
+    return subprocess.run(command, shell=True, env=environment, capture_output=True, text=True, timeout=600, check=False)
+
+
+def run_commands(example: Example, where: str) -> None:
+    """Run what is typed."""
     typed = commands(example)
     assert typed, f"{where}: a console block without a prompt ($)"
     for number, command in enumerate(typed, 1):
-        done = subprocess.run(
-            command, shell=True, env={**os.environ, "PATH": path}, capture_output=True, text=True, timeout=600, check=False
-        )
+        done = run_command(command)
         requested = example.status if number == len(typed) else 0
         said = f"{done.stdout[-2000:]}{done.stderr[-2000:]}"
         assert done.returncode == requested, f"{where}: `{command}` gives {done.returncode}\n{said}"
@@ -93,6 +102,7 @@ def test_examples(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, r
         monkeypatch.setattr(own, "_registered", dict(own._registered))
     if page.name not in QUICK:
         shutil.copytree(request.getfixturevalue("workshop"), tmp_path, dirs_exist_ok=True)
+        (tmp_path / "cache").symlink_to(request.getfixturevalue("own_cache"))
     run_page(page, tmp_path)
 
 
@@ -235,7 +245,8 @@ def test_the_files_of_extend_work_as_they_stand(tmp_path: Path) -> None:
         "print(s.network.geometry.parts, s.network.turns, s.sampler)\n"
         "train(c(['plugins=[area,lines]', 'task=area', 'experiment=told', 'epochs=1']), print)"
     )
-    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300)
+    (tmp_path / "tried.py").write_text(script)
+    done = run_words(["tried.py"], tmp_path)
     assert done.stdout.startswith("['extent'] transformer {'spread': 0.5} nadam halved twins\n"), done.stderr
     assert "\n['scalars', 'surroundings:patches'] 4 small_first\nepoch 1/1 " in done.stdout
     assert " rectangles/s" in done.stdout and (tmp_path / "runs" / "area" / "lines.txt").is_file()

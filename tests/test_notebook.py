@@ -6,12 +6,15 @@ import contextlib
 import io
 import json
 import os
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests.forked import run_words
 
 ROOT = Path(__file__).parent.parent
 NOTEBOOK = ROOT / "docs" / "own-maps.ipynb"
@@ -46,10 +49,16 @@ def test_the_notebook_can_be_opened() -> None:
     assert len(code) >= 5
 
 
+def run_in_fork(words: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+    """Do what `subprocess.run` does for the commands of the notebook."""
+    return run_words(words[words[0] == sys.executable :], Path.cwd())
+
+
 @pytest.mark.longer
-def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_notebook_runs(tmp_path: Path, own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    (tmp_path / "cache").symlink_to(own_cache)
+    monkeypatch.setattr(subprocess, "run", run_in_fork)
     printed = execute_cells(read_notebook())
     assert "recall@1" in "".join(printed) and "rooms in the joined map" in printed[-1]
     assert (tmp_path / "tuned" / "embedder.onnx").is_file() and (tmp_path / "joined" / "report.html").is_file()

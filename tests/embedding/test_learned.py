@@ -102,9 +102,10 @@ NETWORKS = {
     "values": Network(Geometry(["scalars"], width=16), Node("gat", 2, doors=1, width=8), size=24),
     "paper": Network(Geometry(["scalars"], width=16), Node("gat", 1, edge_values=False, jump="max"), size=8),
     "bare": Network(Geometry(["scalars"], width=8), Node("gat", 1, edges=False, edge_values=False, skip=False), size=8),
-    "means": Network(Geometry(["engineered", "shapedna"], width=8), Node("sage", 1, width=8, jump="last"), size=8),
+    "means": Network(
+        Geometry(["engineered", "shapedna"], width=8), Node("sage", 1, doors=2, near=True, width=8, jump="last"), size=8
+    ),
     "bare means": Network(Geometry(["scalars"], width=8), Node("sage", 2, edges=False), size=8),
-    "near": Network(Geometry(["scalars"], width=8), Node("sage", 1, doors=2, near=True), size=8),
     "crops": Network(Geometry(["scalars", *CROP_SHAPES], width=8), Node("gat", 1, around=10.0, ways=True), size=8),
     "points": Network(Geometry(["pointnet", "voxelcnn"], width=8), Node("none"), size=8),
     "local": Network(Geometry(["pointnet_local"], width=8, yaws=2, canonical=True), Node("none"), size=8),
@@ -173,7 +174,7 @@ def test_a_network_that_reads_landmarks_is_exported_and_says_the_same_of_maps_wi
 
 
 @pytest.mark.longer
-@pytest.mark.parametrize("kind", ["transformer", "gps"])
+@pytest.mark.parametrize("kind", [pytest.param("transformer", marks=pytest.mark.slow), "gps"])  # the second holds the first
 def test_a_node_encoder_of_somebody_else_trains_is_exported_and_loads(torch, tmp_path, monkeypatch, kind):
     """Registered by one line. Those who load it need not know it."""
     from topomerge.models.weights import read_embedder

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests.forked import run_words
 from topomerge.embedding import graph
 
 ROOT = Path(__file__).parent.parent.parent
@@ -29,7 +28,6 @@ def test_columns_are_looked_up_by_name():
         assert len(set(columns)) == len(columns)
 
 
-@pytest.mark.longer
 def test_a_feature_more_makes_everything_wider(tmp_path):
     """One more feature of rooms and of edges, in front of all others: layers, examples and packed columns follow."""
     pytest.importorskip("torch_geometric")
@@ -41,6 +39,9 @@ def test_a_feature_more_makes_everything_wider(tmp_path):
         text = text.replace(f"\n{name}", f"\n{name}\n    'brightness',")
     path.write_text(text)
     code = """
+import sys
+for name in [name for name in sys.modules if name.partition(".")[0] == "topomerge"]:
+    del sys.modules[name]  # that of the tests: this is a fork of them
 import json, torch, topomerge
 from topomerge.embedding.learned import load_embedder
 from topomerge.embedding.network import Geometry, Network, Node
@@ -58,9 +59,9 @@ print(json.dumps({"file": topomerge.__file__, "x": tensors["x"].shape[1], "edge_
     "rooms": network.geometry.parts["scalars"].each[0].in_features, "edges": network.node.edge[0].in_features,
     "embedding": list(network(tensors)[0].shape), "columns": [CLIMB, *KIND_COLUMNS], "refused": refused}))
 """
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env={"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, check=True
-    )
+    (tmp_path / "wider.py").write_text(code)
+    done = run_words(["wider.py"], tmp_path)
+    assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout)
     assert Path(said["file"]).is_relative_to(tmp_path)
     rooms, edges = len(graph.ROOM_FEATURES) + 1, len(graph.EDGE_FEATURES) + 1

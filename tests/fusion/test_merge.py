@@ -90,11 +90,16 @@ def test_two_halves_are_merged(merged, halves):
     assert merged.maps == halves
 
 
+@pytest.fixture(scope="module")
+def stricter(halves):
+    """The halves where nothing is sure enough."""
+    return tm.merge(halves, threshold=1.0)
+
+
 @pytest.mark.longer
-def test_rooms_are_matched_only_where_walls_are_not_believed(merged, refused, halves):
+def test_rooms_are_matched_only_where_walls_are_not_believed(merged, refused, halves, stricter):
     assert merged.seconds["embed"] == merged.seconds["match"] == 0
     assert refused.seconds["embed"] > 0 and refused.seconds["match"] > 0
-    stricter = tm.merge(halves, threshold=1.0)
     assert not stricter.merged and stricter.seconds["embed"] > 0
     assert tm.merge(halves, threshold=0.0, poses="rooms").seconds["embed"] > 0  # there are no others
     by_rooms = tm.merge(halves, poses="rooms")
@@ -174,8 +179,8 @@ def test_force_joins_them_and_still_says_no(halves, stranger):
 
 
 @pytest.mark.longer
-def test_a_threshold_is_kept_to(halves, merged):
-    assert tm.merge(halves, threshold=1.0).status == "abstained"
+def test_a_threshold_is_kept_to(halves, stricter):
+    assert stricter.status == "abstained"
     for wrong in (-0.1, 1.1, float("nan")):
         with pytest.raises(InputError, match="between 0 and 1"):
             tm.merge(halves, threshold=wrong)

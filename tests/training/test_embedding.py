@@ -19,6 +19,7 @@ from topomerge.models.embedder import Embedder
 from topomerge.models.weights import read_embedder
 
 from tests.cases import list_longer
+from tests.forked import run_words
 from tests.graphs import pair, write_set
 from topomerge import archive
 from topomerge.checkpoint import load_state
@@ -452,12 +453,15 @@ def run(words: list[str]) -> subprocess.CompletedProcess:
 def test_without_hydra(settings, tmp_path, capsys):
     """On a machine with no Hydra and no Open3D, and without importing the extraction."""
     (tmp_path / "run.json").write_text(json.dumps({**convert_to_dict(settings), "epochs": 1}))
-    code = (
-        "import atexit, re, runpy, sys; "
-        "bad = lambda: [m for m in sys.modules if re.match(r'(hydra|omegaconf|open3d|topomerge.extraction)(\\.|$)', m)]; "
-        "atexit.register(lambda: print('imported:', bad())); runpy.run_module('topomerge.training', run_name='__main__')"
+    code = (  # in a fork, which begins without what the tests have imported of these
+        "import atexit, re, runpy, sys\n"
+        "bad = lambda names: [m for m in sys.modules if re.match(rf'({names})(\\.|$)', m)]\n"
+        "for name in bad('hydra|omegaconf|open3d|topomerge'): del sys.modules[name]\n"
+        "atexit.register(lambda: print('imported:', bad('hydra|omegaconf|open3d|topomerge.extraction')))\n"
+        "runpy.run_module('topomerge.training', run_name='__main__')\n"
     )
-    done = run([sys.executable, "-c", code, str(tmp_path / "run.json"), "name=bare"])
+    (tmp_path / "bare.py").write_text(code)
+    done = run_words([tmp_path / "bare.py", tmp_path / "run.json", "name=bare"], ROOT)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.endswith("imported: []\n")
     assert load_embedder(tmp_path / "bare").about["run"] == "bare"

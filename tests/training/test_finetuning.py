@@ -150,15 +150,6 @@ def test_replay_mixes_another_set_in(settings: Training, tmp_path: Path, monkeyp
         fit(replace(mixed, name="third", replay_data="missing"), quiet)
 
 
-@pytest.mark.longer
-def test_an_export_tells_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO)
-    for name in ("onnxscript", "onnx_ir", "torch.onnx"):
-        logging.getLogger(name).setLevel(logging.NOTSET)
-    export_embedder(Embedder(SMALL), tmp_path)
-    assert [r.name for r in caplog.records] == []
-
-
 def scores(first: int, rooms: int = 10, found: int = 8) -> PairScores:
     """A pair with so many rooms found first, and so many of ten matches right."""
     ranks = np.where(np.arange(rooms) < first, 1, 3)
@@ -210,8 +201,13 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.longer
-def test_finetune_keeps_what_helped(folder: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+def test_finetune_keeps_what_helped(folder: Path, tmp_path: Path, monkeypatch, capsys, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    for name in ("onnxscript", "onnx_ir", "torch.onnx"):
+        logging.getLogger(name).setLevel(logging.NOTSET)
     export_embedder(Embedder(SMALL), tmp_path / "start")
+    assert [r.name for r in caplog.records] == []  # an export tells nothing
+    caplog.set_level(logging.WARNING)
     out = tmp_path / "tuned"
     words = ["finetune", str(folder), "-o", str(out), "--from", str(tmp_path / "start"), "--epochs", "1", "--batch", "1", "-q"]
     words += ["--cache", str(tmp_path / "cache")]

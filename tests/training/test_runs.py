@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from dataclasses import asdict, replace
@@ -14,6 +13,7 @@ import pytest
 import torch
 from topomerge.models.weights import read_embedder
 
+from tests.forked import run_two
 from tests.graphs import write_set
 from topomerge import code_digest
 from topomerge.code_digest import find_other_clone, read_commit
@@ -162,7 +162,7 @@ def test_a_second_clone_is_told_that_it_runs_the_code_of_another(tmp_path):
 
 
 @pytest.mark.longer
-@pytest.mark.parametrize("script", ["train.py", "evaluate.py"])
+@pytest.mark.parametrize("script", ["train.py", pytest.param("evaluate.py", marks=pytest.mark.slow)])
 def test_the_scripts_of_a_second_clone_say_so(tmp_path, script):
     """The clone has its own `topomerge`, which Python finds first, but the environment's models and datasets."""
     from tests.package_copy import copied
@@ -204,24 +204,20 @@ def test_seeds_are_gathered_with_mean_and_interval(settings, tmp_path):
     assert mean == 1 and np.isnan(low) and np.isnan(high)
 
 
-@pytest.mark.longer
 @pytest.mark.usefixtures("unexported")
 def test_two_processes_take_the_step_of_one_with_all_pairs(settings, tmp_path):
-    """torchrun with gloo: rooms of the other process are negatives, with gradients; weights end as those of one process."""
+    """As by torchrun: rooms of the other process are negatives, with gradients; weights end as those of one process."""
     same = replace(settings, epochs=2, batch=2, augment=replace(settings.augment, rooms=0.0, edges=0.0, jitter=0.0))
     same = replace(same, network=replace(SMALL, dropout=0.0))
     (tmp_path / "run.json").write_text(json.dumps(convert_to_dict(same)))
-    words = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "topomerge.training"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    given = [sys.executable, *words, str(tmp_path / "run.json"), "name=two"]
-    done = subprocess.run(given, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False, env=environment)
-    assert done.returncode == 0, done.stderr
+    for done in run_two(["-m", "topomerge.training", tmp_path / "run.json", "name=two"], ROOT):
+        assert done.returncode == 0 and "another training" not in done.stderr, done.stderr
     fit(replace(same, name="one", batch=4), quiet)
     two, one = (load_weights(tmp_path / name) for name in ("two", "one"))
     for name, value in one.items():
         assert torch.allclose(value, two[name], atol=2e-5), name
     assert read_run(tmp_path / "two")["starts"][0]["device"] == "2 x cpu, 32-true"
-    assert "another training" not in done.stderr and main([str(tmp_path / "run.json"), "name=two"]) == 1
+    assert main([str(tmp_path / "run.json"), "name=two"]) == 1
 
 
 def load_weights(run: Path) -> dict[str, torch.Tensor]:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.forked import run_two
 from tests.training import tiny
 from topomerge.archive import VARIABLE, find_weights_file, read_weights_json
 from topomerge.embedding.engineered import scale_features
@@ -250,14 +251,12 @@ def test_resumed_equals_uninterrupted(task, words, tmp_path, monkeypatch) -> Non
 @pytest.mark.longer
 @pytest.mark.parametrize("task", SAMPLED)
 def test_two_processes_keep_the_same_weights(task, words, tmp_path, monkeypatch) -> None:
-    """torchrun with gloo: both processes make other batches and end with the same weights; the run is written once."""
+    """As by torchrun, with gloo: both processes make other batches and end with the same weights; the run is written once."""
     script = tmp_path / "both.py"
     script.write_text(BOTH)
     given = json.dumps(words(task, "name=two"))
-    launch = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script), task, str(tmp_path), given]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, *launch], capture_output=True, text=True, timeout=300, check=False, env=environment)
-    assert done.returncode == 0, done.stderr
+    for done in run_two([script, task, tmp_path, given], ROOT):
+        assert done.returncode == 0, done.stderr
     told = [json.loads((tmp_path / f"rank{k}.json").read_text()) for k in range(2)]
     assert told[0]["weights"] == told[1]["weights"] and told[0]["batches"] != told[1]["batches"]
     assert told[0]["scores"] == told[1]["scores"]

@@ -75,11 +75,10 @@ def houses(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def cache(houses: Path) -> Path:
+def cache(houses: Path, own_cache: Path) -> Path:
     """A cache that holds its maps."""
-    place = houses.parent / "cache"
-    build_own_sets(houses, place)
-    return place
+    build_own_sets(houses, own_cache)
+    return own_cache
 
 
 @pytest.fixture
