@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from functools import partial
+from importlib import import_module
+from threading import Barrier
+
 import numpy as np
 import pytest
 
 from tests import scenes
 from tests.cases import list_longer
 from topomerge.errors import InputError
+from topomerge.extraction import room_odds, segment, walls
 from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS, DefaultParameters, ThesisParameters
+from topomerge.extraction.plans import storey_floor
 from topomerge.extraction.voxels import voxelise
-from topomerge.kernels import count_threads, occupied_cells, rasters, set_thread_count, stencil
+from topomerge.kernels import count_threads, images, occupied_cells, rasters, set_thread_count, stencil
 from topomerge.types import PointCloud, TopometricMap
 
 
@@ -119,10 +126,11 @@ def test_two_storeys_with_a_stair():
     assert (storey[(z > 3.2)] == 1).mean() > 0.95 and (storey[z < 1.3] == 0).all()
 
 
-def test_any_number_of_threads_extracts_the_same(monkeypatch):
-    points, before, found = scenes.two_rooms().points(0.005).astype(np.float32), count_threads(), []
-    for loops in (occupied_cells, rasters, stencil):
-        for name in {"LEAST_POINTS", "LEAST_CELLS"} & set(vars(loops)):
+@pytest.mark.parametrize("scene", [scenes.two_rooms, scenes.two_storeys])
+def test_any_number_of_threads_extracts_the_same(monkeypatch, scene):
+    points, before, found = scene().points(0.005).astype(np.float32), count_threads(), []
+    for loops in (images, occupied_cells, rasters, stencil):
+        for name in {"LEAST_POINTS", "LEAST_CELLS", "LEAST_FILLED"} & set(vars(loops)):
             monkeypatch.setattr(loops, name, 1000)  # so that slices are taken of a small scene, too
     try:
         for threads in (1, 3):
@@ -135,6 +143,31 @@ def test_any_number_of_threads_extracts_the_same(monkeypatch):
     assert (alone.grid.cells == shared.grid.cells).all() and (alone.room == shared.room).all()
     for name in ("rooms", "edges", "storeys", "areas", "narrows"):
         assert getattr(alone, name).tobytes() == getattr(shared, name).tobytes(), name
+
+
+def test_storeys_are_worked_on_side_by_side(monkeypatch):
+    """Each step waits for the other storey: one after the other, none would ever come."""
+    both, before, names = Barrier(2), count_threads(), []
+
+    def meet(step, *args):
+        both.wait(30)
+        names.append(step.__name__)
+        return step(*args)
+
+    for module, name in (
+        (segment, "build_storey_plan"),
+        (import_module("topomerge.extraction.extract"), "segment_storey"),
+        (walls, "_faces_of"),
+        (storey_floor, "_find_labels"),
+        (room_odds, "_Hulls"),
+    ):
+        monkeypatch.setattr(module, name, partial(meet, getattr(module, name)))
+    try:
+        set_thread_count(2)
+        assert len(extract(scenes.two_storeys().points(0.02)).storeys) == 2
+    finally:
+        set_thread_count(before)
+    assert sorted(Counter(names).values()) == [2] * 5
 
 
 def test_a_ramp_is_one_way_through():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -84,3 +86,32 @@ def test_what_could_end_the_library_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"nested deeper than 5,000") as caught:
         ifc.check_references(step_file(tmp_path / "a.ifc", *chain(6000)))
     assert "themselves" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("module", "absent"), [("e57", ("numba", "scipy")), ("ifc", ("scipy.sparse",))])
+def test_a_process_that_reads_imports_what_its_format_needs(module: str, absent: tuple[str, ...]) -> None:
+    code = f"import sys, topomerge.io.piece, topomerge.io.{module}; print([n for n in {absent} if n in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stdout) == (0, "[]\n"), done.stderr
+
+
+def test_the_library_is_imported_without_its_grammars() -> None:
+    pytest.importorskip("ifcopenshell")
+    code = "import sys; from topomerge.io import ifc; ifc._import_library().open; print('lark' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stdout) == (0, "False\n"), done.stderr
+
+
+@pytest.mark.parametrize(("cores", "threads"), [(None, 1), (1, 1), (2, 1), (3, 3), (64, 4)])
+def test_bodies_are_made_by_one_thread_where_two_gain_nothing(
+    monkeypatch: pytest.MonkeyPatch, cores: int | None, threads: int
+) -> None:
+    geom, requested = pytest.importorskip("ifcopenshell.geom"), []
+
+    def refuse(_settings: object, _model: object, count: int, **_: object) -> None:
+        requested.append(count)
+        raise RuntimeError
+
+    monkeypatch.setattr(geom, "iterator", refuse)
+    monkeypatch.setattr("os.cpu_count", lambda: cores)
+    assert not list(ifc._iter_shapes_by_kernel(None, [], "opencascade")) and requested == [threads]

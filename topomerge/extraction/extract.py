@@ -41,6 +41,7 @@ from topomerge.extraction.slices import is_slice, raise_slice
 from topomerge.extraction.topology import build_topometric_map, select_rooms_with_floor
 from topomerge.extraction.views.view_rooms import segment_views
 from topomerge.extraction.walls import relabel_walls, unroll_walls
+from topomerge.kernels import run_side_by_side
 from topomerge.numpy_nn import sigmoid
 from topomerge.progress import Progress, Stopwatch
 from topomerge.types import EDGE_DTYPE, LEVELLED, Array, PointCloud, TopometricMap, VoxelGrid, add_outline_odds
@@ -254,7 +255,7 @@ def gather_evidence(
     rasters, places = rasterise_storeys(scan, navigable, p.standing_height, looks), scan.places
     # Rather too many segments than too few: what is merged here, no later evidence can part (docs/adr/0024).
     narrow = min(p.narrow, p.slice_door if scan.flat else p.door)
-    storeys = [segment_storey(rasters, i, narrow, parts, places) for i in range(len(rasters.numbers))]
+    storeys = run_side_by_side(lambda i: segment_storey(rasters, i, narrow, parts, places), range(len(rasters.numbers)))
     watch.begin("walls", 0.6)
     walls = unroll_walls(scan, navigable, rasters, storeys) if p.walls else None
     return Evidence(rasters, find_passages(storeys, walls, p.walls and not parts), walls)

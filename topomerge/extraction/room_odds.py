@@ -22,6 +22,7 @@ from topomerge.archive import read_weights_json
 from topomerge.errors import InputError
 from topomerge.extraction.completeness import WALL_SIGHT
 from topomerge.extraction.storeys import measure_floor_to_ceiling
+from topomerge.kernels import run_side_by_side
 from topomerge.kernels.rays import is_seen_from
 from topomerge.numpy_nn import sigmoid
 from topomerge.types import ROOM_ODDS, Array, TopometricMap, are_within, compute_extent, select_lowest_of_column
@@ -101,7 +102,8 @@ def compute_room_features(map: TopometricMap, names: Sequence[str] = ROOM_FEATUR
     rooms = map.rooms
     table = {name: np.zeros(len(rooms)) for name in (*ROOM_FEATURES, *GRID_FEATURES)}
     covered = np.zeros((2, len(rooms)))  # columns with a ceiling, and all
-    for storey in _iter_storey_floors(map):
+
+    def measure(storey: _StoreyFloor) -> None:  # each writes what is of its own rooms
         hulls = _Hulls(storey)
         for room, window in _iter_windows(storey):
             own = storey.room[window] == room
@@ -113,6 +115,8 @@ def compute_room_features(map: TopometricMap, names: Sequence[str] = ROOM_FEATUR
             table["between"][room] = hulls.measure_share_between(room)
             for name, value in _measure_outline(storey, room, window).items():
                 table[name][room] = value
+
+    run_side_by_side(measure, list(_iter_storey_floors(map)))
     columns = np.maximum(covered[1], 1)
     cells = np.maximum(rooms["cells"], 1) / columns
     mean = np.average(cells, weights=columns) if len(rooms) else 1.0

@@ -36,6 +36,7 @@ from topomerge.extraction.plans.storey_plan import ClassifiedStorey, Merge, Stor
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.slices import is_raised
 from topomerge.extraction.storeys import NOWHERE, find_storeys, measure_floor_to_ceiling
+from topomerge.kernels import run_side_by_side
 from topomerge.numpy_nn import sigmoid
 from topomerge.types import Array, VoxelGrid, are_within
 
@@ -128,8 +129,8 @@ def rasterise_storeys(scan: Scan, navigable: VoxelGrid, standing_height: float, 
     # Robots' grids and drawings have weights of their own: those of scans err more on real ones (docs/adr/0005).
     raised = not scan.flat and is_raised(grid)  # with a floor that was assumed, a scan of the upper half of rooms is none
     plans, probabilities = [], []
-    for k in numbers:
-        plan = build_storey_plan(coarse, floor, of_coarse, k, scan.crossed)
+    # The looks of the network share the threads by themselves.
+    for plan in run_side_by_side(lambda k: build_storey_plan(coarse, floor, of_coarse, k, scan.crossed), numbers):
         probability = compute_column_probabilities(plan, load_weights(raised), looks)
         if scan.drawn_doors is not None:
             probability = add_drawn_doors(plan, probability, scan.drawn_doors)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 from scipy import ndimage
@@ -23,6 +23,7 @@ from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, PLACES,
 from topomerge.extraction.plans.storey_floor import WALL_REACH, find_cells_of_storey
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.segment import RasterisedStoreys, SegmentedStorey, find_segments
+from topomerge.kernels import run_side_by_side
 from topomerge.kernels.occupied_cells import OFFSET_STEPS
 from topomerge.structure.floors import FACE_HEIGHTS, FULL_COLUMN, LEAST_CELLS
 from topomerge.structure.lines import detect_lines, estimate_main_direction
@@ -44,11 +45,9 @@ def unroll_walls(
     if scan.fine is None or not any(storey.count for storey in storeys):
         return None
     # Of segments, before rooms exist: so doors on walls have a say in the only cut (docs/adr/0024).
-    first, rows = 0, []
-    for storey in storeys:
-        rows += _faces_of(scan.grid, rasters, storey, first)
-        first += storey.count
-    elevations = unroll(np.array(rows, FACE_DTYPE), navigable, scan.fine, scan.crossed)
+    first = np.cumsum([0, *(storey.count for storey in storeys)]).tolist()
+    rows = run_side_by_side(lambda i: _faces_of(scan.grid, rasters, storeys[i], first[i]), range(len(storeys)))
+    elevations = unroll(np.array(list(chain(*rows)), FACE_DTYPE), navigable, scan.fine, scan.crossed)
     classes = classify_places(elevations)
     doors = compute_door_probabilities(elevations, classes)
     return StoreyWalls(

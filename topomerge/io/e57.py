@@ -27,7 +27,6 @@ from topomerge.io.piece import (
     read_head,
     read_in_subprocess,
 )
-from topomerge.kernels.codecs import compute_crc32c
 from topomerge.types import Array
 
 PAGES_A_TIME = 1 << 15  # checked at a time
@@ -121,6 +120,8 @@ def _convert_to_cartesian(spherical: Array) -> Array:
 
 def check_pages(path: Path) -> None:
     """Refuse a file whose header or any page is damaged."""
+    from topomerge.kernels.codecs import compute_crc32c  # here: the process that decodes needs no compiled loop
+
     head = read_head(path, "an E57 file", b"ASTM-E57", 48)
     length, xml, xml_length, page = struct.unpack("<QQQQ", head[16:48])
     size = path.stat().st_size

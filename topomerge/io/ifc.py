@@ -9,14 +9,13 @@ import subprocess
 import sys
 from array import array
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from topomerge.errors import InputError
 from topomerge.io.landmarks import parse_landmarks
@@ -38,6 +37,9 @@ def check_references(path: Path) -> None:
     Raises:
         InputError: it does.
     """
+    from scipy.sparse import csr_array  # here: the process that makes bodies needs none of it
+    from scipy.sparse.csgraph import connected_components
+
     owners, targets, count = parse_references(path.read_bytes())
     graph = csr_array((np.ones(len(owners), np.int8), (owners, targets)), shape=(count, count))
     _, circle = connected_components(graph, directed=True, connection="strong")
@@ -112,7 +114,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
 
 def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Yield the same in this process."""
-    import ifcopenshell
+    ifcopenshell = _import_library()
 
     try:
         model = ifcopenshell.open(str(path))
@@ -143,6 +145,20 @@ def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
     lost = len(built) - len(shapes)
     if lost:
         yield Piece(np.empty((0, 3)), warnings=(f"{lost} of {len(built)} elements have no usable shape",), done=1.0)
+
+
+def _import_library() -> Any:
+    """Import ifcopenshell without lark: it sets up a parser for what headers say of views, which is not read here."""
+    hidden = "lark" not in sys.modules
+    if hidden:
+        sys.modules["lark"] = None  # type: ignore[assignment]
+    try:
+        with redirect_stdout(io.StringIO()):  # it tells that lark is missing
+            import ifcopenshell
+    finally:
+        if hidden:
+            del sys.modules["lark"]
+    return ifcopenshell
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +210,7 @@ def read_elements(path: Path) -> list[ModelElement]:
 
 def write_elements() -> None:
     """Write the elements of the model that the command line names to stdout, as one NumPy archive, for `read_elements`."""
-    import ifcopenshell
+    ifcopenshell = _import_library()
 
     model = ifcopenshell.open(sys.argv[1])
     built = [p for p in model.by_type("IfcElement") if p.Representation and _is_built(p, doors=True)]
@@ -244,7 +260,8 @@ def _iter_shapes_by_kernel(model: Any, products: list[Any], kernel: Any) -> Iter
 
     settings = ifcopenshell.geom.settings()
     settings.set("use-world-coords", True)
-    threads = min(4, os.cpu_count() or 1)
+    # Two threads take twice one's processor time for the same bodies: no gain where the reader's own process has the other core.
+    threads = min(4, cores) if (cores := os.cpu_count() or 1) > 2 else 1
     try:
         iterator = ifcopenshell.geom.iterator(settings, model, threads, include=products, geometry_library=kernel)
         if not products or not iterator.initialize():

@@ -15,7 +15,6 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.io import text
 from topomerge.io.piece import BLOCK_POINTS, Piece, ReadOptions, build_damage_error, build_truncation_error, convert_to_float32
-from topomerge.kernels.codecs import unpack_lzf
 from topomerge.types import Array
 
 LONGEST_HEADER = 1 << 16  # bytes
@@ -119,6 +118,8 @@ def _iter_compressed(path: Path, header: Header) -> Iterator[Array]:
         raise build_truncation_error(path, len(data), packed, "bytes")
     if full != header.points * header.dtype.itemsize or full > BEST_PACKING * max(packed, 1):
         raise build_damage_error(path, "a PCD file", f"{full:,} bytes for {header.points:,} points")
+    from topomerge.kernels.codecs import unpack_lzf  # here: E57 takes its poses from this module, and needs no compiled loop
+
     unpacked = unpack_lzf(data[:packed], full)
     if unpacked is None:
         raise build_damage_error(path, "a PCD file", "its compressed data can't be unpacked")

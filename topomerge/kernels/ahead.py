@@ -39,7 +39,7 @@ try:  # parts of numba that it does not promise to keep: without them loops load
 except ImportError:
     _Cache = None  # type: ignore[assignment, misc]
 
-MODULES = ("bend", "graphs", "images", "occupied_cells", "rasters", "rays", "registration", "stencil", "voxels")
+MODULES = ("bend", "graphs", "images", "meshes", "occupied_cells", "rasters", "rays", "registration", "stencil", "voxels")
 SWITCH = "TOPOMERGE_COMPILE_AHEAD"  # environment variable: 0 compiles nothing ahead
 NOTE = "ahead"
 AHEAD: dict[Any, tuple[str, ...]] = {}  # loops, each with the types of its arguments

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from topomerge.kernels import compile_ahead
+from topomerge.kernels import compile_ahead, count_threads, run_side_by_side
 
 
 @compile_ahead("u1[:,:,::1], i2[:,::1], i8[:,::1], i8[::1], i8, i8")
@@ -92,6 +92,7 @@ def warp_sheet(planes, room, back, low, shape, knots, step):  # type: ignore[no-
     return out, of
 
 
+LEAST_FILLED = 1_000_000  # points times strips, below which a thread costs more than it saves
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
@@ -152,9 +153,13 @@ def fill_strips(
     low = corners.min(axis=(0, 1))
     columns = ((corners.max(axis=(0, 1)) - low) // tile).astype(np.int64) + 1
     table = _find_touched_tiles(frames, along, across, low, tile, columns)
-    first = np.searchsorted(table[:, 0], np.arange(int(columns.prod()) + 1))
-    lines = np.ascontiguousarray(table[:, 1])
-    _fill(points, frames, sizes, starts, low, tile, columns, first, lines, step, out)
+
+    def fill(own: Ints) -> None:  # strips share no element, so that each gets its points in their order
+        first = np.searchsorted(own[:, 0], np.arange(int(columns.prod()) + 1))
+        _fill(points, frames, sizes, starts, low, tile, columns, first, np.ascontiguousarray(own[:, 1]), step, out)
+
+    threads = count_threads() if len(points) * len(frames) >= LEAST_FILLED else 1
+    run_side_by_side(fill, [table[table[:, 1] % threads == k] for k in range(threads)])
     return out
 
 

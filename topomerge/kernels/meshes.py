@@ -8,6 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from topomerge.kernels import compile_ahead
+
 CORNERS = 40  # of a cell, at most: each neighbour adds one
 
 
@@ -95,7 +97,7 @@ def _draw_uniform(number):  # type: ignore[no-untyped-def]  # pragma: no cover -
     return ((h ^ (h >> np.uint64(31))) >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
-@njit(cache=True, error_model="numpy")
+@compile_ahead("f8[:,:,::1], f8, i8, f8[:,::1], i8[::1], b1", error_model="numpy")
 def _walk(triangles, spacing, first, points, owner, fill):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Count the lattice points, or write them where `fill`; triangle i has the number first + i."""
     count = 0
@@ -141,6 +143,7 @@ def sample_triangles(triangles: NDArray[Any], spacing: float, first: int = 0) ->
     """
     triangles = np.ascontiguousarray(triangles, np.float64)
     empty = np.empty((0, 3)), np.empty(0, np.int64)
+    spacing, first = float(spacing), int(first)  # the types that the loop is compiled for
     count = int(_walk(triangles, spacing, first, *empty, False))
     points, owner = np.empty((count, 3)), np.empty(count, np.int64)
     _walk(triangles, spacing, first, points, owner, True)

@@ -12,6 +12,7 @@ from topomerge.extraction.plans.passages import Pair
 from topomerge.extraction.plans.plan import locate_columns
 from topomerge.extraction.plans.storey_plan import Floor, Merge, StoreyPlan
 from topomerge.extraction.segment import PartitionedStorey
+from topomerge.kernels import run_side_by_side
 from topomerge.types import Array, VoxelGrid, are_within, select_lowest_of_column
 
 WALL_REACH = 0.5  # m: so far into walls and what stands before them the cells of a room go
@@ -38,11 +39,18 @@ def build_floor(
     probability: dict[Pair, float] = {}
     merges: list[Merge] = []
     rooms = areas = 0
-    for part in cut:
+    # Each storey by itself; what several claim is the last one's, whatever the number of threads.
+    laid = run_side_by_side(
+        lambda part: (
+            *_select_floor_cells(part, navigable, storey == part.number, factor),
+            *_find_labels(grid, part.plan, part.room, factor),
+        ),
+        cut,
+    )
+    for part, (places, at, standing, rows, own) in zip(cut, laid, strict=True):
         room = np.where(part.room >= 0, part.room + rooms, -1)
         area = np.where(part.area >= 0, part.area + areas, -1)
-        _label_cells(label, grid, part.plan, room, factor)
-        places, at, standing = _select_floor_cells(part, navigable, storey == part.number, factor)
+        label[rows] = own + rooms
         cells.append(places)
         properties.append((standing, np.full(len(places), part.number), room[tuple(at.T)], area[tuple(at.T)]))
         probability |= {(a + rooms, b + rooms): p for (a, b), p in part.door_probability.items()}
@@ -71,12 +79,13 @@ def build_floor(
     )
 
 
-def _label_cells(label: Array, grid: VoxelGrid, plan: StoreyPlan, room: Array, factor: int) -> None:
-    """Give the occupied cells of a storey the room of their column; walls go to the nearest room."""
+def _find_labels(grid: VoxelGrid, plan: StoreyPlan, room: Array, factor: int) -> tuple[Array, Array]:
+    """Return the rows of the occupied cells of a storey that have a room, and (k,) that of their column; walls go to the nearest
+    room."""
     far, nearest = ndimage.distance_transform_edt(room < 0, return_indices=True)
     room = np.where(far * plan.edge <= WALL_REACH, room[tuple(nearest)], -1)
     rows, column = find_cells_of_storey(grid, plan, room, factor)
-    label[rows] = room[tuple(column.T)]
+    return rows, room[tuple(column.T)]
 
 
 def find_cells_of_storey(grid: VoxelGrid, plan: StoreyPlan, room: Array, factor: int) -> tuple[Array, Array]:
