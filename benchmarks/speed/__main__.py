@@ -30,7 +30,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "room_search": {"rooms": [2000]},
     "networks": {"sides": (64,), "strip": 40, "squares": 2},
     "build_pairs": {"pairs": 2, "rooms": 4},
-    "training": {"batches": (2,), "steps": 1},
+    "training": {"batches": (2,), "steps": 1, "examples": 2},
     "researcher": {"most": 1},
     "studio": {"rooms": [10]},
     "readers": {"most": 0, "repeat": 1},

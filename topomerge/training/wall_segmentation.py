@@ -187,12 +187,15 @@ class PackedWalls:
         words = draw_words(key, LOST_ELEMENTS, x[0].numel()).view(-1, *x.shape[1:])
         x[chosen] *= words >= lowest[:, None, None, None]
         begin, size = rng.integers(length, size=count), rng.integers(4, max(length // 2, 5), count)
-        at, channel = np.arange(length), np.arange(STRIP_CHANNELS)
-        covered = (at >= begin[:, None]) & (at < (begin + size)[:, None]) & (rng.random(count) < augment.hidden)[:, None]
-        lost = covered[..., None] & (channel < rng.integers(1, BANDS, count)[:, None])[:, None]
-        for share, channels in ((augment.walk, channel == BANDS), (augment.rays, channel > BANDS)):
-            lost |= (rng.random(count) < share)[:, None, None] & channels
-        x *= torch.from_numpy(~lost).to(self.device)[:, :, None]
+        top = np.where(rng.random(count) < augment.hidden, rng.integers(1, BANDS, count), 0)
+        blind = [rng.random(count) < share for share in (augment.walk, augment.rays)]
+        numbers = torch.from_numpy(np.stack([begin, begin + size, top, *blind])).to(self.device)
+        first, end, channels, walk, rays = numbers[..., None, None]
+        at = torch.arange(length, device=self.device)[:, None]
+        channel = torch.arange(STRIP_CHANNELS, device=self.device)
+        lost = (at >= first) & (at < end) & (channel < channels)
+        lost |= ((channel == BANDS) & (walk > 0)) | ((channel > BANDS) & (rays > 0))
+        x *= ~lost[:, :, None]
         return x.float() / 255
 
 
