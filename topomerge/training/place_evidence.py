@@ -165,7 +165,7 @@ def augment_planes(x: torch.Tensor, augment: PlaceAugment, rng: np.random.Genera
     mirrored = turned.flip(1) if rng.random() < 0.5 else turned
     blind = rng.random(count) < augment.upper
     factor = rng.normal(1.0, augment.noise, (count, planes))
-    factor[np.ix_(blind, UPPER_PLANES)] = 0
+    factor[np.ix_(blind, np.array(UPPER_PLANES))] = 0
     return mirrored.contiguous() * torch.from_numpy(factor.astype(np.float32)).to(x.device)[:, None, None]
 
 
