@@ -173,6 +173,17 @@ def test_a_photograph_of_a_plan_has_its_rooms(tmp_path):
     assert len(map.rooms) == 5 and (map.rooms["outside"] < 0.5).all()
 
 
+def test_a_photograph_without_a_page_is_told_from_a_grid(tmp_path):
+    rng = np.random.default_rng(3)
+    light = np.linspace(40, 220, 160)[:, None] + rng.normal(0, 25, (160, 120))
+    greys = np.clip(light, 0, 255).astype(np.uint8)
+    greys[60:100, 40:80] = 255  # floor of a grid
+    Image.fromarray(greys).save(tmp_path / "photo.png")
+    Image.fromarray(np.where(greys > 200, 254, np.where(greys < 60, 0, 205)).astype(np.uint8)).save(tmp_path / "grid.png")
+    told = {name: " ".join(read_points(tmp_path / f"{name}.png", resolution=0.05).warnings) for name in ("photo", "grid")}
+    assert "looks like a photograph" in told["photo"] and "photograph" not in told["grid"]
+
+
 @pytest.mark.longer
 def test_a_blueprint_has_its_rooms(tmp_path):
     sheet = np.asarray(Image.open(draw_case(tmp_path / "plan.png")).resize((759, 599), Image.Resampling.BILINEAR))

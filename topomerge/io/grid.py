@@ -16,7 +16,7 @@ from scipy import ndimage
 from topomerge.archive import refuse_pointer
 from topomerge.errors import InputError
 from topomerge.io.drawing import NAME_HEIGHT, TracedDrawing, build_name_landmarks, build_stairs_landmarks, is_plan, trace_drawing
-from topomerge.io.drawn_page import find_page
+from topomerge.io.drawn_page import find_page, is_photograph
 from topomerge.io.drawn_storeys import DrawnStorey, find_storeys
 from topomerge.io.floor_masks import check_outside_floor, is_inverted
 from topomerge.io.grey_levels import GreyLevels, find_grey_levels, find_washed_walls, is_clear_cut, is_unknown_grey
@@ -36,6 +36,7 @@ CAMERA, EXPOSURE = 0x8769, 0x829A  # tags of EXIF: of how a picture was taken, a
 FEWEST_DOTS, MOST_DOTS = 99.0, 2400.0  # an inch, of a scan; 72 and 96 are those of screens
 SLAB = 0.3  # m between the walls of a drawn storey and the next floor
 INVERT = "; if it shows light lines on dark paper, invert its colours"
+PHOTOGRAPH = "was read as a robot's grid, but looks like a photograph: no page of a plan is found in it; take it with its border"
 
 
 LARGEST_YAML = 1 << 20  # bytes
@@ -70,7 +71,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         warning = f"{path.name}: has {pages} pages, and the first was read; save the others as files of their own"
         yield Piece(np.empty((0, 3)), warnings=(warning,), done=0.0)
     is_yaml = path.suffix.lower() in (".yaml", ".yml")
-    page = find_page(read_picture(path)) if options.drawing and not is_yaml else None
+    picture = read_picture(path) if options.drawing and not is_yaml else None
+    page = None if picture is None else find_page(picture)
     if is_yaml:
         plan = read_yaml(path)
         if options.resolution is not None:
@@ -87,6 +89,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     else:
         plan = Plan(path, options.resolution)
         occupied, free, warnings = read_pixels(path, plan)
+        if picture is not None and is_photograph(picture):
+            warnings = (*warnings, f"{path.name}: {PHOTOGRAPH}")
     if options.page is not None:
         raise InputError(f"{path}: is no page with drawn plans; leave --page out")
     yield Piece(np.empty((0, 3)), warnings=(*plan.warnings, *warnings), landmarks=names, done=0.1)
