@@ -35,7 +35,7 @@ def last_lines(folder: Path, text: str, *options: str) -> list[str]:
     """What a run of these tests says last, without the line that counts all."""
     tests = folder / "tests"
     tests.mkdir(parents=True)
-    for name in ("conftest.py", "compiling.py", "forked.py"):
+    for name in ("conftest.py", "compiling.py", "exporting.py", "forked.py"):
         shutil.copy(ROOT / "tests" / name, tests)
     (tests / "test_some.py").write_text(text)
     (folder / "pytest.ini").write_text("[pytest]\nmarkers =\n  slow: s\n  data: d\n")
