@@ -8,18 +8,14 @@ import numpy as np
 from scipy import ndimage
 from topomerge.datasets.pairs.drawing import TRUE_CLASSES, WALL_REACH
 from topomerge.datasets.pairs.plan_examples import PlanExample, build_storey_plans
-from topomerge.datasets.plans.robot_home import WIDEST_LEAF, spread_rooms
+from topomerge.datasets.plans.robot_home import WIDEST_LEAF, load_robot_rooms
 
-from topomerge.errors import InputError
-from topomerge.io.json_map import load_json_map
 from topomerge.io.points import read_points
-from topomerge.io.valetudo import is_robot_map, parse_robot_map
 from topomerge.types import Array, are_within
 
 HOME_EDGE = 0.1  # m, of a column
 DOOR_DEPTH = 0.13  # m to each side of where two rooms touch
 UNTOLD = 255  # class of columns of which nothing is true: where the owner cut an open plan
-FEWEST_ROOMS = 2
 
 
 def load_home_examples(path: Path) -> list[PlanExample]:
@@ -29,13 +25,7 @@ def load_home_examples(path: Path) -> list[PlanExample]:
     Raises:
         InputError: it is no map of Valetudo, or the robot tells fewer than two rooms apart.
     """
-    about = load_json_map(path)
-    if not is_robot_map(about):
-        raise InputError(f"{path}: is no map of Valetudo; give maps that robots drew")
-    drawn = parse_robot_map(path, about)
-    rooms, large = spread_rooms(drawn)
-    if len(large) < FEWEST_ROOMS:
-        raise InputError(f"{path}: the robot tells {len(large)} rooms apart, so nothing is true about it; leave it out")
+    drawn, rooms, _ = load_robot_rooms(path)
     classes = classify_pixels(rooms, drawn.resolution)
     examples = []
     for plan, places in build_storey_plans(read_points(path), HOME_EDGE):
@@ -59,11 +49,13 @@ def classify_pixels(rooms: Array, resolution: float) -> Array:
     out = np.full(rooms.shape, TRUE_CLASSES.index("outside"), np.uint8)
     out[ndimage.distance_transform_edt(rooms == 0) * resolution <= WALL_REACH] = TRUE_CLASSES.index("wall")
     out[rooms > 0] = TRUE_CLASSES.index("inside")
-    touching, _ = ndimage.label(_find_borders(rooms), np.ones((3, 3)))
-    for number, box in enumerate(ndimage.find_objects(touching), 1):
-        wide = max(side.stop - side.start for side in box) * resolution > WIDEST_LEAF
-        near = ndimage.distance_transform_edt(touching != number) * resolution <= DOOR_DEPTH
-        out[near & (rooms > 0)] = UNTOLD if wide else TRUE_CLASSES.index("doorway")
+    touching, count = ndimage.label(_find_borders(rooms), np.ones((3, 3)))
+    sizes = [max(side.stop - side.start for side in box) * resolution for box in ndimage.find_objects(touching)]
+    if count:
+        far, nearest = ndimage.distance_transform_edt(touching == 0, return_indices=True)
+        near = (far * resolution <= DOOR_DEPTH) & (rooms > 0)
+        wide = np.array([False, *(size > WIDEST_LEAF for size in sizes)])[touching[tuple(nearest)]]
+        out[near] = np.where(wide, UNTOLD, TRUE_CLASSES.index("doorway"))[near]
     return out
 
 
