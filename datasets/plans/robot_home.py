@@ -21,7 +21,6 @@ from topomerge.io.valetudo import RobotMap, is_robot_map, parse_robot_map
 from topomerge.types import Array
 
 SMALLEST_HOME_ROOM = 0.8  # m2
-FEWEST_HOME_ROOMS = 2  # of a home whose rooms are taken for true
 HOME_CAVITY = 0.3  # m; narrower strips of a room are left out
 HOME_INSET = 0.03  # m, half the wall between rooms whose floors touch
 WIDEST_LEAF = 1.3  # m; wider contacts of two rooms are openings without a leaf
@@ -65,22 +64,6 @@ def read_robot_home(path: Path) -> Sketch:
         add_contacts(result, [c for c in touching if (np.hypot(*(c[2][1] - c[2][0])) > WIDEST_LEAF) == wide], index, kind)
     guess_kinds(result, "")
     return result
-
-
-def load_robot_rooms(path: Path) -> tuple[RobotMap, Array, Array]:
-    """Load a robot's map of which the rooms are taken for true, and what `spread_rooms` returns of it.
-
-    Raises:
-        InputError: it is no map of Valetudo, or the robot tells fewer than two rooms apart.
-    """
-    about = load_json_map(path)
-    if not is_robot_map(about):
-        raise InputError(f"{path}: is no map of Valetudo; give one that a robot drew")
-    drawn = parse_robot_map(path, about)
-    labels, large = spread_rooms(drawn)
-    if len(large) < FEWEST_HOME_ROOMS:
-        raise InputError(f"{path}: the robot tells {len(large)} rooms apart, so nothing is true about it; take another map")
-    return drawn, labels, large
 
 
 def spread_rooms(drawn: RobotMap) -> tuple[Array, Array]:

@@ -8,7 +8,8 @@ import numpy as np
 from scipy import ndimage
 from topomerge.datasets.pairs.drawing import TRUE_CLASSES, WALL_REACH
 from topomerge.datasets.pairs.plan_examples import PlanExample, build_storey_plans
-from topomerge.datasets.plans.robot_home import WIDEST_LEAF, load_robot_rooms
+from topomerge.datasets.plans.robot_home import WIDEST_LEAF
+from topomerge.datasets.real.robot_homes import load_robot_rooms
 
 from topomerge.io.points import read_points
 from topomerge.types import Array, are_within

@@ -10,13 +10,33 @@ from pathlib import Path
 
 import numpy as np
 from topomerge.datasets.plans.grid import NARROW_CONTACT, find_contacts, trace_outline
-from topomerge.datasets.plans.robot_home import load_robot_rooms
+from topomerge.datasets.plans.robot_home import spread_rooms
 from topomerge.datasets.simulation.floor_truth import OUTSIDE_ROOMS, TRUTH_CELL, TRUTH_MARGIN, FloorTruth, mask_unseen
 
+from topomerge.errors import InputError
+from topomerge.io.json_map import load_json_map
+from topomerge.io.valetudo import RobotMap, is_robot_map, parse_robot_map
 from topomerge.types import Array, TrueRoom
 
+FEWEST_HOME_ROOMS = 2
 HOME_HEIGHT = 2.5  # m
 INSIDE = 0.01  # m, from a corner of a column into it
+
+
+def load_robot_rooms(path: Path) -> tuple[RobotMap, Array, Array]:
+    """Load a robot's map of which the rooms are taken for true, and what `spread_rooms` returns of it.
+
+    Raises:
+        InputError: it is no map of Valetudo, or the robot tells fewer than two rooms apart.
+    """
+    about = load_json_map(path)
+    if not is_robot_map(about):
+        raise InputError(f"{path}: is no map of Valetudo; give one that a robot drew")
+    drawn = parse_robot_map(path, about)
+    labels, large = spread_rooms(drawn)
+    if len(large) < FEWEST_HOME_ROOMS:
+        raise InputError(f"{path}: the robot tells {len(large)} rooms apart, so nothing is true about it; take another map")
+    return drawn, labels, large
 
 
 def compute_home_truth(path: Path, points: Array) -> tuple[FloorTruth, tuple[TrueRoom, ...]]:
